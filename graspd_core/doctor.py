@@ -1,0 +1,154 @@
+"""`graspd doctor`: what works on this machine, and what to do about what does not.
+
+Libraries are tried in processes of their own, so that one which aborts on import is reported instead of taking the
+report with it, and the ROS probe keeps rclpy out of this process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+PROBE_TIMEOUT = 60.0  # seconds; a cold disk takes several for torch or Open3D
+_SETUP = "run `make setup`, or pip install -c constraints.txt -e '.[ros,dev]'"
+_SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
+# distribution: module
+_LIBRARIES = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "trimesh": "trimesh",
+    "pytorch-kinematics": "pytorch_kinematics",
+    "open3d": "open3d",
+    "libigl": "igl",
+    "fast-simplification": "fast_simplification",
+    "pyyaml": "yaml",
+    "matplotlib": "matplotlib",
+}
+_TORCH = """
+import torch
+torch.linalg.inv(torch.eye(3))
+device = "CUDA " + torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+print(f"{torch.__version__}, {device}, {torch.get_num_threads()} threads")
+"""
+_MUJOCO = """
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+data = mujoco.MjData(model)
+mujoco.mj_step(model, data, 10)
+assert data.qpos[2] < 0, "a dropped ball did not fall"
+print(f"{mujoco.__version__}, steps a model")
+"""
+# What ROS is, only the ROS package knows.
+_ROS = "from graspd_ros.probe import probe; print(probe())"
+_HANDS = """
+import torch
+torch.set_num_threads(1)
+from graspd_core.hands.library import hand_names, load_hand
+print(", ".join(f"{name} ({len(load_hand(name).joint_names)} joints)" for name in hand_names()))
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was tried.
+
+    Attributes:
+        name: what was tried.
+        ok: whether it works.
+        detail: version or figure when it works, the error in one line when not.
+        hint: what to do, empty when it works.
+        needed: whether graspd is of no use without it.
+    """
+
+    name: str
+    ok: bool
+    detail: str
+    hint: str = ""
+    needed: bool = True
+
+
+def run_checks() -> list[Check]:
+    """Try everything graspd stands on; takes a few seconds."""
+    probes = [
+        ("torch", _TORCH, _SETUP, True),
+        ("mujoco", _MUJOCO, _SETUP, True),
+        *((name, _import_probe(name, module), _SETUP, True) for name, module in _LIBRARIES.items()),
+        ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
+        ("ROS 2 (rclpy)", _ROS, "only the node needs it: pip install -c constraints.txt -e '.[ros]'", False),
+    ]
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        probed = list(pool.map(lambda probe: try_code(*probe), probes))
+    return [_check_python(), *_check_system_libraries(), *probed, _check_cache()]
+
+
+def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
+    """Run Python code in a process of its own: its last line is the detail, its failure the check's."""
+    try:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        return Check(name, False, f"no answer within {PROBE_TIMEOUT:.0f} s", hint, needed)
+    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+    last = lines[-1] if lines else f"ended with status {done.returncode}"
+    return Check(name, done.returncode == 0, last, hint, needed)
+
+
+def format_checks(checks: Iterable[Check]) -> str:
+    """The report as lines: a verdict, what was tried, what came out, and the remedy under what failed."""
+    lines = []
+    for check in checks:
+        verdict = "ok  " if check.ok else "FAIL" if check.needed else "-   "
+        lines.append(f"{verdict} {check.name:<20} {check.detail}")
+        if check.hint and not check.ok:
+            lines.append(f"     {'':<20} -> {check.hint}")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Print the report; 0 when all that is needed works, else 1."""
+    checks = run_checks()
+    sys.stdout.write(format_checks(checks) + "\n")
+    return 0 if all(check.ok for check in checks if check.needed) else 1
+
+
+def _import_probe(distribution: str, module: str) -> str:
+    return f"import {module}; from importlib.metadata import version; print(version({distribution!r}))"
+
+
+def _check_python() -> Check:
+    version = ".".join(map(str, sys.version_info[:3]))
+    ok = (3, 11) <= sys.version_info[:2] <= (3, 12)
+    return Check("Python", ok, f"{version} at {sys.executable}", "use Python 3.11 or 3.12")
+
+
+def _check_system_libraries() -> list[Check]:
+    checks = []
+    for library, package in _SYSTEM_LIBRARIES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError as error:
+            checks.append(Check(library, False, str(error), f"sudo apt-get install {package}"))
+        else:
+            checks.append(Check(library, True, "found"))
+    return checks
+
+
+def _check_cache() -> Check:
+    from graspd_core.geometry.cache import cache_path
+
+    path = cache_path("doctor")
+    if path is None:
+        return Check("cache", True, "kept in memory only (GRASPD_CACHE=off)")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        hint = "make it writable, set XDG_CACHE_HOME, or GRASPD_CACHE=off; without it every start builds anew"
+        return Check("cache", False, str(error), hint, needed=False)
+    return Check("cache", True, f"{path.parent} is writable")

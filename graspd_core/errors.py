@@ -1,0 +1,25 @@
+"""Wrong use raises one of these; failing to find a grasp is an `Outcome`, never an exception."""
+
+
+class GraspdError(Exception):
+    """Base of every error graspd raises on purpose: one line that names the culprit and the valid choices."""
+
+
+class MeshError(GraspdError):
+    """A mesh cannot be read or holds no usable surface."""
+
+
+class CloudError(GraspdError):
+    """A point cloud cannot be read or shows no usable object."""
+
+
+class HandError(GraspdError):
+    """A hand description cannot be found, read or used."""
+
+
+class ConfigError(GraspdError):
+    """A setting is unknown, of the wrong type or out of range."""
+
+
+class FormatError(GraspdError):
+    """A grasps file is not in the format or version that this reader knows."""

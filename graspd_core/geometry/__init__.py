@@ -1,0 +1,1 @@
+"""Meshes, clouds, signed distance fields and scenes."""

@@ -1,0 +1,82 @@
+"""Arrays remembered by key: in this process always, and on disk between processes.
+
+Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`); `GRASPD_CACHE=off` keeps everything in memory. A file
+that cannot be read back whole is built again, and a disk that cannot be written is done without.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+Arrays = dict[str, np.ndarray]
+
+# Part of every file's name: raise it when what is computed from the same mesh changes.
+VERSION = 1
+CAPACITY = 64
+
+_memory: OrderedDict[str, Arrays] = OrderedDict()
+_lock = threading.Lock()
+
+
+def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
+    """The arrays stored under `key`, built and stored if there are none that are `valid`. Read-only by convention."""
+    with _lock:
+        if key in _memory:
+            _memory.move_to_end(key)
+            return _memory[key]
+    path = cache_path(key)
+    arrays = _read(path) if path else None
+    if arrays is None or not valid(arrays):
+        arrays = build()
+        if path:
+            _write(path, arrays)
+    with _lock:
+        _memory[key] = arrays
+        while len(_memory) > CAPACITY:
+            _memory.popitem(last=False)
+    return arrays
+
+
+def forget() -> None:
+    """Empty the memory of this process; files stay."""
+    with _lock:
+        _memory.clear()
+
+
+def cache_path(key: str) -> Path | None:
+    """Where the file of `key` lies, None when the disk is not to be used."""
+    if os.environ.get("GRASPD_CACHE", "").lower() in ("off", "0", "no"):
+        return None
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(home) / "graspd" / f"{key}-v{VERSION}.npz"
+
+
+def _read(path: Path) -> Arrays | None:
+    try:
+        # Opening by hand closes the file whatever happens; npz members carry a CRC, so a damaged one is noticed.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, arrays: Arrays) -> None:
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+            temporary = Path(file.name)
+            np.savez(file, allow_pickle=False, **arrays)
+        # Renaming is atomic: another process sees the whole file or none.
+        temporary.replace(path)
+    except OSError:
+        if temporary:
+            temporary.unlink(missing_ok=True)

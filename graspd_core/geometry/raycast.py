@@ -1,0 +1,128 @@
+"""Rays against meshes: depth images as a camera sees them, and shaded pictures, without any display.
+
+Camera frames follow the optical convention: z forward, x right, y down.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from graspd_core.geometry.embree import first_hits
+from graspd_core.types import TriangleMesh
+
+Vector = Sequence[float | int] | Float[np.ndarray, "3"]
+
+BACKGROUND = 255
+AMBIENT = 0.25
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """An ideal camera.
+
+    Attributes:
+        width, height: size of its image [pixels].
+        fx, fy: focal lengths [pixels].
+        cx, cy: where the optical axis meets the image [pixels].
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def camera_of_view(width: int, height: int, field_of_view: float = 0.7) -> PinholeCamera:
+    """A centred camera of that vertical field of view [rad]."""
+    focal = 0.5 * height / float(np.tan(0.5 * field_of_view))
+    return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
+    """`T_world_camera` of a camera at `eye` that looks at `target` with `up` upwards in its image [m].
+
+    Looking along `up`, any roll will do and one is chosen.
+    """
+    forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, dtype=float))
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = eye
+    return pose
+
+
+def render_depth(
+    mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "height width"]:
+    """Distance along the optical axis [m], 0 where the ray meets nothing."""
+    distance, _, _ = _cast(mesh, camera, T_world_camera)
+    return np.where(np.isfinite(distance), distance, 0.0)
+
+
+def cloud_from_depth(depth: Float[np.ndarray, "height width"], camera: PinholeCamera) -> Float[np.ndarray, "points 3"]:
+    """The seen points in the camera's frame [m]; pixels of depth 0 give none."""
+    return (_rays(camera) * depth[..., None])[depth > 0]
+
+
+def render_shaded(
+    meshes: Sequence[tuple[TriangleMesh, tuple[float, float, float]]],
+    *,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    width: int = 640,
+    height: int = 480,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh, _ in meshes[:-1]])
+    together = TriangleMesh(
+        np.vstack([mesh.vertices for mesh, _ in meshes]),
+        np.vstack([mesh.faces + offset for (mesh, _), offset in zip(meshes, offsets, strict=True)]),
+    )
+    colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
+    distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
+    hit = np.isfinite(distance)
+    view, above = -T_world_camera[:3, 2], np.array([0.0, 0.0, 1.0])
+    # A face is lit whichever way it is wound: towards the viewer.
+    normal = normal * np.where(normal @ view < 0, -1.0, 1.0)[..., None]
+    light = AMBIENT + 0.55 * (normal @ view).clip(0) + 0.2 * (normal @ above).clip(0)
+    image = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
+    image[hit] = (255 * (colours[face[hit]] * light[hit][:, None]).clip(0, 1)).astype(np.uint8)
+    return image
+
+
+def save_png(image: UInt8[np.ndarray, "height width 3"], path: str | Path) -> None:
+    """Write an RGB picture (PNG specification: one IHDR, one IDAT of unfiltered rows, IEND)."""
+    height, width, _ = image.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, width * 3)], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
+    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def _rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
+    """Directions of unit depth, camera frame."""
+    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones_like(x)], -1)
+
+
+def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
+    """Depth (infinite where nothing is hit), face index and unit face normal of each pixel."""
+    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    return first_hits(TriangleMesh(mesh.vertices - position, mesh.faces), _rays(camera) @ rotation.T)

@@ -1,0 +1,216 @@
+"""Authored test objects, each the size of something a hand picks up, with closed-form volumes.
+
+Curved surfaces are tessellated with vertices on the true surface, so a mesh's volume is up to 1 % below the closed
+form. The mug (cup and handle) and the hammer (shaft and head) are overlapping closed bodies: their inside is where the
+winding number is not zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from math import asin, pi, sqrt
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import MeshError
+from graspd_core.types import TriangleMesh
+
+SEGMENTS = 64
+
+SPHERE_RADIUS = 0.035
+BOX_HALF = (0.03, 0.03, 0.045)
+CYLINDER_RADIUS, CYLINDER_HALF = 0.033, 0.055
+CAPSULE_RADIUS, CAPSULE_HALF = 0.028, 0.04
+PLATE_HALF = (0.06, 0.04, 0.0075)
+TORUS_MAJOR, TORUS_MINOR = 0.035, 0.013
+MUG_RADIUS, MUG_HALF, MUG_WALL = 0.04, 0.0475, 0.004
+HANDLE_ROOT, HANDLE_ARM, HANDLE_OUTER, HANDLE_INNER, HANDLE_HALF_WIDTH = 0.038, 0.044, 0.032, 0.024, 0.006
+BOWL_RADIUS, BOWL_WALL = 0.065, 0.005
+BOTTLE_PROFILE = ((0.032, -0.085), (0.032, 0.025), (0.014, 0.055), (0.014, 0.085))
+L_LONG, L_SHORT, L_THICK, L_HALF_WIDTH = 0.09, 0.08, 0.035, 0.02
+SHAFT_RADIUS, SHAFT_LOW, HEAD_LOW = 0.013, -0.09, 0.05
+HEAD_HALF = (0.045, 0.015, 0.015)
+
+
+def make_shape(name: str) -> TriangleMesh:
+    """The authored shape of that name [m]. Raises MeshError for an unknown name."""
+    if name not in SHAPES:
+        raise MeshError(f"unknown shape {name!r}; valid shapes: {', '.join(sorted(SHAPES))}")
+    return SHAPES[name]()
+
+
+def shape_volume(name: str) -> float:
+    """Closed-form volume [m³] of an authored shape; overlaps count once. Raises MeshError for an unknown name."""
+    if name not in VOLUMES:
+        raise MeshError(f"unknown shape {name!r}; valid shapes: {', '.join(sorted(VOLUMES))}")
+    return VOLUMES[name]()
+
+
+def _sphere() -> TriangleMesh:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=SPHERE_RADIUS)
+    return TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
+
+
+def _cylinder() -> TriangleMesh:
+    r, h = CYLINDER_RADIUS, CYLINDER_HALF
+    return _revolve([(0, -h), (r, -h), (r, h), (0, h)])
+
+
+def _capsule() -> TriangleMesh:
+    turn = np.linspace(-pi / 2, pi / 2, 34)
+    lift = np.where(turn < 0, -CAPSULE_HALF, CAPSULE_HALF)
+    return _revolve(np.column_stack([CAPSULE_RADIUS * np.cos(turn), CAPSULE_RADIUS * np.sin(turn) + lift]))
+
+
+def _torus() -> TriangleMesh:
+    turn = 2 * pi * np.arange(48) / 48
+    ring = np.column_stack([TORUS_MAJOR + TORUS_MINOR * np.cos(turn), TORUS_MINOR * np.sin(turn)])
+    return _revolve(ring, closed=True)
+
+
+def _mug() -> TriangleMesh:
+    r, h, wall = MUG_RADIUS, MUG_HALF, MUG_WALL
+    cup = _revolve([(0, -h), (r, -h), (r, h), (r - wall, h), (r - wall, wall - h), (0, wall - h)])
+    turn = np.linspace(-pi / 2, pi / 2, 25)
+    bend = np.column_stack([np.cos(turn), np.sin(turn)])
+    curves = []
+    for radius in (HANDLE_OUTER, HANDLE_INNER):
+        arc = radius * bend + [HANDLE_ARM, 0]
+        curves.append(np.vstack([[HANDLE_ROOT, -radius], arc, [HANDLE_ROOT, radius]]))
+    return _join(cup, _ribbon(curves[0], curves[1], HANDLE_HALF_WIDTH))
+
+
+def _bowl() -> TriangleMesh:
+    turn = np.linspace(-pi / 2, 0, 20)
+    circle = np.column_stack([np.cos(turn), np.sin(turn)])
+    inner = (BOWL_RADIUS - BOWL_WALL) * circle[::-1]
+    profile = np.vstack([BOWL_RADIUS * circle, inner])
+    return _revolve(profile + np.array([0, BOWL_RADIUS / 2]))
+
+
+def _bottle() -> TriangleMesh:
+    return _revolve([(0, BOTTLE_PROFILE[0][1]), *BOTTLE_PROFILE, (0, BOTTLE_PROFILE[-1][1])])
+
+
+def _l_block() -> TriangleMesh:
+    a, b, t = L_LONG, L_SHORT, L_THICK
+    outer = np.array([(0, a), (0, 0), (b, 0)]) - [b / 2, a / 2]
+    inner = np.array([(t, a), (t, t), (b, t)]) - [b / 2, a / 2]
+    return _subdivide(_ribbon(outer, inner, L_HALF_WIDTH), 3)
+
+
+def _hammer() -> TriangleMesh:
+    inside_head = HEAD_LOW + HEAD_HALF[2]
+    r = SHAFT_RADIUS
+    shaft = _revolve([(0, SHAFT_LOW), (r, SHAFT_LOW), (r, inside_head), (0, inside_head)])
+    return _join(shaft, _box(HEAD_HALF, (0.0, 0.0, inside_head)))
+
+
+def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriangleMesh:
+    x, y, z = half
+    ring = _ribbon(np.array([(x, -z), (x, z)]), np.array([(-x, -z), (-x, z)]), y)
+    fine = _subdivide(ring, 3)
+    return TriangleMesh(fine.vertices + np.array(centre), fine.faces)
+
+
+def _revolve(profile, closed: bool = False) -> TriangleMesh:
+    """Turn an (r, z) profile about z: from axis to axis going up outside, or a closed counter-clockwise loop."""
+    profile = np.asarray(profile, dtype=float)
+    if not closed:
+        profile[[0, -1], 0] = 0.0
+    turn = 2 * pi * np.arange(SEGMENTS) / SEGMENTS
+    r, z = profile[:, :1], profile[:, 1:]
+    rings = np.stack([r * np.cos(turn), r * np.sin(turn), np.broadcast_to(z, (len(profile), SEGMENTS))], -1)
+    return _stitch(rings, wrap_rows=closed)
+
+
+def _ribbon(outer: Float[np.ndarray, "n 2"], inner: Float[np.ndarray, "n 2"], half_width: float) -> TriangleMesh:
+    """A bar of rectangular section between two curves of the x-z plane, `half_width` [m] to either side of it."""
+    corners = [(outer, -half_width), (outer, half_width), (inner, half_width), (inner, -half_width)]
+    rings = np.stack([np.column_stack([c[:, 0], np.full(len(c), y), c[:, 1]]) for c, y in corners], 1)
+    # A ring shrunk to a point closes either end.
+    ends = [np.broadcast_to(ring.mean(0), ring.shape)[None] for ring in (rings[0], rings[-1])]
+    return _stitch(np.concatenate([ends[0], rings, ends[1]]), wrap_rows=False)
+
+
+def _stitch(rings: Float[np.ndarray, "rows columns 3"], wrap_rows: bool) -> TriangleMesh:
+    """Join consecutive closed rings by triangles; rings that are single points become poles."""
+    rows, columns = rings.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    low = index if wrap_rows else index[:-1]
+    high = np.roll(index, -1, 0) if wrap_rows else index[1:]
+    a, b, c, d = low, np.roll(low, -1, 1), np.roll(high, -1, 1), high
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    vertices, inverse = np.unique(np.round(rings.reshape(-1, 3), 9), axis=0, return_inverse=True)
+    faces = inverse.reshape(-1)[faces]
+    solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return TriangleMesh(vertices, faces[solid])
+
+
+def _subdivide(mesh: TriangleMesh, times: int) -> TriangleMesh:
+    import trimesh
+
+    vertices, faces = mesh.vertices, mesh.faces
+    for _ in range(times):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)[:2]
+    return TriangleMesh(np.asarray(vertices), np.asarray(faces))
+
+
+def _join(*bodies: TriangleMesh) -> TriangleMesh:
+    offsets = np.cumsum([0] + [len(body.vertices) for body in bodies[:-1]])
+    faces = [body.faces + offset for body, offset in zip(bodies, offsets, strict=True)]
+    return TriangleMesh(np.vstack([body.vertices for body in bodies]), np.vstack(faces))
+
+
+def _mug_volume() -> float:
+    """Cup, half-ring handle, and the handle's two arms from the cup's outer wall to the bend.
+
+    An arm of width 2w is a box less the cylinder x² + y² < R²: ∫ (x_end − √(R² − y²)) dy over |y| < w.
+    """
+    r, h, wall, w = MUG_RADIUS, MUG_HALF, MUG_WALL, HANDLE_HALF_WIDTH
+    cup = pi * r**2 * 2 * h - pi * (r - wall) ** 2 * (2 * h - wall)
+    bend = pi / 2 * (HANDLE_OUTER**2 - HANDLE_INNER**2) * 2 * w
+    arm = (2 * w * HANDLE_ARM - (w * sqrt(r**2 - w**2) + r**2 * asin(w / r))) * (HANDLE_OUTER - HANDLE_INNER)
+    return cup + bend + 2 * arm
+
+
+def _bottle_volume() -> float:
+    parts = pairwise(BOTTLE_PROFILE)
+    return sum(pi / 3 * (z1 - z0) * (r0 * r0 + r0 * r1 + r1 * r1) for (r0, z0), (r1, z1) in parts)
+
+
+def _box_volume(half: tuple[float, float, float]) -> float:
+    return 8 * half[0] * half[1] * half[2]
+
+
+SHAPES: dict[str, Callable[[], TriangleMesh]] = {
+    "sphere": _sphere,
+    "box": lambda: _box(BOX_HALF),
+    "cylinder": _cylinder,
+    "capsule": _capsule,
+    "plate": lambda: _box(PLATE_HALF),
+    "torus": _torus,
+    "mug": _mug,
+    "bowl": _bowl,
+    "bottle": _bottle,
+    "l_block": _l_block,
+    "hammer": _hammer,
+}
+
+VOLUMES: dict[str, Callable[[], float]] = {
+    "sphere": lambda: 4 / 3 * pi * SPHERE_RADIUS**3,
+    "box": lambda: _box_volume(BOX_HALF),
+    "cylinder": lambda: pi * CYLINDER_RADIUS**2 * 2 * CYLINDER_HALF,
+    "capsule": lambda: pi * CAPSULE_RADIUS**2 * (2 * CAPSULE_HALF + 4 / 3 * CAPSULE_RADIUS),
+    "plate": lambda: _box_volume(PLATE_HALF),
+    "torus": lambda: 2 * pi**2 * TORUS_MAJOR * TORUS_MINOR**2,
+    "mug": _mug_volume,
+    "bowl": lambda: 2 / 3 * pi * (BOWL_RADIUS**3 - (BOWL_RADIUS - BOWL_WALL) ** 3),
+    "bottle": _bottle_volume,
+    "l_block": lambda: (L_LONG + L_SHORT - L_THICK) * L_THICK * 2 * L_HALF_WIDTH,
+    "hammer": lambda: _box_volume(HEAD_HALF) + pi * SHAFT_RADIUS**2 * (HEAD_LOW - SHAFT_LOW),
+}

@@ -1,0 +1,123 @@
+"""All collision primitives of a hand at once, as tensors: distance of object points to every link.
+
+Boxes and round solids (cylinders; spheres and capsules count as swept points and segments) are exact; hulls are left
+to the contact candidates. Gradients are exact where the distance is smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from graspd_core.hands.model import HandModel
+from graspd_core.se3 import safe_norm
+
+
+@dataclass(frozen=True, eq=False)
+class Solids:
+    """Primitives in one common form: a box of half extents `core`, swept by `radius`; cylinders are round boxes.
+
+    Attributes:
+        rotation, translation: `T_link_primitive` [m].
+        core: half extents of a box, or (radius, radius, half length) of a cylinder; zero-width for swept solids [m].
+        radius: sweep radius of spheres and capsules, zero for others [m].
+        is_round: one where x and y are one radial coordinate.
+        link: link of each primitive.
+    """
+
+    rotation: Float[Tensor, "solids 3 3"]
+    translation: Float[Tensor, "solids 3"]
+    core: Float[Tensor, "solids 3"]
+    radius: Float[Tensor, "solids"]
+    is_round: Float[Tensor, "solids"]
+    link: Int[Tensor, "solids"]
+
+
+def make_solids(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> Solids:
+    """Lay the hand's boxes and round solids out as tensors."""
+    solids = [p for p in hand.primitives if p.kind != "hull"]
+    core, radius, is_round = [], [], []
+    for p in solids:
+        if p.kind == "box":
+            core.append(p.size)
+        elif p.kind == "cylinder":
+            core.append((p.size[0], p.size[0], p.size[1]))
+        else:
+            core.append((0.0, 0.0, p.size[1] if p.kind == "capsule" else 0.0))
+        radius.append(p.size[0] if p.kind in ("sphere", "capsule") else 0.0)
+        is_round.append(float(p.kind == "cylinder"))
+
+    def tensor(values: object, shape: tuple[int, ...]) -> Tensor:
+        return torch.as_tensor(np.asarray(values, dtype=float).reshape(shape), device=device, dtype=dtype)
+
+    n = len(solids)
+    return Solids(
+        rotation=tensor([p.rotation for p in solids], (n, 3, 3)),
+        translation=tensor([p.translation for p in solids], (n, 3)),
+        core=tensor(core, (n, 3)),
+        radius=tensor(radius, (n,)),
+        is_round=tensor(is_round, (n,)),
+        link=torch.as_tensor([p.link for p in solids], device=device, dtype=torch.long),
+    )
+
+
+def solid_distance(
+    solids: Solids,
+    rotations: Float[Tensor, "batch links 3 3"],
+    translations: Float[Tensor, "batch links 3"],
+    points: Float[Tensor, "batch points 3"],
+) -> Float[Tensor, "batch points solids"]:
+    """Signed distance [m] of base-frame points to every solid, negative inside, for the link poses of `forward`."""
+    local = _to_solids(solids, rotations, translations, points)
+    return _distance(local, solids.core, solids.radius, solids.is_round)
+
+
+def solid_bound(
+    solids: Solids,
+    rotations: Float[Tensor, "batch links 3 3"],
+    translations: Float[Tensor, "batch links 3"],
+    points: Float[Tensor, "batch points 3"],
+) -> Float[Tensor, "batch points solids"]:
+    """A cheap lower bound of `solid_distance` [m]: largest coordinate of the offset from the bounding box."""
+    local = _to_solids(solids, rotations, translations, points)
+    return (local.abs() - (solids.core + solids.radius[:, None])).amax(-1)
+
+
+def _to_solids(
+    solids: Solids, rotations: Tensor, translations: Tensor, points: Float[Tensor, "batch points 3"]
+) -> Float[Tensor, "batch points solids 3"]:
+    """Base-frame points in the frame of every solid."""
+    rotation = rotations[:, solids.link] @ solids.rotation
+    origin = (rotations[:, solids.link] @ solids.translation[:, :, None]).squeeze(-1) + translations[:, solids.link]
+    columns = rotation.permute(0, 2, 1, 3).flatten(2)
+    return (points @ columns).unflatten(-1, (-1, 3)) - (origin[:, :, None, :] @ rotation).squeeze(-2)[:, None]
+
+
+def pair_distance(
+    solids: Solids,
+    rotations: Float[Tensor, "batch links 3 3"],
+    translations: Float[Tensor, "batch links 3"],
+    points: Float[Tensor, "batch pairs 3"],
+    which: Int[Tensor, "batch pairs"],
+) -> Float[Tensor, "batch pairs"]:
+    """Signed distance [m] of base-frame points each to one solid."""
+    rows = torch.arange(len(points), device=points.device)[:, None]
+    links = solids.link[which]
+    in_link = (points - translations[rows, links])[..., None, :] @ rotations[rows, links]
+    local = ((in_link - solids.translation[which][..., None, :]) @ solids.rotation[which]).squeeze(-2)
+    return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
+
+
+def _distance(
+    local: Float[Tensor, "*batch 3"], core: Tensor, radius: Tensor, is_round: Tensor
+) -> Float[Tensor, "*batch"]:
+    reach = local.abs()
+    radial = safe_norm(reach[..., :2])
+    x = torch.where(is_round > 0, radial, reach[..., 0])
+    y = torch.where(is_round > 0, torch.zeros_like(radial), reach[..., 1])
+    past = torch.stack([x, y, reach[..., 2]], -1) - core
+    return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0) - radius

@@ -1,0 +1,223 @@
+"""The file format `graspd/grasps`, version 1 (docs/format.md): write a result, read it back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_core.config import PlanConfig
+from graspd_core.errors import ConfigError, FormatError
+from graspd_core.geometry.scene import ObjectModel
+from graspd_core.hands.model import HandModel
+from graspd_core.types import Contact, Grasp, GraspMetrics, GraspResult, HoldResult, Posture, Verdict
+
+FORMAT, VERSION = "graspd/grasps", 1
+_METRIC_KEYS = (
+    "contact_area_cm2",
+    "intersection_volume_cm3",
+    "penetration_mm",
+    "self_penetration_mm",
+    "epsilon",
+    "volume",
+    "sd_cm",
+)
+_LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy", "pytorch-kinematics")
+
+
+def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig) -> dict[str, Any]:
+    """A result as JSON-ready values; lengths in metres, angles in radians, forces in newtons unless a key says so."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "units": "m, rad, N",
+        "outcome": {"name": result.outcome.name, "message": result.outcome.value, "warnings": list(result.warnings)},
+        "hand": {
+            "name": hand.name,
+            "urdf": hand.urdf,
+            "base_link": hand.base_link,
+            "joint_names": list(hand.joint_names),
+        },
+        "object": {
+            "source": target.source,
+            "sha256": target.sha256,
+            "center_of_mass": target.center_of_mass.tolist(),
+            "mass": target.mass,
+            "friction": target.friction,
+            "scale": target.scale,
+        },
+        "config": dataclasses.asdict(config),
+        "seed": result.seed,
+        "method": result.method,
+        "versions": _versions(),
+        "timing": dataclasses.asdict(result.timing),
+        "grasps": [_grasp(rank, grasp) for rank, grasp in enumerate(result.grasps)],
+    }
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a path that no file can be written to, before the work that would be lost; makes missing directories.
+
+    Raises:
+        ConfigError: the path is a directory, or its directory cannot be made or written to.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a directory; give the name of a file to write")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def save_result(
+    path: str | Path, result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig
+) -> None:
+    """Write a result; the file appears whole or not at all."""
+    # NaN is not JSON: a document that held one must never be written.
+    save_text(Path(path), json.dumps(result_document(result, target, hand, config), indent=1, allow_nan=False) + "\n")
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all; makes missing directories."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def load_document(path: str | Path) -> dict[str, Any]:
+    """Read a grasps file.
+
+    Raises:
+        FormatError: missing, not JSON, of another format or of an unknown version.
+    """
+    path = Path(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise FormatError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise FormatError(f"{path}: not JSON: {error}") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FormatError(f"{path}: not a {FORMAT} file")
+    if document.get("version") != VERSION:
+        raise FormatError(f"{path}: version {document.get('version')!r} is unknown; this reader knows {VERSION}")
+    return document
+
+
+def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
+    """The grasps of a document that `load_document` read, in rank order; the squeeze has the grasp's base pose.
+
+    Metrics stay in the document: who wants to judge a grasp measures it anew.
+
+    Raises:
+        FormatError: a grasp lacks a key, or holds something of the wrong kind there.
+    """
+    try:
+        return tuple(_grasp_of(values) for values in document["grasps"])
+    except KeyError as error:
+        raise FormatError(f"grasps: a grasp lacks the key {error}") from None
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"grasps: {error}") from None
+
+
+def _grasp_of(values: dict[str, Any]) -> Grasp:
+    def posture(position: str, quaternion: str, joints: str) -> Posture:
+        return Posture(*(np.array(values[key], dtype=float) for key in (position, quaternion, joints)))
+
+    hold = values["metrics"]["hold"]
+    verdict = Verdict(values["verdict"])
+    return Grasp(
+        pregrasp=posture("pregrasp_position", "pregrasp_quaternion_wxyz", "pregrasp_joint_positions"),
+        grasp=posture("position", "quaternion_wxyz", "joint_positions"),
+        squeeze=posture("position", "quaternion_wxyz", "squeeze_joint_positions"),
+        contacts=tuple(Contact(c["link"], tuple(c["position"]), tuple(c["normal"])) for c in values["contacts"]),
+        score=values["score"],
+        hold=hold and HoldResult(
+            verdict is Verdict.VERIFIED,
+            _or_infinite(hold["max_displacement_cm"]) / 100,
+            float(np.deg2rad(_or_infinite(hold["max_rotation_deg"]))),
+            values["reason"],
+        ),
+        verdict=verdict,
+        reason=values["reason"],
+    )  # fmt: skip
+
+
+def _grasp(rank: int, grasp: Grasp) -> dict[str, Any]:
+    return {
+        "rank": rank,
+        "verdict": str(grasp.verdict),
+        "reason": grasp.reason,
+        "score": grasp.score,
+        "position": _list(grasp.grasp.position),
+        "quaternion_wxyz": _list(grasp.grasp.quaternion_wxyz),
+        "joint_positions": _list(grasp.grasp.joint_positions),
+        "pregrasp_joint_positions": _list(grasp.pregrasp.joint_positions),
+        "squeeze_joint_positions": _list(grasp.squeeze.joint_positions),
+        "pregrasp_position": _list(grasp.pregrasp.position),
+        "pregrasp_quaternion_wxyz": _list(grasp.pregrasp.quaternion_wxyz),
+        "contacts": [{"link": c.link, "position": list(c.position), "normal": list(c.normal)} for c in grasp.contacts],
+        "metrics": _metrics(grasp.metrics, grasp.hold),
+    }
+
+
+def _metrics(metrics: GraspMetrics | None, hold: HoldResult | None) -> dict[str, Any]:
+    """Every key in every grasp; null where nothing was measured or a figure is not finite."""
+    values: dict[str, float | None] = dict.fromkeys(_METRIC_KEYS)
+    if metrics is not None:
+        figures = (
+            metrics.contact_area * 1e4,
+            metrics.intersection_volume * 1e6,
+            metrics.penetration * 1e3,
+            metrics.self_penetration * 1e3,
+            metrics.epsilon,
+            metrics.volume,
+            None if metrics.displacement is None else metrics.displacement * 100,
+        )
+        values = dict(zip(_METRIC_KEYS, map(_finite, figures), strict=True))
+    measured = hold and {
+        "max_displacement_cm": _finite(hold.max_displacement * 100),
+        "max_rotation_deg": _finite(float(np.rad2deg(hold.max_rotation))),
+    }
+    return {**values, "hold": measured}
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and np.isfinite(value) else None
+
+
+def _or_infinite(value: float | None) -> float:
+    return float("inf") if value is None else value
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+def _list(values: np.ndarray) -> list[float]:
+    return [float(v) for v in values]
+
+
+def _versions() -> dict[str, str]:
+    versions = {}
+    for name in _LIBRARIES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions

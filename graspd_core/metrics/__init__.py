@@ -1,0 +1,1 @@
+"""Static grasp quality. A judge: shares no code with the optimiser."""

@@ -1,0 +1,45 @@
+"""Static quality of one grasp. Definitions are those of docs/metrics.md; every figure is independent of the frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.geometry.exact import DistanceQuery, signed_distance
+from graspd_core.geometry.features import farthest_points
+from graspd_core.metrics import contacts, overlap
+from graspd_core.metrics.judge import Judge
+from graspd_core.metrics.wrenches import wrench_hull
+from graspd_core.types import GraspMetrics, Posture
+
+# Contacts that the wrench hull is made of. Its time grows with their square; twice as many raise ε by a fifth.
+MAX_CONTACTS = 16
+# Half the distance of a central difference [m].
+_STEP = 2e-4
+
+
+def measure(judge: Judge, posture: Posture) -> GraspMetrics:
+    """All static metrics of the judge's hand at `posture` on the judge's object."""
+    target = judge.target
+    placed = contacts.place_hand(judge, posture)
+    touching = placed.points[contacts.touching(placed)]
+    chosen = touching[farthest_points(touching, MAX_CONTACTS)]
+    normals = surface_normals(judge.query, chosen)
+    epsilon, volume = wrench_hull(chosen - target.center_of_mass, normals, target.friction, target.radius)
+    return GraspMetrics(
+        contact_area=contacts.contact_area(placed),
+        contact_links=contacts.contact_links(placed),
+        intersection_volume=overlap.intersection_volume(judge, placed),
+        penetration=overlap.penetration(placed),
+        self_penetration=overlap.self_penetration(judge, placed),
+        epsilon=epsilon,
+        volume=volume,
+    )
+
+
+def surface_normals(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Outward unit normals of the object's surface next to points, by central differences of the exact distance."""
+    probes = points[:, None, None] + _STEP * np.stack([np.eye(3), -np.eye(3)])
+    distance = signed_distance(query, probes.reshape(-1, 3)).reshape(len(points), 2, 3)
+    gradient = distance[:, 0] - distance[:, 1]
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,1 @@
+"""Optimisers: a scene and a hand in, candidate grasps out."""

@@ -1,0 +1,220 @@
+"""The front door: a scene and a hand in, ranked and verified grasps out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from typing import TypeVar
+
+import torch
+
+from graspd_core.config import VERIFICATIONS, PlanConfig, load_preset
+from graspd_core.errors import ConfigError
+from graspd_core.geometry.scene import Scene, load_scene, object_parts, scene_from_cloud
+from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.metrics.judge import make_judge
+from graspd_core.metrics.quality import measure
+from graspd_core.optimise.solver import Hooks
+from graspd_core.optimise.synthesis import synthesise
+from graspd_core.types import (
+    Grasp,
+    GraspResult,
+    Outcome,
+    Progress,
+    ProgressHook,
+    Stage,
+    StopHook,
+    Timing,
+    TriangleMesh,
+    Verdict,
+)
+from graspd_core.verify.trial import hold_trial, judge
+from graspd_core.verify.world import PROTOCOLS, build_world
+
+__all__ = ["check_request", "hand_names", "load_hand", "load_scene", "plan_grasps", "scene_from_cloud", "warm_up"]
+
+T, R = TypeVar("T"), TypeVar("R")
+
+# How often stop and deadline are looked at while waiting for the collision parts [s].
+_POLL = 0.02
+
+# Rounds of optimiser and trial at most, and the distance of their seeds.
+_ROUNDS, _SEED_STEP = 3, 1_000_003
+
+
+def plan_grasps(
+    scene: Scene,
+    hand: HandModel,
+    *,
+    count: int = 16,
+    seed: int = 0,
+    preset: str | PlanConfig = "balanced",
+    verify: str = "standard",
+    deadline: float | None = None,
+    device: str = "cpu",
+    progress: ProgressHook | None = None,
+    stop: StopHook | None = None,
+) -> GraspResult:
+    """Plan grasps and try them in MuJoCo in rank order until `count` of them hold.
+
+    Args:
+        scene: from `load_scene` or `scene_from_cloud`.
+        hand: from `load_hand`.
+        count: verified grasps wanted (with verify="none": grasps wanted).
+        seed: same seed, same machine, same grasps.
+        preset: a preset's name, a preset file, or the settings themselves.
+        verify: "standard" or "hard" hold trial, or "none".
+        deadline: seconds from now after which the run ends with what it has.
+        device: of the optimiser's tensors.
+        progress: called from this thread with `Progress` values.
+        stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
+
+    Returns:
+        Always a result; `outcome` says how it went. Grasps that failed their trial follow the verified ones.
+
+    Raises:
+        ConfigError: count, seed, verify, deadline, device or preset is not valid.
+    """
+    config = load_preset(preset) if isinstance(preset, str) else preset
+    check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
+    run = _Run(scene, time.perf_counter(), deadline, progress or (lambda _: None), stop or (lambda: False))
+    # The collision parts take about as long as the optimiser: build them beside it.
+    parts = _in_background(object_parts, scene.object) if verify != "none" else None
+    hooks = Hooks(
+        report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, 0),
+        # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its postures.
+        stop=run.over,
+    )
+    grasps: tuple[Grasp, ...] = ()
+    first, good, optimising = None, 0, 0.0
+    # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
+    for attempt in range(_ROUNDS):
+        began = time.perf_counter()
+        found = synthesise(
+            scene, hand, count=count - good, seed=seed + _SEED_STEP * attempt, config=config, hooks=hooks, device=device
+        )
+        optimising += time.perf_counter() - began
+        if parts is None:
+            metrics_judge = make_judge(scene.object, hand)
+            new = tuple(replace(g, metrics=measure(metrics_judge, g.grasp)) for g in found.grasps[: count - good])
+        else:
+            new, passed_at = _verify(run, scene, hand, found.grasps, parts, PROTOCOLS[verify], count - good, good)
+            first = first or passed_at
+        grasps = tuple(sorted((*grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
+        good = sum(g.verdict is not Verdict.FAILED for g in grasps)
+        if good >= count or run.over():
+            break
+    finished = time.perf_counter()
+    outcome = _outcome(run, bool(grasps), good, count)
+    load, sdf = scene.timing
+    timing = Timing(
+        load=load,
+        sdf=sdf,
+        optimise=optimising,
+        verify=finished - run.began - optimising,
+        first_verified=None if first is None else first - run.began + load + sdf,
+        total=finished - run.began + load + sdf,
+    )
+    run.report(Stage.DONE, 1, 1, 0.0, good)
+    return GraspResult(outcome, grasps, timing, seed, config.method, warnings=scene.object.warnings)
+
+
+def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
+    """Refuse what `plan_grasps` would refuse, without a scene. Raises ConfigError: what is valid."""
+    if not 1 <= count <= 1024:
+        raise ConfigError(f"count: {count} grasps; valid: 1 to 1024")
+    if not 0 <= seed < 2**63:
+        raise ConfigError(f"seed: {seed}; valid: 0 to 2^63 - 1")
+    if verify not in VERIFICATIONS:
+        raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")
+    if deadline is not None and not deadline > 0:
+        raise ConfigError(f"deadline: {deadline} s; it must be positive")
+    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    devices += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+    if device not in devices:
+        raise ConfigError(f"device: {device!r}; valid on this machine: {', '.join(devices)}")
+
+
+def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
+    """Do the first-use work of torch and MuJoCo on a small sphere, so that the first request is as fast as others."""
+    plan_grasps(load_scene("shape:sphere"), hand, count=1, preset="fast", verify="standard", stop=stop)
+
+
+def _in_background(work: Callable[[T], R], argument: T) -> Future[R]:
+    """Start work in a thread of its own; nobody waits for it but who asks for its result."""
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
+    future = pool.submit(work, argument)
+    pool.shutdown(wait=False)
+    return future
+
+
+class _Run:
+    """Clock, hooks and end of one run."""
+
+    def __init__(
+        self, scene: Scene, began: float, deadline: float | None, progress: ProgressHook, stop: StopHook
+    ) -> None:
+        self.scene, self.began, self.progress = scene, began, progress
+        self.end = began + deadline if deadline is not None else float("inf")
+        self.cancelled = False
+        self._stop = stop
+
+    def stop(self) -> bool:
+        self.cancelled = self.cancelled or self._stop()
+        return self.cancelled
+
+    def over(self) -> bool:
+        return self.stop() or time.perf_counter() >= self.end
+
+    def report(self, stage: Stage, step: int, of: int, best: float, verified: int) -> None:
+        self.progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began))
+
+
+def _verify(
+    run: _Run,
+    scene: Scene,
+    hand: HandModel,
+    candidates: tuple[Grasp, ...],
+    parts: Future[tuple[TriangleMesh, ...]],
+    protocol,
+    count: int,
+    before: int,
+) -> tuple[tuple[Grasp, ...], float | None]:
+    """Try candidates in rank order until `count` held (`before` did already); verified ones first, then the failed."""
+    verified: list[Grasp] = []
+    failed: list[Grasp] = []
+    first = None
+    while candidates and not run.over() and not wait([parts], timeout=_POLL).done:
+        pass
+    if not candidates or run.over():
+        return (), None
+    world = build_world(hand, scene.object, parts.result(), protocol)
+    metrics_judge = make_judge(scene.object, hand)
+    for index, grasp in enumerate(candidates):
+        if len(verified) == count or run.over():
+            break
+        hold = hold_trial(world, grasp, protocol, stop=run.over)
+        if run.over() and not hold.passed:
+            # A trial that was cut short says nothing of the grasp.
+            break
+        tried = judge(replace(grasp, metrics=measure(metrics_judge, grasp.grasp)), hold)
+        if hold.passed:
+            first = first or time.perf_counter()
+            verified.append(tried)
+        else:
+            failed.append(tried)
+        run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified))
+    return (*verified, *failed), first
+
+
+def _outcome(run: _Run, any_found: bool, good: int, count: int) -> Outcome:
+    if good >= count:
+        return Outcome.SUCCEEDED
+    if run.cancelled:
+        return Outcome.CANCELLED
+    if time.perf_counter() >= run.end:
+        return Outcome.DEADLINE
+    return Outcome.TOO_FEW if any_found else Outcome.NO_CANDIDATES

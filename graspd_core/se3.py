@@ -1,0 +1,79 @@
+"""Rigid transforms on torch tensors: `T_a_b` maps coordinates in frame b to frame a; quaternions are wxyz.
+
+Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is defined as zero.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# The one epsilon of the project: below it a squared length counts as zero [unit²].
+EPSILON = 1e-12
+
+
+def safe_norm(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    """Euclidean norm over the last axis, with gradient zero (not NaN) at the origin."""
+    squared = (x * x).sum(-1)
+    is_zero = squared <= EPSILON**2
+    return torch.where(
+        is_zero, torch.zeros_like(squared), torch.where(is_zero, torch.ones_like(squared), squared).sqrt()
+    )
+
+
+def normalize(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    """Unit vectors along the last axis; zero stays zero."""
+    return x / safe_norm(x).clamp_min(EPSILON)[..., None]
+
+
+def rotation_from_quaternion(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of wxyz quaternions of any non-zero length."""
+    w, x, y, z = normalize(q).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit wxyz quaternions with w ≥ 0 (Shepperd's method: the largest component is the divisor)."""
+    m = rotation
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    candidates = torch.stack(
+        [
+            torch.stack([squares[..., 0], wx, wy, wz], -1),
+            torch.stack([wx, squares[..., 1], xy, xz], -1),
+            torch.stack([wy, xy, squares[..., 2], yz], -1),
+            torch.stack([wz, xz, yz, squares[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    q = normalize(candidates.gather(-2, best).squeeze(-2))
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def rotation_from_axis_angle(
+    axis: Float[Tensor, "*#batch 3"], angle: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Rodrigues' formula for unit axes and angles [rad]."""
+    half = 0.5 * angle[..., None]
+    return rotation_from_quaternion(torch.cat([half.cos(), half.sin() * axis], -1))
+
+
+def transform_points(
+    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"], points: Float[Tensor, "*batch n 3"]
+) -> Float[Tensor, "*batch n 3"]:
+    """Map points of frame b to frame a by `T_a_b = (rotation, translation)`."""
+    return points @ rotation.transpose(-1, -2) + translation[..., None, :]
+
+
+def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "count 3 3"]:
+    """Uniform random rotations (normalised Gaussian quaternions)."""
+    return rotation_from_quaternion(torch.randn(count, 4, generator=generator, dtype=dtype))

@@ -1,0 +1,1 @@
+"""Physics trials in MuJoCo. A judge: shares no code with the optimiser."""

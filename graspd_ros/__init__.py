@@ -1,0 +1,1 @@
+"""The ROS 2 shell around graspd_core: messages in, messages out. Nothing about grasping is decided here."""

@@ -1,0 +1,83 @@
+"""The process: starts the node, waits for a signal, ends cleanly.
+
+Ctrl-C and SIGTERM are handled here instead of by rclpy, from before the slow imports on, so that neither leaves a
+traceback at any time. Once the node runs the main thread only waits, since Python runs signal handlers nowhere else.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+
+STOP_TIMEOUT = 2.0  # seconds that a busy worker has to notice that it must stop
+
+EXIT_STOPPED = 0
+EXIT_FAILED = 1
+EXIT_BAD_INPUT = 2
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until a signal; 0 when stopped, 1 when it cannot go on, 2 for a bad parameter."""
+    _on_signal(lambda: os._exit(EXIT_STOPPED))  # nothing is open yet, and an import cannot be ended otherwise
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+
+    import rclpy
+    from rclpy.exceptions import ParameterException
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import try_shutdown
+
+    from graspd_core.errors import GraspdError
+    from graspd_ros.service import GraspNode
+
+    wake, failed = threading.Event(), threading.Event()
+    _on_signal(wake.set)
+
+    def fail() -> None:
+        failed.set()
+        wake.set()
+
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = GraspNode(on_failure=fail)
+    except (GraspdError, ParameterException) as error:
+        sys.stderr.write(f"graspd_node: {error}\n")
+        try_shutdown()
+        return EXIT_BAD_INPUT
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        try:
+            executor.spin()
+        finally:
+            if not wake.is_set():
+                fail()
+
+    spinner = threading.Thread(target=spin, name="graspd_executor", daemon=True)
+    spinner.start()
+    wake.wait()
+    ended = node.close(STOP_TIMEOUT)
+    executor.shutdown(timeout_sec=0.5)
+    spinner.join(0.5)
+    node.destroy_node()
+    try_shutdown()
+    status = EXIT_FAILED if failed.is_set() else EXIT_STOPPED
+    if not ended:
+        # A worker deep in a library call would abort the interpreter's teardown; there is nothing left to save.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status
+
+
+def _on_signal(action: Callable[[], None]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: action())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""The node's parameters: one list of fields with type, default, range and description feeds ROS and the settings."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from graspd_core.config import VERIFICATIONS, load_preset
+from graspd_core.errors import ConfigError
+from graspd_ros.worker import BusyPolicy
+
+CLOUD_POLICIES = ("newest", "each", "off")
+
+
+def _setting(
+    default: Any,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: Iterable[str] = (),
+    check: Callable[[str], object] | None = None,
+    read_only: bool = False,
+) -> Any:
+    metadata = {
+        "description": description,
+        "range": None if low is None else (low, high),
+        "choices": tuple(choices),
+        "check": check,
+        "read_only": read_only,
+    }
+    if isinstance(default, list):
+        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def _check_device(name: str) -> None:
+    import torch
+
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError):  # torch raises either, as the build goes
+        valid = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+        raise ConfigError(f"{name!r} is not a device of this machine; valid: {', '.join(valid)}") from None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The parameters as they stood when a request came; the descriptions are those that `ros2 param describe` shows."""
+
+    hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
+    device: str = _setting("cpu", "torch device of the optimiser", check=_check_device, read_only=True)
+    torch_threads: int = _setting(
+        1, "threads of the optimiser; more than 1 costs time on a shared machine", low=1, high=64, read_only=True
+    )
+    queue_size: int = _setting(4, "mesh requests that may wait", low=0, high=64, read_only=True)
+    busy_policy: str = _setting("queue", "what a mesh request does while the node is busy", choices=BusyPolicy)
+    cloud_policy: str = _setting(
+        "newest",
+        "newest: a cloud waits until the node is idle, and a newer one takes its place; each: every cloud is a request "
+        "under busy_policy; off: clouds are not taken",
+        choices=CLOUD_POLICIES,
+    )
+    num_grasps: int = _setting(8, "grasps to optimise and, with a trial, to verify", low=1, high=256)
+    preset: str = _setting("balanced", "name of a shipped preset, or path of a preset's yaml file", check=load_preset)
+    verify: str = _setting("standard", "the hold trial that a grasp must pass", choices=VERIFICATIONS)
+    deadline: float = _setting(60.0, "time that one request may take [s]", low=0.1, high=3600.0)
+    seed: int = _setting(0, "seed of the random starts", low=0, high=2**31 - 1)
+    mass: float = _setting(0.1, "mass of the object [kg]", low=0.001, high=100.0)
+    friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
+    mesh_scale: float = _setting(1.0, "factor from the mesh file's unit to metres", low=1e-6, high=1e6)
+    mesh_frame: str = _setting("object", "frame id of grasps on a mesh: the mesh's own frame")
+    mesh_roots: list[str] = _setting(
+        [".", "package://graspd_ros"], "directories that meshes may be read from: paths or package://name"
+    )
+    progress_rate: float = _setting(10.0, "most progress reports a second [Hz]", low=0.1, high=10.0)
+    output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
+
+
+def declare_settings(node: Node) -> Settings:
+    """Declare every parameter on the node and read them.
+
+    Raises:
+        ConfigError: a value given at the start is not a valid choice.
+        rclpy.exceptions.ParameterException: a value of the wrong type or out of range.
+    """
+    for setting in dataclasses.fields(Settings):
+        default = Settings.__dataclass_fields__[setting.name].default
+        if setting.default_factory is not dataclasses.MISSING:
+            default = setting.default_factory()
+        node.declare_parameter(setting.name, default, _descriptor(setting))
+    settings = read_settings(node)
+    for name, value in dataclasses.asdict(settings).items():
+        _check_value(name, value)
+    node.add_on_set_parameters_callback(check_parameters)
+    return settings
+
+
+def read_settings(node: Node) -> Settings:
+    """The parameters as they are now."""
+    values: dict[str, Any] = {s.name: node.get_parameter(s.name).value for s in dataclasses.fields(Settings)}
+    values["mesh_roots"] = list(values["mesh_roots"] or [])
+    return Settings(**values)
+
+
+def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
+    """Refuse what is not a valid choice; types and ranges are refused by ROS itself."""
+    try:
+        for parameter in parameters:
+            _check_value(parameter.name, parameter.value)
+    except ConfigError as error:
+        return SetParametersResult(successful=False, reason=str(error))
+    return SetParametersResult(successful=True)
+
+
+def _check_value(name: str, value: Any) -> None:
+    setting = Settings.__dataclass_fields__.get(name)
+    if setting is None:
+        return  # ROS has parameters of its own on every node
+    choices, check = setting.metadata["choices"], setting.metadata["check"]
+    if choices and value not in choices:
+        raise ConfigError(f"parameter {name}: {value!r} is not one of {', '.join(choices)}")
+    if check is not None:
+        try:
+            check(value)
+        except ConfigError as error:
+            raise ConfigError(f"parameter {name}: {error}") from None
+
+
+def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
+    choices = setting.metadata["choices"]
+    descriptor = ParameterDescriptor(
+        description=setting.metadata["description"],
+        read_only=setting.metadata["read_only"],
+        additional_constraints=f"one of {', '.join(choices)}" if choices else "",
+    )
+    if setting.metadata["range"] is not None:
+        low, high = setting.metadata["range"]
+        if isinstance(setting.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+        else:
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    return descriptor

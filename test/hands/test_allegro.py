@@ -1,0 +1,135 @@
+"""The Allegro hand that graspd ships with: golden values, geometry, postures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from graspd_core.hands.distance import hand_sdf
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.meshes import hand_mesh, primitive_mesh
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.overlap import link_overlaps
+from graspd_core.hands.surface import dense_samples
+
+TIPS = ("link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip")
+# Fingertip origins in base_link [m] at a share of the joint range (None: zero, clipped to the limits), from the
+# published description through pytorch-kinematics and MuJoCo, which agree to 1e-5 m.
+GOLDEN = {
+    None: [[0, 0.05531, 0.13344], [0, 0, 0.13620], [0, -0.05531, 0.13344], [0.02596, 0.16123, -0.08550]],
+    0.5: [
+        [0.09535, 0.04752, 0.04437],
+        [0.09535, 0, 0.04679],
+        [0.09535, -0.04752, 0.04437],
+        [0.08403, 0.05714, -0.0102],
+    ],
+    0.75: [
+        [0.06303, 0.05726, -0.01746],
+        [0.06303, 0.01509, -0.01396],
+        [0.06303, -0.02719, -0.01483],
+        [0.04901, -0.01368, -0.02021],
+    ],
+}
+# Extents of the maker's meshes in their link frames [m]: lower corner, upper corner.
+PROXIMAL = ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0628])
+MEDIAL = ([-0.0098, -0.0135, -0.0063], [0.0098, 0.0135, 0.0472])
+DISTAL = ([-0.0098, -0.0135, -0.0063], [0.0098, 0.0135, 0.0157])
+BASE = ([-0.0098, -0.0135, 0.0], [0.0098, 0.0135, 0.0220])
+TIP = ([-0.0120, -0.0120, -0.0110], [0.0120, 0.0120, 0.0120])
+EXTENTS = {
+    "base_link": ([-0.0295, -0.0567, -0.0950], [0.0113, 0.0567, 0.0017]),
+    **{f"link_{4 * finger}.0": BASE for finger in range(3)},
+    **{f"link_{4 * finger + 1}.0": PROXIMAL for finger in range(3)},
+    **{f"link_{4 * finger + 2}.0": MEDIAL for finger in range(3)},
+    **{f"link_{4 * finger + 3}.0": DISTAL for finger in range(3)},
+    **dict.fromkeys(TIPS, TIP),
+    "link_12.0": ([-0.0392, -0.0080, -0.0080], [0.0055, 0.0260, 0.0415]),
+    "link_13.0": ([-0.0098, -0.0135, -0.0002], [0.0098, 0.0135, 0.0218]),
+    "link_14.0": ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0577]),
+    "link_15.0": ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0313]),
+}
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return load_hand("allegro_right")
+
+
+@pytest.mark.parametrize("share", GOLDEN)
+def test_golden_fingertips(hand: HandModel, share: float | None) -> None:
+    q = np.clip(0, hand.lower, hand.upper) if share is None else hand.lower + share * (hand.upper - hand.lower)
+    tips = link_poses(hand, q)[1][[hand.link_index[name] for name in TIPS]]
+    np.testing.assert_allclose(tips, GOLDEN[share], atol=1e-5)  # the golden values have five decimals
+
+
+def test_joint_order_limits_and_effort(hand: HandModel) -> None:
+    assert hand.joint_names == tuple(f"joint_{i}.0" for i in range(16))
+    np.testing.assert_allclose(hand.lower, [-0.47, -0.196, -0.174, -0.227] * 3 + [0.263, -0.105, -0.189, -0.162])
+    np.testing.assert_allclose(hand.upper, [0.47, 1.61, 1.709, 1.618] * 3 + [1.396, 1.163, 1.644, 1.719])
+    np.testing.assert_allclose(hand.effort, 0.7)
+    assert hand.link_mass.sum() == pytest.approx(0.9861)
+
+
+def test_inertias_are_those_of_solid_bodies(hand: HandModel) -> None:
+    for inertia in hand.link_inertia:
+        a, b, c = np.linalg.eigvalsh(inertia)
+        assert a > 0
+        assert a + b >= c
+
+
+@pytest.mark.parametrize("name", EXTENTS)
+def test_primitives_cover_the_true_extents(hand: HandModel, name: str) -> None:
+    meshes = [primitive_mesh(p).vertices for p in hand.primitives_of[hand.link_index[name]]]
+    vertices = np.concatenate(meshes)
+    lower, upper = EXTENTS[name]
+    # 0.06 mm: the extents are rounded to 0.1 mm, and the tip's ball is drawn with inscribed facets.
+    assert (vertices.min(0) <= np.array(lower) + 6e-5).all()
+    assert (vertices.max(0) >= np.array(upper) - 6e-5).all()
+    # 1 mm: the tip's ball reaches that far into the box behind it; everything else is as snug as the rounding.
+    assert (vertices.min(0) >= np.array(lower) - 1.0001e-3).all()
+    assert (vertices.max(0) <= np.array(upper) + 6e-5).all()
+
+
+@pytest.mark.parametrize("posture", ["open_posture", "closed_posture"])
+def test_postures_are_within_limits_and_free_of_self_collision(hand: HandModel, posture: str) -> None:
+    q = getattr(hand, posture)
+    assert ((hand.lower <= q) & (q <= hand.upper)).all()
+    points, links, _ = dense_samples(hand, count=6000, seed=11)
+    overlap = np.where(hand.adjacent, 0.0, link_overlaps(hand, q[None], points, links)[0])
+    assert overlap.max() == 0.0
+
+
+def test_a_fist_is_seen_to_collide(hand: HandModel) -> None:
+    points, links, _ = dense_samples(hand, seed=11)
+    fist = hand.lower + 0.75 * (hand.upper - hand.lower)
+    overlap = np.where(hand.adjacent, 0.0, link_overlaps(hand, fist[None], points, links)[0])
+    assert overlap.max() > 3e-3
+
+
+def test_thumb_opposes_the_fingers_when_open(hand: HandModel) -> None:
+    tips = link_poses(hand, hand.open_posture)[1][[hand.link_index[name] for name in TIPS]]
+    assert ((tips - hand.palm_center) @ hand.palm_normal > 0.03).all()
+    assert np.linalg.norm(tips[3] - tips[1]) > 0.08  # room for an object of 8 cm
+
+
+def test_adjacency(hand: HandModel) -> None:
+    index, adjacent = hand.link_index, hand.adjacent
+    assert (adjacent == adjacent.T).all()
+    assert adjacent.diagonal().all()
+    for one, other in (("link_3.0", "link_3.0_tip"), ("link_2.0", "link_3.0_tip"), ("base_link", "link_4.0")):
+        assert adjacent[index[one], index[other]]
+    for one, other in (("link_3.0_tip", "link_15.0_tip"), ("base_link", "link_7.0_tip"), ("link_1.0", "link_5.0")):
+        assert not adjacent[index[one], index[other]]
+
+
+def test_hand_mesh_lies_on_the_links_surfaces(hand: HandModel) -> None:
+    mesh = hand_mesh(hand, hand.closed_posture)
+    rotations, translations = link_poses(hand, hand.closed_posture)
+    distance = torch.full((len(mesh.vertices),), torch.inf, dtype=torch.float64)
+    for link in range(hand.num_links):
+        local = torch.as_tensor((mesh.vertices - translations[link]) @ rotations[link])
+        distance = torch.minimum(distance, hand_sdf(hand, link, local))
+    assert float(distance.max()) < 1e-9
+    assert mesh.faces.max() == len(mesh.vertices) - 1

@@ -1,0 +1,141 @@
+"""Forward kinematics against pytorch-kinematics, MuJoCo and finite differences."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graspd_core.hands.kinematics import (
+    forward,
+    link_poses,
+    make_kinematics,
+    place,
+    placement,
+    point_jacobian,
+    points_in_base,
+)
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.urdf import read_urdf
+
+SLIDER = """<robot name="slider">
+  <link name="rail"/><link name="cart"/><link name="plate"/><link name="arm"/><link name="second"/>
+  <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/>
+    <origin xyz="0.1 0 0" rpy="0.3 -0.2 0.5"/><axis xyz="0 1 1"/>
+    <limit lower="-0.1" upper="0.2" effort="5" velocity="1"/></joint>
+  <joint name="weld" type="fixed"><parent link="cart"/><child link="plate"/><origin xyz="0 0 0.05" rpy="0 0 1"/></joint>
+  <joint name="turn" type="continuous"><parent link="plate"/><child link="arm"/><axis xyz="1 2 2"/></joint>
+  <joint name="other" type="revolute"><parent link="rail"/><child link="second"/><origin xyz="0 0.2 0"/>
+    <axis xyz="0 0 -1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+@pytest.fixture(scope="module")
+def allegro() -> HandModel:
+    return load_hand("allegro_right")
+
+
+@pytest.fixture(scope="module")
+def slider(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
+    path = tmp_path_factory.mktemp("slider") / "slider.urdf"
+    path.write_text(SLIDER)
+    return read_urdf(path)
+
+
+@pytest.fixture(scope="module", params=["allegro", "slider"])
+def hand(request: pytest.FixtureRequest) -> HandModel:
+    return request.getfixturevalue(request.param)
+
+
+def _random_q(hand: HandModel, count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(hand.lower, hand.upper, (count, hand.num_joints))
+
+
+def test_agrees_with_pytorch_kinematics(hand: HandModel) -> None:
+    import pytorch_kinematics as pk
+
+    chain = pk.build_chain_from_urdf(Path(hand.urdf).read_bytes())
+    q = torch.as_tensor(_random_q(hand, 20, 0), dtype=torch.float32)
+    rotations, translations = forward(make_kinematics(hand), q)
+    theirs = chain.forward_kinematics(q)
+    for link, name in enumerate(hand.link_names):
+        matrix = theirs[name].get_matrix()
+        # 1e-5: both in float32, and pytorch-kinematics keeps its offsets as float32 quaternions.
+        torch.testing.assert_close(translations[:, link], matrix[:, :3, 3].expand(20, 3), atol=1e-5, rtol=0)
+        torch.testing.assert_close(rotations[:, link], matrix[:, :3, :3].expand(20, 3, 3), atol=1e-5, rtol=0)
+
+
+def test_agrees_with_mujoco(allegro: HandModel) -> None:
+    mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
+
+    text = (
+        Path(allegro.urdf)
+        .read_text()
+        .replace('<robot name="allegro_right">', '<robot name="a"><mujoco><compiler fusestatic="false"/></mujoco>')
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    base = allegro.link_group == allegro.link_group[0]
+    for q in _random_q(allegro, 5, 1):
+        for name, value in zip(allegro.joint_names, q, strict=True):
+            data.joint(name).qpos[0] = value
+        mujoco.mj_kinematics(model, data)
+        rotations, translations = link_poses(allegro, q)
+        for link in np.flatnonzero(~base):
+            body = data.body(allegro.link_names[link])
+            np.testing.assert_allclose(translations[link], body.xpos, atol=1e-9)
+            np.testing.assert_allclose(rotations[link], body.xmat.reshape(3, 3), atol=1e-9)
+
+
+def test_gradients_by_finite_differences(hand: HandModel) -> None:
+    kinematics = make_kinematics(hand, dtype=torch.float64)
+    q = torch.as_tensor(_random_q(hand, 2, 2)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: forward(kinematics, x), q)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_link_poses_are_rigid_and_placing_agrees_with_them(allegro: HandModel, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    q = _random_q(allegro, 3, seed)
+    points, links = rng.normal(size=(30, 3)), rng.integers(0, allegro.num_links, 30)
+    kinematics = make_kinematics(allegro, dtype=torch.float64)
+    rotations, translations = forward(kinematics, torch.as_tensor(q))
+    eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
+    torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
+    expected = (rotations[:, links] @ torch.as_tensor(points)[None, :, :, None]).squeeze(-1)
+    turned = place(
+        placement(allegro.num_links, torch.as_tensor(points), torch.as_tensor(links), directions=True),
+        rotations,
+        translations,
+    )
+    torch.testing.assert_close(turned, expected, atol=1e-12, rtol=0)
+    moved = points_in_base(kinematics, torch.as_tensor(q), torch.as_tensor(points), torch.as_tensor(links))
+    torch.testing.assert_close(moved, expected + translations[:, links], atol=1e-12, rtol=0)
+
+
+def test_point_jacobian_is_the_derivative(hand: HandModel) -> None:
+    rng = np.random.default_rng(3)
+    q = _random_q(hand, 1, 3)[0]
+    points, links = rng.normal(size=(25, 3)) * 0.05, rng.integers(0, hand.num_links, 25)
+    kinematics = make_kinematics(hand, dtype=torch.float64)
+
+    def positions(x: torch.Tensor) -> torch.Tensor:
+        return points_in_base(kinematics, x[None], torch.as_tensor(points), torch.as_tensor(links))[0]
+
+    expected = torch.autograd.functional.jacobian(positions, torch.as_tensor(q))
+    np.testing.assert_allclose(point_jacobian(hand, q, points, links), np.asarray(expected), atol=1e-12)
+
+
+def test_float32_agrees_with_float64(allegro: HandModel) -> None:
+    q = torch.as_tensor(_random_q(allegro, 10, 4))
+    double = forward(make_kinematics(allegro, dtype=torch.float64), q)[1]
+    single = forward(make_kinematics(allegro), q.float())[1]
+    torch.testing.assert_close(single.double(), double, atol=1e-6, rtol=0)

@@ -1,0 +1,172 @@
+"""The import rules of docs/architecture.md, read off the sources."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MAX_LINES = 350
+
+BASE = {"types", "errors", "se3", "config", "paths"}
+UP_TO_CONTACT = BASE | {"geometry", "hands", "contact"}
+ROOMS = UP_TO_CONTACT | {"optimise", "metrics", "verify", "io"}
+# What each room of graspd_core may import; a room that is not here may not exist.
+MAY_IMPORT = {
+    "types": {"types", "errors"},
+    "errors": set[str](),
+    "se3": {"se3", "types", "errors"},
+    "config": BASE,
+    "paths": {"errors"},
+    "geometry": BASE | {"geometry"},
+    "hands": BASE | {"geometry", "hands"},
+    "contact": UP_TO_CONTACT,
+    "optimise": UP_TO_CONTACT | {"optimise"},
+    "metrics": UP_TO_CONTACT | {"metrics"},
+    "verify": UP_TO_CONTACT | {"verify"},
+    "io": BASE | {"geometry", "hands", "io"},
+    "pipeline": ROOMS | {"pipeline"},
+    "__init__": BASE | {"pipeline", "io"},
+    "html": ROOMS | {"html"},
+    "bench": ROOMS | {"pipeline", "bench", "__init__"},
+    "doctor": ROOMS | {"pipeline", "doctor", "__init__"},
+    "cli": ROOMS | {"pipeline", "bench", "doctor", "html", "cli", "__init__"},
+}
+NODE_SEES = {"pipeline", "config", "types", "errors", "paths", "io", "__init__"}
+
+# library: where it may be imported, as a path prefix below the repository root
+CONFINED = {
+    "mujoco": ("graspd_core/verify/",),
+    "open3d": ("graspd_core/geometry/",),
+    "matplotlib": ("graspd_core/bench/charts",),
+}
+HEAVY = {"open3d", "trimesh", "igl", "vhacdx", "pytorch_kinematics", "mujoco", "matplotlib", "fast_simplification"}
+ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported module: its dotted name, its line, and whether importing the file runs it."""
+
+    module: str
+    line: int
+    at_module_level: bool
+
+
+def imports_of(source: str, package: str) -> list[Import]:
+    """Every import of a file in `package`, those inside functions too; relative ones are resolved."""
+    found: list[Import] = []
+
+    def visit(node: ast.AST, at_module_level: bool) -> None:
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            at_module_level = False
+        if isinstance(node, ast.Import):
+            found.extend(Import(alias.name, node.lineno, at_module_level) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")
+            base = ".".join(parents[: len(parents) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module) if part)
+            if module == "graspd_core":
+                found.extend(Import(f"{module}.{a.name}", node.lineno, at_module_level) for a in node.names)
+            else:
+                found.append(Import(module, node.lineno, at_module_level))
+        inside = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for child in ast.iter_child_nodes(node):
+            visit(child, at_module_level and not inside)
+
+    visit(ast.parse(source), True)
+    return found
+
+
+def room_of(module: str) -> str:
+    """The room of a `graspd_core...` module; names that the package itself offers count as its `__init__`."""
+    room = module.removeprefix("graspd_core").strip(".").split(".")[0]
+    return room if room in MAY_IMPORT else "__init__"
+
+
+def breaches(path: str, source: str) -> list[str]:
+    """What `source`, lying at `path` below the root, does against the rules; one line each."""
+    parts = Path(path).with_suffix("").parts
+    home = parts[1]
+    wrong = []
+    if source.count("\n") > MAX_LINES:
+        wrong.append(f"{path}: {source.count(chr(10))} lines, more than {MAX_LINES}: split it")
+    if parts[0] == "graspd_core" and home not in MAY_IMPORT:
+        wrong.append(f"{path}: {home} is not a room; give it a row in MAY_IMPORT and docs/architecture.md")
+    for found in imports_of(source, ".".join(parts[:-1])):
+        library = found.module.split(".")[0]
+        where = f"{path}:{found.line}: imports {found.module}"
+        if library == "graspd_core":
+            allowed = NODE_SEES if parts[0] == "graspd_ros" else MAY_IMPORT.get(home, set())
+            if room_of(found.module) not in allowed:
+                wrong.append(f"{where}, but {home} may import only {sorted(allowed)}")
+        if parts[0] == "graspd_core" and (library in ROS or library.endswith("_msgs")):
+            wrong.append(f"{where}, but graspd_core knows no ROS")
+        if library in CONFINED and not path.startswith(CONFINED[library]):
+            wrong.append(f"{where}, which only {' and '.join(CONFINED[library])} may")
+        if library in HEAVY and found.at_module_level:
+            wrong.append(f"{where} at module level: import it inside the function that needs it")
+    return wrong
+
+
+def sources() -> list[Path]:
+    return sorted(path for package in ("graspd_core", "graspd_ros") for path in (ROOT / package).rglob("*.py"))
+
+
+def test_the_house_keeps_its_rules():
+    found = [line for path in sources() for line in breaches(str(path.relative_to(ROOT)), path.read_text())]
+    assert not found, "\n".join(found)
+
+
+def test_no_file_outside_the_packages_is_too_long():
+    others = [p for folder in ("test", "examples", "benchmarks", "scripts") for p in (ROOT / folder).rglob("*.py")]
+    long = {str(p.relative_to(ROOT)) for p in others if p.read_text().count("\n") > MAX_LINES}
+    assert not long
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "culprit"),
+    [
+        ("graspd_core/geometry/sdf.py", "from graspd_core.hands.model import HandModel", "hands.model"),
+        ("graspd_core/contact/forces.py", "from ..optimise import losses", "optimise"),
+        (
+            "graspd_core/metrics/quality.py",
+            "def f():\n    from graspd_core.optimise.losses import g",
+            "optimise.losses",
+        ),
+        ("graspd_core/verify/trial.py", "from graspd_core import optimise", "optimise"),
+        ("graspd_core/hands/model.py", "from graspd_core.pipeline import plan_grasps", "pipeline"),
+        ("graspd_core/io.py", "import rclpy", "rclpy"),
+        ("graspd_core/io.py", "from sensor_msgs.msg import PointCloud2", "sensor_msgs.msg"),
+        ("graspd_core/optimise/losses.py", "def f():\n    import mujoco", "mujoco"),
+        ("graspd_core/hands/meshes.py", "def f():\n    import open3d as o3d", "open3d"),
+        ("graspd_core/verify/world.py", "import mujoco", "module level"),
+        ("graspd_core/geometry/mesh.py", "if True:\n    import trimesh", "module level"),
+        ("graspd_core/geometry/mesh.py", "def f():\n    import matplotlib.pyplot", "matplotlib"),
+        ("graspd_core/bench/suite.py", "def f():\n    from matplotlib import pyplot", "matplotlib"),
+        ("graspd_core/attic/old.py", "x = 1", "not a room"),
+        ("graspd_core/types.py", "\n" * (MAX_LINES + 1), "split it"),
+        ("graspd_ros/node.py", "from graspd_core.geometry.cloud import crop", "geometry.cloud"),
+    ],
+)
+def test_the_checker_sees_a_planted_breach(path: str, source: str, culprit: str):
+    (line,) = breaches(path, source)
+    assert line.startswith(path)
+    assert culprit in line
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("graspd_core/verify/world.py", "def build():\n    import mujoco"),
+        ("graspd_core/geometry/mesh.py", "if TYPE_CHECKING:\n    import trimesh"),
+        ("graspd_core/optimise/problem.py", "from graspd_core.contact.wrench import support"),
+        ("graspd_core/contact/forces.py", "from .wrench import support"),
+        ("graspd_ros/node.py", "import rclpy\nfrom graspd_core.pipeline import plan_grasps"),
+    ],
+)
+def test_the_checker_lets_good_code_pass(path: str, source: str):
+    assert breaches(path, source) == []
