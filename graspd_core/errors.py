@@ -13,6 +13,14 @@ class CloudError(GraspdError):
     """A point cloud cannot be read or shows no usable object."""
 
 
+class NoObjectError(CloudError):
+    """A scene was seen well enough, and what was asked for is not in it."""
+
+
+class BagError(GraspdError):
+    """A bag cannot be read, or lacks what was asked of it."""
+
+
 class HandError(GraspdError):
     """A hand description cannot be found, read or used."""
 

@@ -55,6 +55,19 @@ class TriangleMesh:
 
 
 @dataclass(frozen=True)
+class Plane:
+    """A flat support that fills the half-space n·x < offset.
+
+    Attributes:
+        normal: unit normal, into the free side.
+        offset: n·x of its points [m].
+    """
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+
+
+@dataclass(frozen=True)
 class Contact:
     """One place where a link touches the object.
 

@@ -18,15 +18,17 @@ MOST_POINTS = 20_000
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points that some camera saw.
+    """Points that one camera saw. Several views of a scene are several of these, in one frame.
 
     Attributes:
         points: positions [m]; may hold NaN until cleaned.
         viewpoint: where the camera stood, in the same frame [m].
+        forward: unit direction of its optical axis, in the same frame; None where it is not known.
     """
 
     points: Float[np.ndarray, "points 3"]
     viewpoint: Float[np.ndarray, "3"]
+    forward: Float[np.ndarray, "3"] | None = None
 
 
 def is_cloud_file(path: str | Path) -> bool:

@@ -18,7 +18,7 @@ from graspd_core.geometry.mesh import MESH_ENDINGS, check_mesh, content_hash, lo
 from graspd_core.geometry.reconstruct import reconstruct
 from graspd_core.geometry.sdf import GridSDF, build_sdf, is_solid
 from graspd_core.geometry.shapes import make_shape
-from graspd_core.types import TriangleMesh
+from graspd_core.types import Plane, TriangleMesh
 
 SHAPE_PREFIX = "shape:"
 
@@ -61,18 +61,37 @@ class ObjectModel:
 
 
 @dataclass(frozen=True)
+class Neighbour:
+    """A thing that the hand must not touch.
+
+    Attributes:
+        mesh: its closed surface, in the object's frame [m].
+        sdf: its signed distance.
+    """
+
+    mesh: TriangleMesh
+    sdf: GridSDF
+
+
+@dataclass(frozen=True)
 class Scene:
-    """What a grasp is planned against.
+    """What a grasp is planned against; all in the object's frame.
 
     Attributes:
         object: the thing to grasp.
         sdf: its signed distance.
         timing: seconds taken by loading and by the distance field.
+        support: what the object stands on, if anything; gravity points against its normal.
+        neighbours: other things, only those that the hand could reach.
+        trust: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it is known.
     """
 
     object: ObjectModel
     sdf: GridSDF
     timing: tuple[float, float]
+    support: Plane | None = None
+    neighbours: tuple[Neighbour, ...] = ()
+    trust: Float[torch.Tensor, "x y z"] | None = None
 
 
 def load_scene(
