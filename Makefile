@@ -6,14 +6,17 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench-foundation clean
+.PHONY: help setup test check format demo bench-foundation bench-rgbd clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
 
 setup: $(STAMP)  ## build .venv (Python 3.11 or 3.12; PYTHON=... names one)
 
-$(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh
+# The directories too: adding or removing a message makes the environment stale.
+INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*))
+
+$(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh $(INTERFACES)
 	@scripts/setup.sh $(VENV) $(PYTHON)
 	@touch $@
 
@@ -34,6 +37,10 @@ demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and 
 
 bench-foundation: setup  ## make the README's results table anew
 	$(RUN)/python benchmarks/foundation.py --readme README.md $(if $(MESHES),--meshes $(MESHES))
+
+bench-rgbd: setup  ## make the table of docs/clouds.md anew: shapes on a table, rendered with sensor noise (an hour)
+	$(RUN)/python benchmarks/rgbd.py --readme docs/clouds.md
+	$(if $(FRAMES),$(RUN)/python benchmarks/rgbd.py --frames $(FRAMES))
 
 clean:  ## remove what was made, the environment excepted
 	rm -rf demo results build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

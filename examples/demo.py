@@ -27,10 +27,10 @@ from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import String
 
+from graspd_core.geometry.depth import cloud_from_depth
 from graspd_core.geometry.mesh import save_mesh
 from graspd_core.geometry.raycast import (
     camera_of_view,
-    cloud_from_depth,
     look_at,
     render_depth,
     render_shaded,
@@ -159,7 +159,7 @@ def rotation_of(x: float, y: float, z: float, w: float) -> np.ndarray:
 
 def cloud_of(mug: TriangleMesh) -> PointCloud2:
     """What a depth camera sees of the mug: one side, in the camera's optical frame."""
-    points = cloud_from_depth(render_depth(mug, CAMERA, T_MUG_CAMERA), CAMERA).astype("<f4")
+    points = cloud_from_depth(render_depth(mug, CAMERA, T_MUG_CAMERA), CAMERA).points.astype("<f4")
     fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate("xyz")]
     cloud = PointCloud2(height=1, width=len(points), fields=fields, point_step=12, row_step=12 * len(points))
     cloud.header.frame_id = "camera_optical_frame"

@@ -29,6 +29,7 @@ class LossWeights:
         penetration: depth below the padded surface.
         self_collision: overlap of the hand with itself.
         posture: joints away from the middle of their range.
+        obstacle: depth in the support or in a neighbour; scenes without any have no such term.
     """
 
     task: float = 3.0
@@ -36,6 +37,7 @@ class LossWeights:
     penetration: float = 1.0
     self_collision: float = 1.0
     posture: float = 0.02
+    obstacle: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,9 @@ class ClosedFormConfig:
         joint_rate: step size of the joints [rad].
         weights: of the loss terms while exploring and refining.
         polish_weights: of the loss terms while polishing.
+        obstacle_factor: times as many starts are tried and kept where there is a support or a neighbour, which rule
+            out most ways to grasp a thing.
+        trust_floor: what a contact counts on surface that was only guessed; one where it was seen.
     """
 
     starts_per_grasp: float = 4.0
@@ -79,9 +84,13 @@ class ClosedFormConfig:
     translation_rate: float = 0.003
     rotation_rate: float = 0.03
     joint_rate: float = 0.03
+    obstacle_factor: float = 2.0
+    trust_floor: float = 0.4
     weights: LossWeights = field(default_factory=LossWeights)
     polish_weights: LossWeights = field(
-        default_factory=lambda: LossWeights(task=6.0, distance=300.0, penetration=10.0, self_collision=100.0)
+        default_factory=lambda: LossWeights(
+            task=6.0, distance=300.0, penetration=10.0, self_collision=100.0, obstacle=10.0
+        )
     )
 
 
@@ -125,6 +134,41 @@ class PlanConfig:
     method: Method = "closed_form"
     closed_form: ClosedFormConfig = field(default_factory=ClosedFormConfig)
     postures: PostureConfig = field(default_factory=PostureConfig)
+
+
+@dataclass(frozen=True)
+class SegmentConfig:
+    """How an object is cut out of a scene that depth cameras saw.
+
+    Attributes:
+        roi_low: lower corner of the workspace, in the cloud's frame [m]; None: no bound.
+        roi_high: upper corner of the workspace, in the cloud's frame [m]; None: no bound.
+        max_range: points farther than this from their camera are ignored [m].
+        voxel: side of the voxels that the scene is thinned by; finer than half of `gap` [m].
+        plane_tolerance: least height above the support that counts as above it, more where the camera is noisier [m].
+        support_size: the smaller side of a support's visible part is at least this [m].
+        contact: what stands on a support comes at least this near to it, occlusion and noise considered [m].
+        gap: things at least this far apart are two [m].
+        smallest_object: things smaller than this are noise [m].
+        largest_object: things larger than this are background: walls, floors, furniture [m].
+        min_points: things seen by fewer points than this are noise.
+        target_reach: a target point this near to a thing means that thing [m].
+        neighbour_reach: other things are reported as far as this from the object [m].
+    """
+
+    roi_low: tuple[float, float, float] | None = None
+    roi_high: tuple[float, float, float] | None = None
+    max_range: float = 2.0
+    voxel: float = 0.003
+    plane_tolerance: float = 0.004
+    support_size: float = 0.1
+    contact: float = 0.02
+    gap: float = 0.008
+    smallest_object: float = 0.008
+    largest_object: float = 0.35
+    min_points: int = 30
+    target_reach: float = 0.05
+    neighbour_reach: float = 0.3
 
 
 T = TypeVar("T")

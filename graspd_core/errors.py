@@ -31,3 +31,7 @@ class ConfigError(GraspdError):
 
 class FormatError(GraspdError):
     """A grasps file is not in the format or version that this reader knows."""
+
+
+class TransformError(GraspdError):
+    """Where one frame stands in another is not known, not at that time, or makes no sense."""

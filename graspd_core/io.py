@@ -16,7 +16,7 @@ from graspd_core.config import PlanConfig
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.geometry.scene import ObjectModel
 from graspd_core.hands.model import HandModel
-from graspd_core.types import Contact, Grasp, GraspMetrics, GraspResult, HoldResult, Posture, Verdict
+from graspd_core.types import Contact, Grasp, GraspMetrics, GraspResult, HoldResult, LiftResult, Posture, Verdict
 
 FORMAT, VERSION = "graspd/grasps", 1
 _METRIC_KEYS = (
@@ -51,6 +51,8 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
             "mass": target.mass,
             "friction": target.friction,
             "scale": target.scale,
+            "support": result.support
+            and {"normal": _list(result.support.normal), "offset": float(result.support.offset)},
         },
         "config": dataclasses.asdict(config),
         "seed": result.seed,
@@ -139,23 +141,28 @@ def _grasp_of(values: dict[str, Any]) -> Grasp:
     def posture(position: str, quaternion: str, joints: str) -> Posture:
         return Posture(*(np.array(values[key], dtype=float) for key in (position, quaternion, joints)))
 
-    hold = values["metrics"]["hold"]
-    verdict = Verdict(values["verdict"])
+    # Files written before there was a lift trial have no such key.
+    hold, lift = values["metrics"]["hold"], values["metrics"].get("lift")
+    verdict, reason = Verdict(values["verdict"]), values["reason"]
+    # A lift is tried only with grasps that held, so the reason is that of the last trial.
+    verified = verdict is Verdict.VERIFIED
     return Grasp(
         pregrasp=posture("pregrasp_position", "pregrasp_quaternion_wxyz", "pregrasp_joint_positions"),
         grasp=posture("position", "quaternion_wxyz", "joint_positions"),
         squeeze=posture("position", "quaternion_wxyz", "squeeze_joint_positions"),
         contacts=tuple(Contact(c["link"], tuple(c["position"]), tuple(c["normal"])) for c in values["contacts"]),
         score=values["score"],
-        hold=hold and HoldResult(
-            verdict is Verdict.VERIFIED,
-            _or_infinite(hold["max_displacement_cm"]) / 100,
-            float(np.deg2rad(_or_infinite(hold["max_rotation_deg"]))),
-            values["reason"],
-        ),
+        hold=hold and HoldResult(verified or lift is not None, *_moved_of(hold), "" if lift else reason),
         verdict=verdict,
-        reason=values["reason"],
-    )  # fmt: skip
+        reason=reason,
+        lift=lift and LiftResult(verified, *_moved_of(lift), lift["reach_through_mm"] / 1e3, reason),
+    )
+
+
+def _moved_of(trial: dict[str, float | None]) -> tuple[float, float]:
+    """Displacement [m] and rotation [rad] of a trial, infinite where they were not finite."""
+    displacement, rotation = (_or_infinite(trial[key]) for key in ("max_displacement_cm", "max_rotation_deg"))
+    return displacement / 100, float(np.deg2rad(rotation))
 
 
 def _grasp(rank: int, grasp: Grasp) -> dict[str, Any]:
@@ -172,11 +179,11 @@ def _grasp(rank: int, grasp: Grasp) -> dict[str, Any]:
         "pregrasp_position": _list(grasp.pregrasp.position),
         "pregrasp_quaternion_wxyz": _list(grasp.pregrasp.quaternion_wxyz),
         "contacts": [{"link": c.link, "position": list(c.position), "normal": list(c.normal)} for c in grasp.contacts],
-        "metrics": _metrics(grasp.metrics, grasp.hold),
+        "metrics": _metrics(grasp.metrics, grasp.hold, grasp.lift),
     }
 
 
-def _metrics(metrics: GraspMetrics | None, hold: HoldResult | None) -> dict[str, Any]:
+def _metrics(metrics: GraspMetrics | None, hold: HoldResult | None, lift: LiftResult | None) -> dict[str, Any]:
     """Every key in every grasp; null where nothing was measured or a figure is not finite."""
     values: dict[str, float | None] = dict.fromkeys(_METRIC_KEYS)
     if metrics is not None:
@@ -190,11 +197,18 @@ def _metrics(metrics: GraspMetrics | None, hold: HoldResult | None) -> dict[str,
             None if metrics.displacement is None else metrics.displacement * 100,
         )
         values = dict(zip(_METRIC_KEYS, map(_finite, figures), strict=True))
-    measured = hold and {
-        "max_displacement_cm": _finite(hold.max_displacement * 100),
-        "max_rotation_deg": _finite(float(np.rad2deg(hold.max_rotation))),
+    return {
+        **values,
+        "hold": hold and _moved(hold),
+        "lift": lift and {**_moved(lift), "reach_through_mm": lift.reach_through * 1e3},
     }
-    return {**values, "hold": measured}
+
+
+def _moved(trial: HoldResult | LiftResult) -> dict[str, float | None]:
+    return {
+        "max_displacement_cm": _finite(trial.max_displacement * 100),
+        "max_rotation_deg": _finite(float(np.rad2deg(trial.max_rotation))),
+    }
 
 
 def _finite(value: float | None) -> float | None:

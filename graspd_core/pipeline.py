@@ -12,7 +12,14 @@ import torch
 
 from graspd_core.config import VERIFICATIONS, PlanConfig, load_preset
 from graspd_core.errors import ConfigError
-from graspd_core.geometry.scene import Scene, load_scene, object_parts, scene_from_cloud
+from graspd_core.geometry.camera import PinholeCamera, camera_from_calibration
+from graspd_core.geometry.choice import Target
+from graspd_core.geometry.cloud import PointCloud, transform_cloud
+from graspd_core.geometry.depth import cloud_from_depth, depth_from_bytes
+from graspd_core.geometry.load import load_scene
+from graspd_core.geometry.perceive import scene_from_views
+from graspd_core.geometry.scene import Scene, object_parts
+from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.metrics.judge import make_judge
@@ -31,10 +38,30 @@ from graspd_core.types import (
     TriangleMesh,
     Verdict,
 )
+from graspd_core.verify.lift import lift_trial, retreat_posture
 from graspd_core.verify.trial import hold_trial, judge
 from graspd_core.verify.world import PROTOCOLS, build_world
 
-__all__ = ["check_request", "hand_names", "load_hand", "load_scene", "plan_grasps", "scene_from_cloud", "warm_up"]
+__all__ = [
+    "HandModel",
+    "PinholeCamera",
+    "PointCloud",
+    "Scene",
+    "Target",
+    "camera_from_calibration",
+    "check_request",
+    "cloud_from_depth",
+    "depth_from_bytes",
+    "hand_names",
+    "link_poses",
+    "load_hand",
+    "load_scene",
+    "plan_grasps",
+    "retreat_posture",
+    "scene_from_views",
+    "transform_cloud",
+    "warm_up",
+]
 
 T, R = TypeVar("T"), TypeVar("R")
 
@@ -61,12 +88,13 @@ def plan_grasps(
     """Plan grasps and try them in MuJoCo in rank order until `count` of them hold.
 
     Args:
-        scene: from `load_scene` or `scene_from_cloud`.
+        scene: from `load_scene` or `scene_from_views`.
         hand: from `load_hand`.
         count: verified grasps wanted (with verify="none": grasps wanted).
         seed: same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
-        verify: "standard" or "hard" hold trial, or "none".
+        verify: "standard" or "hard" hold trial, or "none". Where the object stands on something or among things, a
+            lift trial of the same physics follows, and a grasp is verified when it passes both.
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
         progress: called from this thread with `Progress` values.
@@ -119,7 +147,7 @@ def plan_grasps(
         total=finished - run.began + load + sdf,
     )
     run.report(Stage.DONE, 1, 1, 0.0, good)
-    return GraspResult(outcome, grasps, timing, seed, config.method, warnings=scene.object.warnings)
+    return GraspResult(outcome, grasps, timing, seed, config.method, "", scene.object.warnings, scene.support)
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
@@ -192,16 +220,21 @@ def _verify(
     if not candidates or run.over():
         return (), None
     world = build_world(hand, scene.object, parts.result(), protocol)
+    around = None
+    if scene.support is not None or scene.neighbours:
+        around = build_world(hand, scene.object, parts.result(), protocol, scene.support, scene.neighbours)
     metrics_judge = make_judge(scene.object, hand)
     for index, grasp in enumerate(candidates):
         if len(verified) == count or run.over():
             break
         hold = hold_trial(world, grasp, protocol, stop=run.over)
-        if run.over() and not hold.passed:
+        lift = lift_trial(around, hand, grasp, protocol, stop=run.over) if around and hold.passed else None
+        passed = hold.passed and (lift is None or lift.passed)
+        if run.over() and not passed:
             # A trial that was cut short says nothing of the grasp.
             break
-        tried = judge(replace(grasp, metrics=measure(metrics_judge, grasp.grasp)), hold)
-        if hold.passed:
+        tried = judge(replace(grasp, metrics=measure(metrics_judge, grasp.grasp)), hold, lift)
+        if passed:
             first = first or time.perf_counter()
             verified.append(tried)
         else:

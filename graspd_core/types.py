@@ -100,6 +100,25 @@ class HoldResult:
 
 
 @dataclass(frozen=True)
+class LiftResult:
+    """What a lift trial measured.
+
+    Attributes:
+        passed: whether the hand came, closed and lifted without reaching through anything or losing the object.
+        max_displacement: how far the object's centre of mass was at most from where the hand should have had it [m].
+        max_rotation: object turn from how it stood [rad].
+        reach_through: greatest depth of the hand's postures in the support or a neighbour, zero where clear [m].
+        reason: why it failed, empty when it passed.
+    """
+
+    passed: bool
+    max_displacement: float
+    max_rotation: float
+    reach_through: float
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class GraspMetrics:
     """Static quality of one grasp, measured by `graspd_core.metrics` (definitions: docs/metrics.md).
 
@@ -150,9 +169,10 @@ class Grasp:
         contacts: one per touching link.
         score: the optimiser's own measure, larger is better; ranks grasps before any trial.
         metrics: static quality, None until measured.
-        hold: the trial's figures, None until run.
+        hold: the hold trial's figures, None until run.
         verdict: verified, unverified (no trial asked) or failed.
         reason: why it failed, empty otherwise.
+        lift: the lift trial's figures; None until run, and in scenes with nothing but the object.
     """
 
     pregrasp: Posture
@@ -164,6 +184,7 @@ class Grasp:
     hold: HoldResult | None = None
     verdict: Verdict = Verdict.UNVERIFIED
     reason: str = ""
+    lift: LiftResult | None = None
 
 
 @dataclass(frozen=True)
@@ -209,7 +230,10 @@ class Timing:
 
 @dataclass(frozen=True)
 class GraspResult:
-    """What a run gives back: an outcome, always, and the grasps in rank order, verified ones first."""
+    """What a run gives back: an outcome, always, and the grasps in rank order, verified ones first.
+
+    `support` is what the object stood on, None where it floated.
+    """
 
     outcome: Outcome
     grasps: tuple[Grasp, ...]
@@ -218,3 +242,4 @@ class GraspResult:
     method: str
     message: str = ""
     warnings: tuple[str, ...] = field(default=())
+    support: Plane | None = None

@@ -1,6 +1,6 @@
 """Grasps to ROS messages and to the JSON events of `~/status`.
 
-Quaternions turn from wxyz (core) to xyzw (ROS) in `pose_of`, and nowhere else. No message carries a NaN.
+Quaternions turn from wxyz (core) to xyzw (ROS) in `pose_of`. No message carries a NaN.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ def pose_message(grasp: Grasp, frame: str, stamp: Time) -> PoseStamped:
     return PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of(grasp.grasp))
 
 
-def joint_message(grasp: Grasp, joint_names: Sequence[str], base_link: str, stamp: Time) -> JointState:
-    """Joint values at the grasp [rad]; no velocities and no efforts."""
+def joint_message(posture: Posture, joint_names: Sequence[str], base_link: str, stamp: Time) -> JointState:
+    """Joint values of a posture [rad]; no velocities and no efforts."""
     return JointState(
         header=Header(frame_id=base_link, stamp=stamp),
         name=list(joint_names),
-        position=[float(value) for value in grasp.grasp.joint_positions],
+        position=[float(value) for value in posture.joint_positions],
     )
 
 
@@ -49,8 +49,12 @@ def presentable(result: GraspResult) -> Grasp | None:
 
 def progress_event(progress: Progress) -> dict[str, Any]:
     """A progress report; `fraction` is that of its stage."""
-    fraction = min(progress.step / progress.of, 1.0) if progress.of > 0 else 0.0
-    return {**dataclasses.asdict(progress), "fraction": fraction}
+    return {**dataclasses.asdict(progress), "fraction": fraction_of(progress)}
+
+
+def fraction_of(progress: Progress) -> float:
+    """How much of its stage is done, 0 to 1; 0 where nobody knows."""
+    return min(progress.step / progress.of, 1.0) if progress.of > 0 else 0.0
 
 
 def result_event(result: GraspResult) -> dict[str, Any]:

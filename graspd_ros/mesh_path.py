@@ -8,6 +8,8 @@ from urllib.parse import unquote, urlsplit
 
 from graspd_core.errors import MeshError
 
+MOST_MESH_BYTES = 10**8  # an OBJ of some 1.5 million faces; reading more takes minutes and gigabytes
+MOST_PATH = 4096
 _FORMS = "a path, file:///path or package://package/path"
 
 
@@ -18,9 +20,12 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
     A root may itself be a `package://` name; one whose package is not installed is left out.
 
     Raises:
-        MeshError: an empty or unknown form, a package that is not installed, a path outside every root, no such file.
+        MeshError: an empty or unknown form, a package that is not installed, a path outside every root, no such
+            file, a file too large.
     """
     uri = uri.strip()
+    if len(uri) > MOST_PATH:
+        raise MeshError(f"the mesh path is {len(uri)} characters long; at most {MOST_PATH} are looked at")
     if not uri:
         raise MeshError(f"the mesh path is empty; give {_FORMS}")
     allowed = allowed_roots(roots)
@@ -33,6 +38,8 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
         if not path.is_file():
             kind = "a directory, not a mesh file" if path.is_dir() else "no such file"
             raise MeshError(f"{uri}: {kind} (looked at {path})")
+        if (size := path.stat().st_size) > MOST_MESH_BYTES:
+            raise MeshError(f"{uri}: {size / 1e6:.0f} MB; at most {MOST_MESH_BYTES / 1e6:.0f} MB are read")
     except (OSError, ValueError) as error:
         raise MeshError(f"{uri!r}: not a usable path: {error}") from None
     return path

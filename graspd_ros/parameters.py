@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -16,6 +17,10 @@ from graspd_core.errors import ConfigError
 from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
+MOST_GRASPS = 256
+BUDGETS = (0.1, 3600.0)  # seconds
+SCALES = (1e-6, 1e6)
+WORKSPACE = 10.0  # metres from the camera: beyond any depth sensor that grasps
 
 
 def _setting(
@@ -25,7 +30,7 @@ def _setting(
     low: float | None = None,
     high: float | None = None,
     choices: Iterable[str] = (),
-    check: Callable[[str], object] | None = None,
+    check: Callable[[Any], object] | None = None,
     read_only: bool = False,
 ) -> Any:
     metadata = {
@@ -50,6 +55,11 @@ def _check_device(name: str) -> None:
         raise ConfigError(f"{name!r} is not a device of this machine; valid: {', '.join(valid)}") from None
 
 
+def _check_corner(corner: list[float]) -> None:
+    if len(corner) != 3 or not np.isfinite(corner).all():
+        raise ConfigError(f"{list(corner)} is no corner; give three finite numbers, x, y and z in metres")
+
+
 @dataclass(frozen=True)
 class Settings:
     """The parameters as they stood when a request came; the descriptions are those that `ros2 param describe` shows."""
@@ -59,27 +69,49 @@ class Settings:
     torch_threads: int = _setting(
         1, "threads of the optimiser; more than 1 costs time on a shared machine", low=1, high=64, read_only=True
     )
-    queue_size: int = _setting(4, "mesh requests that may wait", low=0, high=64, read_only=True)
-    busy_policy: str = _setting("queue", "what a mesh request does while the node is busy", choices=BusyPolicy)
+    queue_size: int = _setting(4, "requests that may wait", low=0, high=64, read_only=True)
+    busy_policy: str = _setting("queue", "what a request does while the node is busy", choices=BusyPolicy)
     cloud_policy: str = _setting(
         "newest",
         "newest: a cloud waits until the node is idle, and a newer one takes its place; each: every cloud is a request "
         "under busy_policy; off: clouds are not taken",
         choices=CLOUD_POLICIES,
     )
-    num_grasps: int = _setting(8, "grasps to optimise and, with a trial, to verify", low=1, high=256)
+    cloud_max_age: float = _setting(
+        5.0, "clouds and depth images older than this are refused [s]; 0: none is", low=0.0, high=1e6
+    )
+    segment: bool = _setting(
+        True, "whether the object is cut out of the cloud; false: clouds show the object and nothing else"
+    )
+    voxel_size: float = _setting(0.0, "clouds are thinned to one point a cube of this side [m]; 0: not", low=0, high=1)
+    roi_min: list[float] = _setting(
+        [-WORKSPACE] * 3, "lower corner of the workspace, in the frame of the cloud [m]", check=_check_corner
+    )
+    roi_max: list[float] = _setting(
+        [WORKSPACE] * 3, "upper corner of the workspace, in the frame of the cloud [m]", check=_check_corner
+    )
+    fixed_frame: str = _setting("", "frame that ~/add_view keeps views in, by /tf; empty: that of the first view")
+    output_frame: str = _setting("", "frame of the results, by /tf; empty: the frame of the input")
+    num_grasps: int = _setting(8, "grasps to optimise and, with a trial, to verify", low=1, high=MOST_GRASPS)
     preset: str = _setting("balanced", "name of a shipped preset, or path of a preset's yaml file", check=load_preset)
     verify: str = _setting("standard", "the hold trial that a grasp must pass", choices=VERIFICATIONS)
-    deadline: float = _setting(60.0, "time that one request may take [s]", low=0.1, high=3600.0)
-    seed: int = _setting(0, "seed of the random starts", low=0, high=2**31 - 1)
+    deadline: float = _setting(60.0, "time that one request may take [s]", low=BUDGETS[0], high=BUDGETS[1])
+    seed: int = _setting(0, "seed of the random starts", low=0, high=2**63 - 1)
     mass: float = _setting(0.1, "mass of the object [kg]", low=0.001, high=100.0)
     friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
-    mesh_scale: float = _setting(1.0, "factor from the mesh file's unit to metres", low=1e-6, high=1e6)
+    mesh_scale: float = _setting(1.0, "factor from the mesh file's unit to metres", low=SCALES[0], high=SCALES[1])
     mesh_frame: str = _setting("object", "frame id of grasps on a mesh: the mesh's own frame")
     mesh_roots: list[str] = _setting(
         [".", "package://graspd_ros"], "directories that meshes may be read from: paths or package://name"
     )
     progress_rate: float = _setting(10.0, "most progress reports a second [Hz]", low=0.1, high=10.0)
+    joint_speed: float = _setting(1.0, "top speed of the fingers in a trajectory [rad/s]", low=0.01, high=100.0)
+    base_speed: float = _setting(0.05, "top speed of the hand's base in a trajectory [m/s]", low=0.001, high=10.0)
+    base_turn: float = _setting(
+        0.5, "top turning speed of the hand's base in a trajectory [rad/s]", low=0.01, high=100.0
+    )
+    shortest_stage: float = _setting(1.0, "least time of each stage of a trajectory [s]", low=0.01, high=100.0)
+    publish_markers: bool = _setting(True, "whether ~/markers shows the result")
     output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
 
 
@@ -104,8 +136,9 @@ def declare_settings(node: Node) -> Settings:
 
 def read_settings(node: Node) -> Settings:
     """The parameters as they are now."""
-    values: dict[str, Any] = {s.name: node.get_parameter(s.name).value for s in dataclasses.fields(Settings)}
-    values["mesh_roots"] = list(values["mesh_roots"] or [])
+    values: dict[str, Any] = {s.name: _word(s, node.get_parameter(s.name).value) for s in dataclasses.fields(Settings)}
+    for name in ("mesh_roots", "roi_min", "roi_max"):
+        values[name] = list(values[name] or [])
     return Settings(**values)
 
 
@@ -123,7 +156,7 @@ def _check_value(name: str, value: Any) -> None:
     setting = Settings.__dataclass_fields__.get(name)
     if setting is None:
         return  # ROS has parameters of its own on every node
-    choices, check = setting.metadata["choices"], setting.metadata["check"]
+    choices, check, value = setting.metadata["choices"], setting.metadata["check"], _word(setting, value)
     if choices and value not in choices:
         raise ConfigError(f"parameter {name}: {value!r} is not one of {', '.join(choices)}")
     if check is not None:
@@ -133,11 +166,19 @@ def _check_value(name: str, value: Any) -> None:
             raise ConfigError(f"parameter {name}: {error}") from None
 
 
+def _word(setting: dataclasses.Field, value: Any) -> Any:
+    """The value; YAML, and with it the command line, reads an unquoted `off` as a truth value."""
+    if isinstance(value, bool) and "off" in setting.metadata["choices"]:
+        return "on" if value else "off"
+    return value
+
+
 def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
     choices = setting.metadata["choices"]
     descriptor = ParameterDescriptor(
         description=setting.metadata["description"],
         read_only=setting.metadata["read_only"],
+        dynamic_typing="off" in choices,
         additional_constraints=f"one of {', '.join(choices)}" if choices else "",
     )
     if setting.metadata["range"] is not None:

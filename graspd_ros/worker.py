@@ -31,6 +31,14 @@ class Ending(StrEnum):
     SUPERSEDED = "superseded"
 
 
+class Refusal(StrEnum):
+    """Why `submit` did not take a request."""
+
+    BUSY = "busy"
+    DUPLICATE = "duplicate"
+    STOPPING = "stopping"
+
+
 class Request(Protocol):
     """What the worker needs to know of a request.
 
@@ -50,20 +58,24 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Admission:
-    """The answer to `submit`: taken or not, and why not; `ahead` requests come before it."""
+    """The answer to `submit`: taken or, where there is a refusal, why not; `ahead` requests come before it."""
 
-    accepted: bool
+    refusal: Refusal | None = None
     reason: str = ""
     ahead: int = 0
+
+    @property
+    def accepted(self) -> bool:
+        return self.refusal is None
 
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """The end of a request: `value` when done, `error` when failed."""
+    """The end of a request: `error` when failed; `value` when done, and what there was when it was told to end."""
 
     ending: Ending
     value: V | None = None
-    error: Exception | None = None
+    error: BaseException | None = None
 
 
 class Worker(Generic[R, V]):
@@ -88,11 +100,12 @@ class Worker(Generic[R, V]):
         self._work = work
         self._finish = finish
         self._prepare = prepare
-        self._queue_size = queue_size
+        self.queue_size = queue_size
         self._condition = threading.Condition()
         self._waiting: deque[R] = deque()
         self._newest: R | None = None
         self._running: R | None = None
+        self._live: set[str] = set()  # ids of those accepted and not yet told to have ended
         self._ending: Ending | None = None  # what the running request was told to end as
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="graspd_worker", daemon=True)
@@ -102,21 +115,16 @@ class Worker(Generic[R, V]):
         self._thread.start()
 
     def submit(self, request: R, policy: BusyPolicy) -> Admission:
-        """Take a request or say why not. An `only_newest` request is always taken, whatever the policy."""
+        """Take a request or say why not. An `only_newest` request is taken whatever the policy."""
         superseded: list[R] = []
         with self._condition:
             ahead = len(self._waiting) + (self._running is not None)
-            if self._stopping:
-                return Admission(False, "the node is shutting down")
+            refused = self._refusal(request, policy, ahead)
+            if refused:
+                return refused
             if request.only_newest:
                 superseded = [self._newest] if self._newest else []
                 self._newest = request
-            elif policy is BusyPolicy.REJECT and ahead:
-                return Admission(False, "busy with another request, and busy_policy is reject")
-            elif policy is BusyPolicy.QUEUE and ahead > self._queue_size:
-                return Admission(
-                    False, f"the queue is full: one runs, {ahead - 1} of queue_size={self._queue_size} wait"
-                )
             else:
                 if policy is BusyPolicy.REPLACE:
                     superseded = list(self._waiting)
@@ -124,24 +132,58 @@ class Worker(Generic[R, V]):
                     self._ending = self._ending or (Ending.SUPERSEDED if self._running else None)
                     ahead = int(self._running is not None)
                 self._waiting.append(request)
+            self._live.add(request.id)
             self._condition.notify()
-        for old in superseded:
-            self._finish(old, Report(Ending.SUPERSEDED))
-        return Admission(True, ahead=ahead)
+        self._end_all(superseded, Report(Ending.SUPERSEDED))
+        return Admission(ahead=ahead)
+
+    def _refusal(self, request: R, policy: BusyPolicy, ahead: int) -> Admission | None:
+        if self._stopping:
+            return Admission(Refusal.STOPPING, "the node is shutting down")
+        if request.id in self._live:
+            return Admission(Refusal.DUPLICATE, f"a request {request.id!r} is already waiting or running")
+        if request.only_newest or policy is BusyPolicy.REPLACE:
+            return None
+        if policy is BusyPolicy.REJECT and ahead:
+            return Admission(Refusal.BUSY, "busy with another request, and busy_policy is reject")
+        if policy is BusyPolicy.QUEUE and ahead > self.queue_size:
+            told = f"the queue is full: one runs, {ahead - 1} of queue_size={self.queue_size} wait"
+            return Admission(Refusal.BUSY, told)
+        return None
 
     def cancel(self, request_id: str) -> int:
         """Cancel a waiting or running request, or all of them when the id is empty; returns how many."""
         with self._condition:
-            dropped = [r for r in [*self._waiting, self._newest] if r and request_id in ("", r.id)]
-            self._waiting = deque(r for r in self._waiting if r not in dropped)
-            if self._newest in dropped:
-                self._newest = None
+            dropped = self._take_out(lambda request: request_id in ("", request.id))
             running = self._running is not None and request_id in ("", self._running.id)
             if running:
                 self._ending = Ending.CANCELLED
-        for request in dropped:
-            self._finish(request, Report(Ending.CANCELLED))
+        self._end_all(dropped, Report(Ending.CANCELLED))
         return len(dropped) + running
+
+    def end_waiting(self, which: Callable[[R], bool], report: Report[V]) -> int:
+        """End those of the waiting requests that `which` picks with a report; returns how many."""
+        with self._condition:
+            dropped = self._take_out(which)
+        self._end_all(dropped, report)
+        return len(dropped)
+
+    def _take_out(self, which: Callable[[R], bool]) -> list[R]:
+        dropped = [r for r in [*self._waiting, self._newest] if r is not None and which(r)]
+        self._waiting = deque(r for r in self._waiting if r not in dropped)
+        if self._newest in dropped:
+            self._newest = None
+        return dropped
+
+    def state(self) -> tuple[str | None, int]:
+        """Id of the running request, and how many wait."""
+        with self._condition:
+            running = self._running.id if self._running else None
+            return running, len(self._waiting) + (self._newest is not None)
+
+    def alive(self) -> bool:
+        """Whether the thread still serves."""
+        return self._thread.is_alive()
 
     def stopping(self) -> bool:
         """Whether `stop` was called; long work outside requests polls this."""
@@ -163,12 +205,20 @@ class Worker(Generic[R, V]):
             report = self._done(request)
             with self._condition:
                 told, self._running, self._ending = self._ending, None, None
-            self._finish(request, Report(told) if told else report)
+            self._end_all([request], Report(told, value=report.value) if told else report)
+
+    def _end_all(self, requests: list[R], report: Report[V]) -> None:
+        for request in requests:
+            try:
+                self._finish(request, report)
+            finally:
+                with self._condition:
+                    self._live.discard(request.id)
 
     def _done(self, request: R) -> Report[V]:
         try:
             return Report(Ending.DONE, value=self._work(request, self._should_stop))
-        except Exception as error:  # whatever one request does, the next one is still served
+        except BaseException as error:  # SystemExit too: whatever one request does, the next one is still served
             return Report(Ending.FAILED, error=error)
 
     def _next(self) -> R | None:

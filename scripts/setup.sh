@@ -34,19 +34,26 @@ apt_install() {
         >"$log" 2>&1 || { tail -n 5 "$log" >&2; return 1; }
 }
 
-missing_libraries() {
+missing_packages() {
     local entry
     for entry in "${required[@]}"; do
         "$1" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "${entry%%:*}" 2>/dev/null || echo "${entry##*:}"
     done
+    # The interface package graspd_msgs is compiled.
+    { command -v "${CC:-cc}" && command -v "${CXX:-c++}"; } >/dev/null || echo build-essential
+    "$1" - <<'END'
+import os, sys, sysconfig
+if not os.path.exists(sysconfig.get_path("include") + "/Python.h"):
+    print("python%d.%d-dev" % sys.version_info[:2])
+END
 }
 
-install_libraries() {
+install_packages() {
     local packages
-    mapfile -t packages < <(missing_libraries "$1")
+    mapfile -t packages < <(missing_packages "$1")
     [ ${#packages[@]} -eq 0 ] && return
     if ! may_apt || ! apt_install "${packages[@]}"; then
-        fail "missing system libraries; install them once with: sudo apt-get install ${packages[*]}"
+        fail "missing system packages; install them once with: sudo apt-get install ${packages[*]}"
     fi
 }
 
@@ -63,7 +70,7 @@ ensure_venv_module() {
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 python=$(choose_python)
-install_libraries "$python"
+install_packages "$python"
 # Kept when it works; a half-built, moved or other-versioned one is made anew.
 if ! suitable "$venv/bin/python" || ! "$venv/bin/python" -m pip --version >/dev/null 2>&1 \
     || { [ -n "$wanted" ] && [ "$("$venv/bin/python" -V)" != "$("$wanted" -V)" ]; }; then
@@ -73,5 +80,16 @@ if ! suitable "$venv/bin/python" || ! "$venv/bin/python" -m pip --version >/dev/
 fi
 echo "setup: installing packages into $venv (about 3 GB, a few minutes the first time)"
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE # another environment's ROS may have set it
-"$venv/bin/python" -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[ros,dev]"
+pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
+"${pip[@]}" -c constraints.txt -e ".[ros,dev]" "setuptools>=70.1"
+echo "setup: compiling the messages of graspd_msgs (20 seconds)"
+# Against the very libraries that it will be loaded with; what it needs is installed by now.
+"${pip[@]}" --no-build-isolation --no-deps ./msg_defs
+# /tf has a type that comes with ROS and is not on PyPI.
+if ! "$venv/bin/python" -c 'import tf2_msgs.msg' 2>/dev/null; then
+    build=$(mktemp -d)
+    cp -r scripts/tf2_msgs/. msg_defs/setup.py msg_defs/pyproject.toml "$build"
+    "${pip[@]}" --no-build-isolation --no-deps "$build"
+    rm -r "$build"
+fi
 echo "setup: done"

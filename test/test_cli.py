@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd_core import cli, pipeline
-from graspd_core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, main
+from graspd_core import pipeline
+from graspd_core.cli import main
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.geometry.mesh import save_mesh, surface_samples
 from graspd_core.geometry.shapes import make_shape
 from graspd_core.io import load_document
@@ -173,7 +174,7 @@ def test_every_outcome_has_its_status(
 
 def test_the_first_interrupt_ends_the_run_and_the_second_the_process():
     before = signal.getsignal(signal.SIGINT)
-    with cli._Interrupt() as interrupt:
+    with Interrupt() as interrupt:
         assert not interrupt.came()
         signal.raise_signal(signal.SIGINT)
         assert interrupt.came()

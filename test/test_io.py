@@ -12,7 +12,7 @@ import pytest
 
 from graspd_core.config import PlanConfig
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.geometry.scene import load_scene
+from graspd_core.geometry.load import load_scene
 from graspd_core.hands.library import load_hand
 from graspd_core.io import check_writable, grasps_of, load_document, result_document, save_result
 from graspd_core.types import (
@@ -21,7 +21,9 @@ from graspd_core.types import (
     GraspMetrics,
     GraspResult,
     HoldResult,
+    LiftResult,
     Outcome,
+    Plane,
     Posture,
     Timing,
     Verdict,
@@ -43,7 +45,7 @@ TOP = {
     "grasps",
 }
 HAND = {"name", "urdf", "base_link", "joint_names"}
-OBJECT = {"source", "sha256", "center_of_mass", "mass", "friction", "scale"}
+OBJECT = {"source", "sha256", "center_of_mass", "mass", "friction", "scale", "support"}
 TIMING = {"load", "sdf", "compile", "optimise", "verify", "first_verified", "total"}
 GRASP = {
     "rank", "verdict", "reason", "score", "position", "quaternion_wxyz", "joint_positions", "pregrasp_joint_positions",
@@ -51,7 +53,7 @@ GRASP = {
 }  # fmt: skip
 METRICS = {
     "contact_area_cm2", "intersection_volume_cm3", "penetration_mm", "self_penetration_mm", "epsilon", "volume",
-    "sd_cm", "hold",
+    "sd_cm", "hold", "lift",
 }  # fmt: skip
 
 
@@ -153,6 +155,39 @@ def test_a_grasp_that_was_never_tried_has_no_hold(result, target, hand):
     written = result_document(untried, target, hand, PlanConfig())
     assert written["grasps"][0]["metrics"]["hold"] is None
     assert grasps_of(written)[0].hold is None
+
+
+def test_lift_and_support_are_written_and_read_back(result, target, hand):
+    held = result.grasps[0]
+    lifted = replace(held, lift=LiftResult(True, 0.02, 0.2, 0.0004))
+    dropped = replace(
+        held, lift=LiftResult(False, 0.06, 0.1, 0.0, "dropped"), verdict=Verdict.FAILED, reason="dropped"
+    )  # fmt: skip
+    table = Plane(np.array([0.0, 0.0, 1.0]), -0.05)
+    written = result_document(replace(result, grasps=(lifted, dropped), support=table), target, hand, PlanConfig())
+    assert json.loads(json.dumps(written, allow_nan=False)) == written
+    assert written["object"]["support"] == {"normal": [0.0, 0.0, 1.0], "offset": -0.05}
+    assert written["grasps"][0]["metrics"]["lift"] == {
+        "max_displacement_cm": pytest.approx(2.0),
+        "max_rotation_deg": pytest.approx(np.rad2deg(0.2)),
+        "reach_through_mm": pytest.approx(0.4),
+    }
+    for before, after in zip((lifted, dropped), grasps_of(written), strict=True):
+        assert after.hold is not None
+        assert after.hold.passed
+        assert after.hold.reason == ""
+        assert before.lift is not None
+        assert after.lift is not None
+        assert (after.lift.passed, after.lift.reason) == (before.lift.passed, before.lift.reason)
+        assert after.lift.reach_through == pytest.approx(before.lift.reach_through)
+
+
+def test_without_a_lift_there_is_none_and_files_from_before_there_was_one_are_read(document):
+    assert document["object"]["support"] is None
+    assert document["grasps"][0]["metrics"]["lift"] is None
+    assert grasps_of(document)[0].lift is None
+    del document["grasps"][0]["metrics"]["lift"]
+    assert grasps_of(document)[0].lift is None
 
 
 @pytest.mark.parametrize(

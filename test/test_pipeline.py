@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from graspd_core import pipeline
 from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
 from graspd_core.pipeline import load_hand, load_scene, plan_grasps
-from graspd_core.types import Grasp, GraspResult, Outcome, Progress, Stage, Verdict
+from graspd_core.types import Grasp, GraspResult, LiftResult, Outcome, Plane, Progress, Stage, Verdict
 
 # How late a run may end: one optimiser step on a busy machine, not the seconds that a run takes.
 LATE = 0.5
@@ -54,6 +55,37 @@ def test_grasps_called_verified_have_passed_and_come_first(result):
         assert grasp.hold.passed == (grasp.verdict is Verdict.VERIFIED) == (grasp.reason == "")
         assert grasp.metrics is not None
         assert grasp.contacts
+
+
+def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result):
+    table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()))
+    on_table = plan_grasps(replace(scene, support=table), hand, count=1, seed=3, preset="fast")
+    assert on_table.outcome is Outcome.SUCCEEDED
+    assert on_table.support is table
+    best = on_table.grasps[0]
+    assert best.verdict is Verdict.VERIFIED
+    assert best.hold is not None
+    assert best.lift is not None
+    assert best.hold.passed
+    assert best.lift.passed
+    assert result.support is None
+    assert all(grasp.lift is None for grasp in result.grasps)
+
+
+def test_a_grasp_that_holds_but_cannot_be_lifted_is_not_verified(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
+    lost = LiftResult(False, 0.06, 0.0, 0.0, "the object moved 6.0 cm while lifting")
+    monkeypatch.setattr(pipeline, "lift_trial", lambda *_, **__: lost)
+    table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()))
+    tried: list[Progress] = []
+    short = plan_grasps(
+        replace(scene, support=table), hand, count=1, seed=3, preset="fast",
+        progress=lambda p: tried.append(p) if p.stage is Stage.VERIFY else None, stop=lambda: len(tried) == 4,
+    )  # fmt: skip
+    assert short.outcome is Outcome.CANCELLED
+    held = [grasp for grasp in short.grasps if grasp.hold and grasp.hold.passed]
+    assert held
+    assert all((g.verdict, g.reason, g.lift) == (Verdict.FAILED, lost.reason, lost) for g in held)
+    assert not any(grasp.lift for grasp in short.grasps if grasp.hold and not grasp.hold.passed)
 
 
 def test_joint_limits_hold_exactly_and_quaternions_are_unit(result, hand):

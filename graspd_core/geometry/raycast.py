@@ -8,12 +8,12 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from graspd_core.geometry.camera import PinholeCamera, camera_rays
 from graspd_core.geometry.embree import first_hits
 from graspd_core.types import TriangleMesh
 
@@ -21,24 +21,6 @@ Vector = Sequence[float | int] | Float[np.ndarray, "3"]
 
 BACKGROUND = 255
 AMBIENT = 0.25
-
-
-@dataclass(frozen=True)
-class PinholeCamera:
-    """An ideal camera.
-
-    Attributes:
-        width, height: size of its image [pixels].
-        fx, fy: focal lengths [pixels].
-        cx, cy: where the optical axis meets the image [pixels].
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
 
 def camera_of_view(width: int, height: int, field_of_view: float = 0.7) -> PinholeCamera:
@@ -72,9 +54,15 @@ def render_depth(
     return np.where(np.isfinite(distance), distance, 0.0)
 
 
-def cloud_from_depth(depth: Float[np.ndarray, "height width"], camera: PinholeCamera) -> Float[np.ndarray, "points 3"]:
-    """The seen points in the camera's frame [m]; pixels of depth 0 give none."""
-    return (_rays(camera) * depth[..., None])[depth > 0]
+def render_scene(
+    meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
+    """Distance along the optical axis [m], 0 where the ray meets nothing, and which mesh it meets, -1 for none."""
+    distance, face, _ = _cast(_joined(meshes), camera, T_world_camera)
+    hit = np.isfinite(distance)
+    label = np.full(distance.shape, -1)
+    label[hit] = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])[face[hit]]
+    return np.where(hit, distance, 0.0), label
 
 
 def render_shaded(
@@ -85,11 +73,7 @@ def render_shaded(
     height: int = 480,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
-    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh, _ in meshes[:-1]])
-    together = TriangleMesh(
-        np.vstack([mesh.vertices for mesh, _ in meshes]),
-        np.vstack([mesh.faces + offset for (mesh, _), offset in zip(meshes, offsets, strict=True)]),
-    )
+    together = _joined([mesh for mesh, _ in meshes])
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
     distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
     hit = np.isfinite(distance)
@@ -115,14 +99,19 @@ def save_png(image: UInt8[np.ndarray, "height width 3"], path: str | Path) -> No
     Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
 
 
-def _rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
-    """Directions of unit depth, camera frame."""
-    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], -1)
+def _joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    return TriangleMesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
 
 
 def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
     """Depth (infinite where nothing is hit), face index and unit face normal of each pixel."""
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    return first_hits(TriangleMesh(mesh.vertices - position, mesh.faces), _rays(camera) @ rotation.T)
+    rays = camera_rays(camera)
+    # Pixels beyond the lens's range look nowhere.
+    blind = np.isnan(rays[..., 0])
+    distance, face, normal = first_hits(
+        TriangleMesh(mesh.vertices - position, mesh.faces), np.nan_to_num(rays) @ rotation.T
+    )
+    return np.where(blind, np.inf, distance), face, normal

@@ -1,239 +1,197 @@
-"""From a cloud to a closed mesh.
+"""From one or more views of an object to a closed mesh, saying how it was made and how far each part was seen.
 
-A cloud seen from all round is surfaced by screened Poisson (Kazhdan and Hoppe 2013). A single view shows only the
-front: the back is guessed as the front's reflection through the centre of the silhouette, which is exact for boxes,
-balls, cylinders and all that is point-symmetric, and gives a cup seen from above its walls; where that contradicts what
-was seen, as the front's mirror image across the silhouette's depth. The guess is named in the warnings.
+What was seen is surfaced by screened Poisson with normals towards each view's camera; what was not is completed first,
+by the symmetry, revolution or extrusion that the evidence favours; what the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from graspd_core.errors import CloudError
 from graspd_core.geometry.cloud import PointCloud, clean_cloud
-from graspd_core.geometry.mesh import check_mesh
+from graspd_core.geometry.complete import OPEN, complete
+from graspd_core.geometry.evidence import Evidence, make_sight
+from graspd_core.geometry.extrude import LOW, stand
+from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step
+from graspd_core.geometry.mesh import check_mesh, simplify
+from graspd_core.geometry.poisson import close_surface, fit_poisson, part_walls
 from graspd_core.geometry.topology import is_closed
-from graspd_core.types import TriangleMesh
+from graspd_core.types import Plane, TriangleMesh
+
+# Seen surface is trusted fully to the first distance from a seen point [m], guessed surface not at all past the second.
+TRUSTED, GUESSED = 0.004, 0.02
+# Faces of the result at most.
+MOST_FACES = 16_000
+# Share of the seen points that must lie within this [m] of the result.
+FITTED, FIT = 0.85, 0.004
+# Points of one view that are looked at.
+MOST_POINTS = 120_000
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A closed surface and how it came about.
+
+    Attributes:
+        mesh: closed, in the frame of the views [m].
+        trust: of each vertex, 1 where the surface was seen, falling to 0 at 2 cm from it.
+        method: "poisson", and what completed it, e.g. "poisson, revolution".
+        warnings: what was guessed, one sentence each.
+    """
+
+    mesh: TriangleMesh
+    trust: Float[np.ndarray, "vertices"]
+    method: str
+    warnings: tuple[str, ...]
+
+
+def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) -> Reconstruction:
+    """The closed surface of the object that the views show.
+
+    Args:
+        views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
+            cloud that shows it from all round may stand for many views.
+        support: what the object stands on, in the same frame.
+
+    Raises:
+        CloudError: too few points, or no closed surface fits them.
+    """
+    from scipy.spatial import KDTree
+
+    views = _clean(views)
+    rotation, origin = _frame(views, support)
+    local = [PointCloud((v.points - origin) @ rotation, (v.viewpoint - origin) @ rotation) for v in views]
+    step = point_step(local)
+    standing = support is not None
+    warnings: tuple[str, ...] = ()
+    method = "poisson"
+    if all_round(local):
+        seen, evidence = _all_round(local, step), Evidence((), standing)
+        known = seen
+    else:
+        seen = merge_views(local, step)
+        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
+        evidence = Evidence(tuple(make_sight(v) for v in local), standing, lowest)
+        guess = complete(seen, evidence, step)
+        known = join(seen, guess.surfels)
+        known = join(known, stand(known, evidence, step)) if standing else known
+        method += f", {guess.method}" if guess.method else ""
+        if guess.method or guess.openness > OPEN:
+            warnings = (_sentence(len(views), guess.method),)
+    known = part_walls(known)
+    mesh = close_surface(fit_poisson(known), known, evidence)
+    mesh = _finished(mesh, seen)
+    distance, _ = KDTree(seen.points).query(mesh.vertices)
+    trust = np.clip((GUESSED - distance) / (GUESSED - TRUSTED), 0.0, 1.0)
+    return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), trust, method, warnings)
+
+
+def all_round(views: Sequence[PointCloud]) -> bool:
+    """Whether a single cloud shows surface behind surface, as no camera sees it."""
+    return len(views) == 1 and _layered_share(views[0]) > LAYERED_SHARE
+
 
 # A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
 # this share of exceptions, the cloud is taken to show the object from all round.
 STEEPEST = 4.0
 LAYERED_SHARE = 0.15
 
-# Cells of the height maps across the object's larger side, as far as the points are dense enough.
-CELLS = 72
 
-
-@dataclass(frozen=True)
-class _Slab:
-    """A solid between two height maps over the image plane; depth grows away from the camera.
-
-    Attributes:
-        mask: where the object is.
-        front, back: depth of the near and far surface [m], NaN outside the mask.
-        low: image-plane position of the first cell [m].
-        cell: side of a cell [m].
-    """
-
-    mask: Bool[np.ndarray, "x y"]
-    front: Float[np.ndarray, "x y"]
-    back: Float[np.ndarray, "x y"]
-    low: Float[np.ndarray, "2"]
-    cell: float
-
-
-def reconstruct(
-    points: Float[np.ndarray, "n 3"], *, viewpoint: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """A closed mesh of the object that the points show, and what was guessed.
-
-    Args:
-        points: the object's points alone [m]; NaN and stray points are dropped.
-        viewpoint: where the camera stood [m].
-
-    Raises:
-        CloudError: too few points, or no closed surface fits them.
-    """
-    cloud = clean_cloud(points, np.asarray(viewpoint, dtype=float))
-    if _layered_share(cloud) > LAYERED_SHARE:
-        mesh, warnings = _poisson(cloud), ()
-    else:
-        mesh, warnings = _complete(cloud)
-    mesh, _ = check_mesh(mesh, "reconstruction")
-    if not is_closed(mesh):
-        raise CloudError(f"cloud: no closed surface fits its {len(cloud.points)} points; more views are needed")
-    return mesh, warnings
-
-
-def _layered_share(cloud: PointCloud) -> float:
+def _layered_share(view: PointCloud) -> float:
     """Share of lines of sight that meet points at depths too far apart for one surface, however steep."""
     from scipy.spatial import KDTree
 
-    frame = _view_frame(cloud)
-    local = (cloud.points - cloud.viewpoint) @ frame
+    points = clean_cloud(view.points, view.viewpoint).points
+    sight = points.mean(0) - view.viewpoint
+    axis = sight / max(float(np.linalg.norm(sight)), 1e-9) if np.linalg.norm(sight) > 1e-6 else np.eye(3)[2]
+    right = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    right /= np.linalg.norm(right)
+    local = (points - view.viewpoint) @ np.column_stack([right, np.cross(axis, right), axis])
     distance = float(local[:, 2].mean())
     # From very near the object, lines of sight are not spread enough to sort points by: any direction will do.
-    if distance > np.ptp(cloud.points, axis=0).max() and local[:, 2].min() > 0:
+    if distance > np.ptp(points, axis=0).max() and local[:, 2].min() > 0:
         local[:, :2] *= distance / local[:, 2:]
-    cell = 1.5 * float(np.median(KDTree(cloud.points).query(cloud.points, k=5)[0][:, -1]))
-    _, sight = np.unique(np.round(local[:, :2] / cell).astype(int), axis=0, return_inverse=True)
-    near, far = np.full(sight.max() + 1, np.inf), np.full(sight.max() + 1, -np.inf)
-    np.minimum.at(near, sight.reshape(-1), local[:, 2])
-    np.maximum.at(far, sight.reshape(-1), local[:, 2])
+    cell = 1.5 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
+    _, line = np.unique(np.round(local[:, :2] / cell).astype(int), axis=0, return_inverse=True)
+    line = line.reshape(-1)
+    near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
+    np.minimum.at(near, line, local[:, 2])
+    np.maximum.at(far, line, local[:, 2])
     return float((far - near > STEEPEST * cell).mean())
 
 
-def _poisson(cloud: PointCloud) -> TriangleMesh:
+def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
+    """Finite points, near where most are, of the views that have any."""
+    from scipy.spatial import KDTree
+
+    if len(views) == 0:
+        raise CloudError("cloud: no view at all; at least one is needed")
+    kept = [view.points[:: 1 + len(view.points) // MOST_POINTS].astype(float) for view in views]
+    clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
+    tree = KDTree(clean.points)
+    near = 3 * float(np.median(tree.query(clean.points, k=2)[0][:, 1]))
+    result = []
+    for points, view in zip(kept, views, strict=True):
+        points = points[np.isfinite(points).all(1)]
+        points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
+        if len(points):
+            result.append(PointCloud(points, view.viewpoint.astype(float)))
+    return result
+
+
+def _frame(
+    views: Sequence[PointCloud], support: Plane | None
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
+    points = np.concatenate([view.points for view in views])
+    centre = points.mean(0)
+    view = views[0].viewpoint - centre
+    if support is None:
+        up = view if np.linalg.norm(view) > 1e-6 else np.eye(3)[2]
+        view = np.linalg.svd(points[:: 1 + len(points) // 2000] - centre, full_matrices=False)[2][0]
+    else:
+        up = np.asarray(support.normal, dtype=float)
+        centre = centre - (centre @ up - support.offset) * up
+    up = up / np.linalg.norm(up)
+    level = view - (view @ up) * up
+    if np.linalg.norm(level) < 1e-3 * np.linalg.norm(view):
+        level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    level = level / np.linalg.norm(level)
+    return np.column_stack([level, np.cross(up, level), up]), centre
+
+
+def _all_round(views: Sequence[PointCloud], step: float) -> Surfels:
+    """Points of an all-round cloud with normals that agree with their neighbours', outwards as a whole."""
     import open3d as o3d
 
-    shell = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
-    shell.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(24))
-    shell.orient_normals_consistent_tangent_plane(16)
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(shell, depth=7, n_threads=1)
-    label, _, area = (np.asarray(x) for x in surface.cluster_connected_triangles())
-    if len(area) == 0:
-        raise CloudError(f"cloud: no surface fits its {len(cloud.points)} points")
-    faces = np.asarray(surface.triangles, dtype=np.int64)[label == area.argmax()]
-    mesh = TriangleMesh(np.asarray(surface.vertices), faces)
-    reach = np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0).max() / np.ptp(cloud.points, axis=0).max()
-    if reach > 1.3:
-        raise CloudError(f"cloud: the surface fitted to it is {reach:.1f} times its size; more views are needed")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate([v.points for v in views])))
+    cloud = cloud.voxel_down_sample(step)
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(24))
+    cloud.orient_normals_consistent_tangent_plane(16)
+    return Surfels(np.asarray(cloud.points), np.asarray(cloud.normals))
+
+
+def _finished(mesh: TriangleMesh, seen: Surfels) -> TriangleMesh:
+    """Few faces, closed, and through the points that were seen."""
+    from graspd_core.geometry.embree import make_surface, surface_distance
+
+    mesh, _ = check_mesh(mesh, "reconstruction")
+    fewer, _ = check_mesh(simplify(mesh, MOST_FACES), "reconstruction")
+    mesh = fewer if is_closed(fewer) else mesh
+    fitted = float((surface_distance(make_surface(mesh), seen.points) < FIT).mean())
+    if not is_closed(mesh) or fitted < FITTED:
+        raise CloudError(
+            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed"
+        )
     return mesh
 
 
-def _complete(cloud: PointCloud) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Close a single view by a guessed back."""
-    frame = _view_frame(cloud)
-    centre = cloud.points.mean(0)
-    slab, extruded = _guess_back(_height_map((cloud.points - centre) @ frame))
-    mesh = _surface(slab)
-    warnings = ("cloud: seen from one side only; its back is guessed by symmetry",)
-    if extruded:
-        warnings += ("cloud: seen face on; its depth is unknown and taken as half its smaller width",)
-    return TriangleMesh(mesh.vertices @ frame.T + centre, mesh.faces), warnings
-
-
-def _view_frame(cloud: PointCloud) -> Float[np.ndarray, "3 3"]:
-    """Columns: two axes of the image plane, then the direction of view, in the cloud's frame."""
-    view = cloud.points.mean(0) - cloud.viewpoint
-    length = np.linalg.norm(view)
-    view = view / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-    right = np.cross(view, np.eye(3)[np.abs(view).argmin()])
-    right /= np.linalg.norm(right)
-    return np.column_stack([right, np.cross(view, right), view])
-
-
-def _height_map(points: Float[np.ndarray, "n 3"]) -> _Slab:
-    """The nearest depth over each cell, small holes closed; `back` is the farthest depth seen there."""
-    from scipy.ndimage import binary_closing, binary_fill_holes
-    from scipy.spatial import KDTree
-
-    spacing = float(np.median(KDTree(points[:, :2]).query(points[:, :2], k=5)[0][:, -1]))
-    size = float(np.ptp(points[:, :2], axis=0).max())
-    cell = max(size / CELLS, 0.8 * spacing)
-    margin = 4
-    low = points[:, :2].min(0) - margin * cell
-    index = np.round((points[:, :2] - low) / cell).astype(int)
-    shape = tuple(index.max(0) + margin + 1)
-    near, far = np.full(shape, np.inf), np.full(shape, -np.inf)
-    np.minimum.at(near, tuple(index.T), points[:, 2])
-    np.maximum.at(far, tuple(index.T), points[:, 2])
-    seen = np.isfinite(near)
-    mask = np.asarray(binary_closing(seen, iterations=2), dtype=bool)
-    # Holes of a cell or two are missing pixels; greater ones are the object's own, as in a ring.
-    holes = np.asarray(binary_fill_holes(mask), dtype=bool) & ~mask
-    mask |= holes & (_depth_within(holes)[0] < 1.5)
-    _, nearest = _depth_within(~seen)
-    front = np.where(mask, near[nearest], np.nan)
-    return _Slab(mask, front, np.where(mask, far[nearest], np.nan), low, cell)
-
-
-def _guess_back(seen: _Slab) -> tuple[_Slab, bool]:
-    """A slab with a guessed back, and whether its depth had to be invented."""
-    mask, front, deepest = seen.mask, seen.front, seen.back
-    rim, lost = _rim(seen)
-    # A point-symmetric body's outline is point-symmetric in all three coordinates: its mean is the centre.
-    rows, columns = np.nonzero(rim)
-    middle = np.array([rows.min() + rows.max(), columns.min() + columns.max()])
-    depth = float(np.median(deepest[rim])) + lost
-    i, j = np.indices(mask.shape)
-    mirrored_i, mirrored_j = middle[0] - i, middle[1] - j
-    valid = (mirrored_i >= 0) & (mirrored_i < mask.shape[0]) & (mirrored_j >= 0) & (mirrored_j < mask.shape[1])
-    opposite = np.full(mask.shape, np.nan)
-    opposite[valid] = front[mirrored_i[valid], mirrored_j[valid]]
-    through_centre = 2 * depth - opposite
-    mirrored = 2 * depth - front
-    thinnest = max(2.0 * seen.cell, 0.003)
-    usable = np.isfinite(through_centre) & (through_centre > deepest)
-    back = np.where(usable, through_centre, mirrored)
-    extruded = bool(np.nanmedian(back - front) < 0.1 * seen.cell * CELLS)
-    if extruded:
-        sides = np.array([np.ptp(rows), np.ptp(columns)]) * seen.cell
-        back = np.full(mask.shape, np.nanmedian(front) + 0.5 * sides.min())
-    back = np.where(mask, np.fmax(back, deepest + thinnest), np.nan)
-    return _Slab(mask, front, back, seen.low, seen.cell), extruded
-
-
-def _rim(seen: _Slab) -> tuple[Bool[np.ndarray, "x y"], float]:
-    """The outermost cells, and how much deeper than them the outline lies [m].
-
-    A round body's depth falls off as k √s at distance s from its outline, and the last row of pixels, a cell from it,
-    misses k √cell. k is the median over pairs of a rim cell and one a few cells further in.
-    """
-    from scipy.ndimage import binary_erosion
-
-    rim = seen.mask & ~np.asarray(binary_erosion(seen.mask), dtype=bool)
-    inward, _ = _depth_within(seen.mask)
-    _, nearest = _depth_within(~rim)
-    band = (inward > 2) & (inward < 8)
-    rise = seen.front[nearest][band] - seen.front[band]
-    if len(rise) == 0:
-        return rim, 0.0
-    slope = np.median(rise / (np.sqrt(inward[band]) - 1))
-    return rim, float(max(slope, 0.0))
-
-
-def _surface(slab: _Slab) -> TriangleMesh:
-    """The zero surface of the greatest of: depth before the front, depth past the back, distance from the mask."""
-    import igl
-    from scipy.ndimage import gaussian_filter
-
-    cell, mask = slab.cell, slab.mask
-    outside, nearest = _depth_within(~mask)
-    lateral = (outside - _depth_within(mask)[0]) * cell
-    lateral += np.where(mask, 0.5, -0.5) * cell
-    front, back = slab.front[nearest], slab.back[nearest]
-    depth = np.arange(front.min() - 3 * cell, back.max() + 3 * cell, cell)
-    side = np.broadcast_to(lateral[..., None], (*mask.shape, len(depth)))
-    value = np.maximum.reduce([front[..., None] - depth, depth - back[..., None], side])
-    # Smoothed, because height maps are stairs; kept off zero at the nodes, where the surface would pinch to nothing.
-    value = gaussian_filter(value, 0.7)
-    value = np.where(np.abs(value) < 0.03 * cell, np.where(value < 0, -0.03, 0.03) * cell, value)
-    nodes = np.stack(
-        np.meshgrid(*(slab.low[k] + cell * np.arange(mask.shape[k]) for k in (0, 1)), depth, indexing="ij"), -1
-    )
-    # igl counts the first coordinate fastest.
-    columns = nodes.transpose(2, 1, 0, 3).reshape(-1, 3)
-    march: Any = igl.marching_cubes
-    answer = march(value.ravel(order="F"), columns, *value.shape, 0.0)
-    vertices, faces = answer[:2]
-    if len(faces) == 0:
-        raise CloudError("cloud: the object is too small against the spacing of its points")
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:
-        faces = faces[:, ::-1]
-    return TriangleMesh(np.asarray(vertices), np.asarray(faces, dtype=np.int64))
-
-
-def _depth_within(mask: Bool[np.ndarray, "x y"]) -> tuple[Float[np.ndarray, "x y"], tuple[np.ndarray, ...]]:
-    """How many cells each cell of the mask is from the nearest one outside it, and that one's indices."""
-    from scipy.ndimage import distance_transform_edt
-
-    answer: Any = distance_transform_edt(mask, return_indices=True)
-    return answer[0], tuple(answer[1])
+def _sentence(views: int, method: str) -> str:
+    seen = "one side only" if views == 1 else f"{views} sides, not all round"
+    by = method or "closing the surface smoothly within the cameras' outlines"
+    return f"cloud: seen from {seen}; the rest is guessed by {by}"

@@ -1,10 +1,9 @@
-"""From a file, a named shape or a mesh to a frozen scene: the object's mesh, its mass and its signed distance."""
+"""The frozen scene: the object's mesh, its mass and its signed distance, and what stands around it."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,15 +11,11 @@ from jaxtyping import Float
 
 from graspd_core.errors import MeshError
 from graspd_core.geometry import cache
-from graspd_core.geometry.cloud import CLOUD_ENDINGS, is_cloud_file, load_cloud
 from graspd_core.geometry.convex import convex_parts
-from graspd_core.geometry.mesh import MESH_ENDINGS, check_mesh, content_hash, load_mesh, mass_properties, simplify
-from graspd_core.geometry.reconstruct import reconstruct
+from graspd_core.geometry.mesh import check_mesh, content_hash, mass_properties, simplify
 from graspd_core.geometry.sdf import GridSDF, build_sdf, is_solid
-from graspd_core.geometry.shapes import make_shape
+from graspd_core.geometry.trust import trust_grid
 from graspd_core.types import Plane, TriangleMesh
-
-SHAPE_PREFIX = "shape:"
 
 # Faces beyond this add nothing that a 48³ grid or a hand could feel, and cost build time.
 MOST_FACES = 50_000
@@ -94,82 +89,6 @@ class Scene:
     trust: Float[torch.Tensor, "x y z"] | None = None
 
 
-def load_scene(
-    source: str | Path | TriangleMesh,
-    *,
-    mass: float | None = 0.1,
-    friction: float = 0.6,
-    scale: float = 1.0,
-    resolution: int = 48,
-    device: torch.device | str = "cpu",
-) -> Scene:
-    """Build the scene of one object.
-
-    Args:
-        source: a mesh file, a point cloud file (a solid is reconstructed), `shape:NAME`, or a mesh.
-        mass: [kg]; None takes 300 kg/m³ times the volume.
-        friction: Coulomb coefficient between hand and object.
-        scale: factor on the file's coordinates to make them metres.
-        resolution: nodes along each axis of the distance grid.
-
-    Raises:
-        MeshError: the mesh cannot be read or used, or a number is out of range.
-        CloudError: the cloud cannot be read or shows no object.
-    """
-    start = time.perf_counter()
-    given = "mesh" if isinstance(source, TriangleMesh) else str(source)
-    _refuse_numbers(given, mass=mass, friction=friction, resolution=resolution, scale=scale)
-    mesh, name, warnings = _read_source(source, scale)
-    return build_scene(
-        mesh,
-        source=name,
-        mass=mass,
-        friction=friction,
-        scale=scale,
-        resolution=resolution,
-        device=device,
-        warnings=warnings,
-        started=start,
-    )
-
-
-def scene_from_cloud(
-    points: Float[np.ndarray, "n 3"],
-    *,
-    viewpoint: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    mass: float | None = 0.1,
-    friction: float = 0.6,
-    source: str = "cloud",
-    resolution: int = 48,
-) -> Scene:
-    """The scene of an object that a camera saw, in the cloud's frame; what was guessed is in the object's warnings.
-
-    Args:
-        points: the object's points alone [m]; NaN and stray points are dropped.
-        viewpoint: where the camera stood [m].
-        mass: [kg]; None takes 300 kg/m³ times the volume.
-        friction: Coulomb coefficient between hand and object.
-        source: name of the cloud, for messages.
-        resolution: nodes along each axis of the distance grid.
-
-    Raises:
-        CloudError: the points show no usable object.
-        MeshError: the object they show is too small or too large, or a number is out of range.
-    """
-    started = time.perf_counter()
-    _refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
-    mesh, warnings = reconstruct(points, viewpoint=viewpoint)
-    return build_scene(
-        mesh,
-        source=source,
-        mass=mass,
-        friction=friction,
-        resolution=resolution,
-        warnings=warnings,
-        started=started,
-    )
-
-
 def build_scene(
     mesh: TriangleMesh,
     *,
@@ -181,10 +100,24 @@ def build_scene(
     device: torch.device | str = "cpu",
     warnings: tuple[str, ...] = (),
     started: float | None = None,
+    support: Plane | None = None,
+    neighbours: tuple[Neighbour, ...] = (),
+    trust: Float[np.ndarray, "vertices"] | None = None,
 ) -> Scene:
-    """The scene of a mesh already in metres; `scale` is only recorded. Raises MeshError, see `load_scene`."""
+    """The scene of a mesh already in metres; `scale` is only recorded.
+
+    Args:
+        support: what the object stands on.
+        neighbours: other things near it.
+        trust: how far each of the mesh's vertices was seen, 1, or guessed, 0; None: all of it is known.
+
+    Raises:
+        MeshError: see `load_scene`; or there is not one trust for every vertex.
+    """
+    if trust is not None and len(trust) != len(mesh.vertices):
+        raise MeshError(f"{source}: {len(trust)} values of trust for {len(mesh.vertices)} vertices; valid: one each")
     started = time.perf_counter() if started is None else started
-    _refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
+    refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
     clean, found = check_mesh(mesh, source)
     if len(clean.faces) > MOST_FACES:
         found += (f"{source}: simplified from {len(clean.faces)} to {MOST_FACES} faces",)
@@ -197,7 +130,9 @@ def build_scene(
         note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; distances are unsigned"
         model = ObjectModel(**{**vars(model), "warnings": (*model.warnings, note)})
     sdf = sdf.to(device, sdf.field.dtype)
-    return Scene(model, sdf, (loaded - started, time.perf_counter() - loaded))
+    known = None if trust is None else trust_grid(mesh.vertices, trust, sdf)
+    timing = (loaded - started, time.perf_counter() - loaded)
+    return Scene(model, sdf, timing, support, neighbours, known)
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
@@ -233,23 +168,6 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
     return tuple(TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
 
 
-def _read_source(source: str | Path | TriangleMesh, scale: float) -> tuple[TriangleMesh, str, tuple[str, ...]]:
-    if isinstance(source, TriangleMesh):
-        return TriangleMesh(source.vertices * scale, source.faces), "mesh", ()
-    name = str(source)
-    if name.startswith(SHAPE_PREFIX):
-        shape = make_shape(name.removeprefix(SHAPE_PREFIX))
-        return TriangleMesh(shape.vertices * scale, shape.faces), name, ()
-    if is_cloud_file(source):
-        cloud = load_cloud(source)
-        mesh, warnings = reconstruct(cloud.points * scale, viewpoint=tuple(cloud.viewpoint * scale))
-        return mesh, name, warnings
-    endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
-    if Path(source).is_file() and Path(source).suffix.lower().lstrip(".") not in endings:
-        raise MeshError(f"{name}: unknown ending {Path(source).suffix!r}; valid endings: {', '.join(endings)}")
-    return load_mesh(source, scale=scale), name, ()
-
-
 def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:
     volume, center, unit_inertia = mass_properties(mesh)
     mass = DENSITY * volume if mass is None else mass
@@ -268,7 +186,7 @@ def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:
     )
 
 
-def _refuse_numbers(source: str, *, mass: float | None, friction: float, resolution: int, scale: float = 1.0) -> None:
+def refuse_numbers(source: str, *, mass: float | None, friction: float, resolution: int, scale: float = 1.0) -> None:
     if not (np.isfinite(scale) and scale > 0):
         raise MeshError(f"{source}: scale {scale!r} must be a positive number")
     if mass is not None and not (np.isfinite(mass) and mass > 0):

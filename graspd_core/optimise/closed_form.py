@@ -39,8 +39,9 @@ class AdamState:
 
 
 def weighted(terms: Terms, weights: LossWeights) -> Float[Tensor, "batch"]:
-    """Weighted sum of the terms."""
-    return sum((getattr(weights, name) * value for name, value in terms._asdict().items()), torch.zeros(()))
+    """Weighted sum of the terms that there are."""
+    present = {name: value for name, value in terms._asdict().items() if value is not None}
+    return sum((getattr(weights, name) * value for name, value in present.items()), torch.zeros(()))
 
 
 def pack(poses: Poses) -> Float[Tensor, "batch variables"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -9,8 +11,9 @@ from torch import Tensor
 
 from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.scene import Scene
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import forward, link_poses, make_kinematics
 from graspd_core.hands.model import HandModel
+from graspd_core.optimise.obstacles import RETREAT, Obstacles, make_obstacles, obstacle_gaps
 from graspd_core.optimise.problem import fingertip_groups
 from graspd_core.optimise.solver import Poses
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle
@@ -22,6 +25,9 @@ _TILT = 0.35
 _JOINT_NOISE = 0.1
 # Places drawn for each start kept, surface points that tell the object's width, and how much width matters [m].
 _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
+# Among obstacles more places are drawn; how deep a hand reaches into one [m] that makes its place e times rarer, and
+# how far a hand is lifted off the support to stay above it [m].
+_POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
 # The slab of the object that a hand closes around [m].
 _SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
 
@@ -31,9 +37,11 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
 
     After the published initialisation of Grasp'D (a random surface point, palm towards it, random roll), but on the
     hull, so that no palm starts inside a hollow, and with place and roll drawn in favour of narrow cross-sections.
+    Where there are obstacles, hands that would reach into them, or could not have come there, are drawn last.
     """
     generator = torch.Generator().manual_seed(seed)
-    pool = _POOL * count
+    obstacles = make_obstacles(scene, hand, "cpu", torch.float64)
+    pool = (_POOL if obstacles is None else _POOL_AMONG_OBSTACLES) * count
     points, normals = surface_samples(convex_hull(scene.object.mesh), pool, seed)
 
     def uniform(low: float, high: float) -> Float[Tensor, "pool"]:
@@ -52,16 +60,40 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
     joints = torch.as_tensor(hand.open_posture) + noise * spread
     joints = joints.clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
 
+    blocked = torch.zeros(pool, dtype=torch.float64)
+    if obstacles is not None:
+        frames = forward(make_kinematics(hand, dtype=torch.float64), joints)
+        raised, blocked = raise_clear(obstacles, rotation, translation, frames)
+        palm, translation = palm + raised - translation, raised
+
     surface, _ = surface_samples(scene.object.mesh, _SPAN_POINTS, seed)
     half_width = half_widths(torch.as_tensor(surface), palm, rotation, hand)
     # Gumbel noise makes the best `count` a draw without replacement with weights exp(−half width / scale).
     gumbel = -torch.log(-torch.log(uniform(1e-12, 1.0)))
-    chosen = (gumbel - half_width / _SPAN_SCALE).topk(count).indices
+    chosen = (gumbel - half_width / _SPAN_SCALE - blocked / _DEPTH_SCALE).topk(count).indices
     return Poses(
         translation[chosen].to(device, dtype),
         quaternion_from_rotation(rotation[chosen]).to(device, dtype),
         joints[chosen].to(device, dtype),
     )
+
+
+def raise_clear(
+    obstacles: Obstacles,
+    rotation: Float[Tensor, "batch 3 3"],
+    translation: Float[Tensor, "batch 3"],
+    frames: tuple[Float[Tensor, "batch links 3 3"], Float[Tensor, "batch links 3"]],
+) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
+    """Hands moved off the support, within bounds; and how deep they, here or drawn back, reach into anything [m].
+
+    `frames` are the link poses in the base frame.
+    """
+    if obstacles.normal is not None:
+        depth = -obstacle_gaps(replace(obstacles, neighbours=()), rotation, translation, *frames).amin(-1)
+        translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
+    behind = translation + RETREAT * (rotation @ obstacles.retreat)
+    gaps = [obstacle_gaps(obstacles, rotation, at, *frames).amin(-1) for at in (translation, behind)]
+    return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
 
 
 def half_widths(

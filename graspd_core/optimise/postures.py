@@ -19,7 +19,9 @@ from graspd_core.geometry.sdf import sample_sdf
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.kinematics import place as place_in_base
 from graspd_core.hands.solids import pair_distance, solid_distance
-from graspd_core.optimise.problem import Placed, Problem, place
+from graspd_core.optimise import losses
+from graspd_core.optimise.obstacles import RETREAT, RETREAT_SHARES, Obstacles, obstacle_gaps
+from graspd_core.optimise.problem import OBSTACLE_MARGIN, Placed, Problem, place
 from graspd_core.optimise.solver import Poses
 from graspd_core.se3 import rotation_from_quaternion, transform_points
 
@@ -220,7 +222,8 @@ def open_clear(
     """A nearby posture (base shifted, never turned) from which the hand closes without sweeping through the object.
 
     Both the posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every
-    candidate is to be (1 − a) times the clearance away from the object, so that all that touch arrive together.
+    candidate is to be (1 − a) times the clearance away from the object, so that all that touch arrive together. All of
+    the way keeps clear of obstacles, where there are any.
 
     Returns:
         The postures, and the least distance on the way over what it should be there, one where all is clear.
@@ -237,8 +240,11 @@ def open_clear(
     # Where the grasp itself sinks in, the way out starts from that depth.
     wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
 
+    def way_to(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch variables"]:
+        return (remaining * x + (1 - remaining) * start).flatten(0, 1)
+
     def distances(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch points"]:
-        way = (remaining * x + (1 - remaining) * start).flatten(0, 1)
+        way = way_to(x)
         return hand_distance(problem, rotation, way[:, :3], way[:, 3:])
 
     x, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
@@ -248,6 +254,9 @@ def open_clear(
         x.requires_grad_(True)
         short = ((wanted - distances(x)).clamp_min(0.0) / 0.001).unflatten(0, (len(_WAY), -1))
         loss = (short * short).mean(-1).sum(0) + (cost * (x - start) ** 2).sum(-1)
+        if problem.obstacles is not None:
+            blocked = _obstacle_cost(problem.obstacles, problem, rotation, way_to(x))
+            loss = loss + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         gradient = torch.nan_to_num(gradient)
         mean = 0.9 * mean + 0.1 * gradient
@@ -258,6 +267,30 @@ def open_clear(
     with torch.no_grad():
         share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
     return Poses(x[:, :3], poses.quaternion, x[:, 3:]), share
+
+
+def _obstacle_cost(
+    obstacles: Obstacles, problem: Problem, rotation: Float[Tensor, "batch 3 3"], x: Float[Tensor, "batch variables"]
+) -> Float[Tensor, "batch"]:
+    """The loss term of obstacles for rows of translation and joints."""
+    frames = forward(problem.kinematics, x[:, 3:])
+    gaps = obstacle_gaps(obstacles, rotation, x[:, :3], *frames)
+    return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
+
+
+@torch.no_grad()
+def approach_depth(problem: Problem, obstacles: Obstacles, pregrasp: Poses) -> Float[Tensor, "batch"]:
+    """How deep the hand is in the object on its straight way from the retreat to the pregrasp [m], zero where clear.
+
+    What a pregrasp itself leaves is not looked at here.
+    """
+    rotation = rotation_from_quaternion(pregrasp.quaternion)
+    back = rotation @ obstacles.retreat
+    nearest = [
+        hand_distance(problem, rotation, pregrasp.translation + RETREAT * share * back, pregrasp.joints).amin(-1)
+        for share in RETREAT_SHARES
+    ]
+    return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
 
 
 def hand_distance(

@@ -14,12 +14,14 @@ from graspd_core.contact.wrench import disturbance_directions, wrench_support
 from graspd_core.geometry.features import sharp_points, thin_share
 from graspd_core.geometry.scene import Scene
 from graspd_core.geometry.sdf import GridSDF, sample_sdf
+from graspd_core.geometry.trust import sample_trust
 from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics, placement
 from graspd_core.hands.kinematics import place as place_in_base
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.proxies import proxy_spheres
 from graspd_core.hands.solids import Solids, make_solids, pair_distance, solid_bound
 from graspd_core.optimise import losses
+from graspd_core.optimise.obstacles import Obstacles, make_obstacles, obstacle_gaps
 from graspd_core.se3 import rotation_from_quaternion, transform_points
 
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
@@ -28,6 +30,8 @@ _REACH_OF_OTHERS = 0.004
 _REACH_WHEN_FINE = 0.01
 # Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
 _TASK_POINTS, _FEATURE_PAIRS = 96, 96
+# Free space that the hand keeps to obstacles [m].
+OBSTACLE_MARGIN = 0.002
 # Share of thin surface from which an object counts as thin-walled.
 _THIN_WALLED = 0.6
 
@@ -71,6 +75,8 @@ class Problem:
         center: object's centre of mass [m].
         length: characteristic length of torques [m].
         friction: coefficient planned with.
+        obstacles: what else is in the way, None where nothing is: then nothing is evaluated for it.
+        trust: how far the surface near each node of `sdf` is known, raised to a floor; None: all of it, likewise.
     """
 
     kinematics: Kinematics
@@ -91,16 +97,22 @@ class Problem:
     center: Float[Tensor, "3"]
     length: float
     friction: float
+    obstacles: Obstacles | None = None
+    trust: Float[Tensor, "x y z"] | None = None
 
 
 class Terms(NamedTuple):
-    """Loss terms of a batch of starts, unweighted; the fields are those of `config.LossWeights`."""
+    """Loss terms of a batch of starts, unweighted; the fields are those of `config.LossWeights`.
+
+    `obstacle` is None where the scene has none.
+    """
 
     task: Float[Tensor, "batch"]
     distance: Float[Tensor, "batch"]
     penetration: Float[Tensor, "batch"]
     self_collision: Float[Tensor, "batch"]
     posture: Float[Tensor, "batch"]
+    obstacle: Float[Tensor, "batch"] | None = None
 
 
 def build_problem(
@@ -114,6 +126,7 @@ def build_problem(
     seed: int,
     device: str,
     dtype: torch.dtype,
+    trust_floor: float = 0.0,
 ) -> Problem:
     """Lay scene and hand out as tensors.
 
@@ -123,6 +136,7 @@ def build_problem(
         directions: number of disturbance wrenches.
         friction: coefficient planned with.
         seed: of the spread of disturbances beyond the signed axes.
+        trust_floor: what a contact on surface that was only guessed counts.
     """
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -166,6 +180,8 @@ def build_problem(
         center=tensor(scene.object.center_of_mass),
         length=scene.object.radius,
         friction=friction,
+        obstacles=make_obstacles(scene, hand, device, dtype),
+        trust=None if scene.trust is None else trust_floor + (1 - trust_floor) * scene.trust.to(device, dtype),
     )
 
 
@@ -258,18 +274,27 @@ def evaluate(
         (distance.detach() - radius[:, None]).abs().topk(min(_TASK_POINTS, distance.shape[-1]), largest=False).indices
     )
     rows = torch.arange(len(near), device=near.device)[:, None]
+    activation = losses.soft_contact(distance[rows, near], radius, delta)
+    if problem.trust is not None:
+        activation = activation * sample_trust(problem.trust, problem.sdf, placed.points[rows, near])
     support = wrench_support(
         (placed.points[rows, near] - problem.center) / problem.length,
         normal[rows, near],
-        losses.soft_contact(distance[rows, near], radius, delta),
+        activation,
         problem.directions,
         problem.friction,
     )
-    spheres = place_in_base(problem.sphere_matrix, placed.link_rotations, placed.link_translations)
+    frames = (placed.link_rotations, placed.link_translations)
+    spheres = place_in_base(problem.sphere_matrix, *frames)
+    obstacle = None
+    if problem.obstacles is not None:
+        gaps = obstacle_gaps(problem.obstacles, placed.rotation, translation, *frames)
+        obstacle = losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
     return Terms(
         task=losses.task(support, problem.friction),
         distance=losses.touch(gap, torch.full_like(problem.reach, _REACH_WHEN_FINE) if fine else problem.reach),
         penetration=sunk,
         self_collision=losses.self_collision(spheres, problem.sphere_radii, problem.sphere_weight),
         posture=losses.posture(joints, problem.lower, problem.upper),
+        obstacle=obstacle,
     )

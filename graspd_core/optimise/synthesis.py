@@ -15,13 +15,26 @@ from graspd_core.geometry.scene import Scene
 from graspd_core.hands.model import HandModel
 from graspd_core.optimise.closed_form import ClosedForm
 from graspd_core.optimise.initial import draw_starts
-from graspd_core.optimise.postures import Squeeze, Touches, find_touches, open_clear, self_overlap, squeeze
+from graspd_core.optimise.obstacles import intrusion
+from graspd_core.optimise.postures import (
+    Squeeze,
+    Touches,
+    approach_depth,
+    find_touches,
+    open_clear,
+    self_overlap,
+    squeeze,
+)
 from graspd_core.optimise.problem import Problem, build_problem
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.types import Contact, Grasp, Posture
 
 # However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
 _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
+# A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
+_DEEPEST = 0.0015
+# What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
+_KNOCK_COST = 100.0
 
 
 @dataclass(frozen=True)
@@ -55,10 +68,12 @@ def synthesise(
         seed=seed,
         device=device,
         dtype=dtype,
+        trust_floor=settings.trust_floor,
     )
-    drawn = max(_FEWEST_STARTS, round(count * settings.starts_per_grasp))
+    factor = 1.0 if problem.obstacles is None else settings.obstacle_factor
+    drawn = max(_FEWEST_STARTS, round(count * settings.starts_per_grasp * factor))
     starts = draw_starts(scene, hand, drawn, seed, device, dtype)
-    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
+    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp * factor)))
     solution = minimise(solver, problem, starts, hooks)
     if solution.interrupted == "cancelled":
         return Candidates((), solution.interrupted)
@@ -71,7 +86,10 @@ def synthesise(
 def assemble(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Grasp, ...]:
-    """Three postures and a score for every pose, best first; poses without a balanced squeeze are dropped."""
+    """Three postures and a score for every pose, best first.
+
+    Poses without a balanced squeeze are dropped, and those that reach through an obstacle on their way or at its end.
+    """
     touches = find_touches(problem, poses, config.postures.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.lower)
     pressed = squeeze(problem, poses, touches, effort, config.postures)
@@ -79,6 +97,11 @@ def assemble(
     adjacent = torch.as_tensor(hand.adjacent, device=problem.lower.device)
     overlap = self_overlap(problem, poses.joints, adjacent)
     scores = score(touches, pressed, clearance, overlap)
+    if problem.obstacles is not None:
+        ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
+        depth = intrusion(problem.obstacles, problem.kinematics, poses.quaternion, *ends)
+        knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
+        scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     order = scores.argsort(descending=True)
     return tuple(
         _grasp(problem, hand, int(i), poses, opened, pressed, touches, float(scores[i]))

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.types import Grasp, HoldResult, Posture, Verdict
+from graspd_core.types import Grasp, HoldResult, LiftResult, Posture, Verdict
 from graspd_core.verify.world import Protocol, World
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
@@ -34,7 +34,7 @@ def hold_trial(
     import mujoco
 
     data = mujoco.MjData(world.model)
-    _place(world, data, grasp.pregrasp)
+    place_hand(world, data, grasp.pregrasp)
     mujoco.mj_forward(world.model, data)
     depth = start_penetration(world, data)
     if depth > protocol.max_start_penetration:
@@ -57,7 +57,7 @@ def hold_trial(
             if stop():
                 return _result(worst, "stopped before the trial ended")
             mujoco.mj_step(world.model, data, _CHECK_EVERY)
-            reason = _breach(world, data, protocol, worst)
+            reason = breach(world, data, protocol, worst)
             if reason:
                 return _result(worst, f"{reason} under a pull along {_axis_name(direction)}")
     return _result(worst, "")
@@ -67,10 +67,11 @@ def _result(worst: np.ndarray, reason: str) -> HoldResult:
     return HoldResult(not reason, float(worst[0]), float(worst[1]), reason)
 
 
-def judge(grasp: Grasp, hold: HoldResult) -> Grasp:
-    """The grasp with its verdict written down."""
-    verdict = Verdict.VERIFIED if hold.passed else Verdict.FAILED
-    return replace(grasp, hold=hold, verdict=verdict, reason=hold.reason)
+def judge(grasp: Grasp, hold: HoldResult, lift: LiftResult | None = None) -> Grasp:
+    """The grasp with its verdict written down: verified when it passed every trial that was run."""
+    failed = [trial.reason for trial in (hold, lift) if trial is not None and not trial.passed]
+    verdict = Verdict.FAILED if failed else Verdict.VERIFIED
+    return replace(grasp, hold=hold, lift=lift, verdict=verdict, reason=failed[0] if failed else "")
 
 
 def start_penetration(world: World, data: Any) -> float:
@@ -85,7 +86,8 @@ def _axis_name(direction: np.ndarray) -> str:
     return f"{'-' if direction.min() < 0 else '+'}{'xyz'[int(np.abs(direction).argmax())]}"
 
 
-def _place(world: World, data: Any, posture: Posture) -> None:
+def place_hand(world: World, data: Any, posture: Posture) -> None:
+    """Put base, joints and targets where a posture says; `mj_forward` is the caller's."""
     data.qpos[world.joint_addresses] = posture.joint_positions
     data.mocap_pos[0] = posture.position
     data.mocap_quat[0] = posture.quaternion_wxyz
@@ -97,23 +99,27 @@ def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Proto
     import mujoco
 
     steps = round(protocol.stage_time / protocol.timestep)
-    # The shorter way round for the base: wxyz and its negative are the same rotation.
-    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
     for step in range(1, steps + 1):
-        a = step / steps
-        quaternion = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
-        data.mocap_pos[0] = (1 - a) * start.position + a * end.position
-        data.mocap_quat[0] = quaternion / np.linalg.norm(quaternion)
-        data.ctrl[:] = (1 - a) * start.joint_positions + a * end.joint_positions
+        set_targets(data, start, end, step / steps)
         mujoco.mj_step(world.model, data)
         if step % _CHECK_EVERY == 0:
-            reason = _breach(world, data, protocol, worst)
+            reason = breach(world, data, protocol, worst)
             if reason:
                 return reason
     return ""
 
 
-def _diverged(data: Any) -> bool:
+def set_targets(data: Any, start: Posture, end: Posture, a: float) -> None:
+    """Base pose and joint targets at a share `a` of the straight way from start to end."""
+    # The shorter way round for the base: wxyz and its negative are the same rotation.
+    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
+    quaternion = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
+    data.mocap_pos[0] = (1 - a) * start.position + a * end.position
+    data.mocap_quat[0] = quaternion / np.linalg.norm(quaternion)
+    data.ctrl[:] = (1 - a) * start.joint_positions + a * end.joint_positions
+
+
+def diverged(data: Any) -> bool:
     """Whether MuJoCo met a bad state. Its other warnings, such as a full contact buffer, leave the state sound."""
     import mujoco
 
@@ -121,10 +127,10 @@ def _diverged(data: Any) -> bool:
     return any(data.warning[int(warning)].number for warning in bad)
 
 
-def _breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
+def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
     """Update the worst travel and turn; name the limit that is broken, if any."""
     pose = data.qpos[world.object_address : world.object_address + 7]
-    if _diverged(data) or not np.isfinite(pose).all():
+    if diverged(data) or not np.isfinite(pose).all():
         worst[:] = np.inf
         return "the simulation diverged"
     travel = float(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))

@@ -1,5 +1,8 @@
 """The judge's world: a hand of primitives on a position-controlled base, and a free object of convex parts.
 
+With a support there are gravity and a table, with neighbours there are these; without, neither costs anything. They are
+mocap bodies after the hand's own, so that a trial can lower them all away from the hand.
+
 Contact and solver settings follow the floating protocol of DexGraspBench (Chen et al., BODex, ICRA 2025), from its
 published parameters. Nothing here is differentiable and nothing is shared with the optimiser.
 """
@@ -17,12 +20,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_core.geometry.scene import ObjectModel
+from graspd_core.geometry.mesh import surface_samples
+from graspd_core.geometry.scene import Neighbour, ObjectModel
+from graspd_core.geometry.sdf import sample_sdf
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import quaternion_from_rotation
-from graspd_core.types import TriangleMesh
+from graspd_core.types import Plane, TriangleMesh
 
 _OBJECT = "graspd_object"
+# What the hand meets of the support, and what the object rests on.
+_TABLE, _REST = "the support", "graspd_rest"
+_GRAVITY = 9.81
 _GEOM_OF_KIND = {kind: f"mjGEOM_{kind.upper()}" for kind in ("box", "sphere", "capsule", "cylinder")}
 
 
@@ -79,18 +87,33 @@ class World:
         model: the `mujoco.MjModel`.
         joint_addresses: index into `qpos` of each hand joint, in the hand's order.
         object_address: index into `qpos` of the object's free joint (position, then wxyz).
+        object_velocity: index into `qvel` of its free joint.
         object_body: body id of the object.
         center_of_mass: of the object, in its own frame [m].
+        hand_geoms: ids of the hand's geoms.
+        obstacles: id and name of the geom of every obstacle to the hand.
+        up: unit direction against gravity; None where there is none.
     """
 
     model: Any
     joint_addresses: np.ndarray
     object_address: int
+    object_velocity: int
     object_body: int
     center_of_mass: Float[np.ndarray, "3"]
+    hand_geoms: tuple[int, ...] = ()
+    obstacles: tuple[tuple[int, str], ...] = ()
+    up: Float[np.ndarray, "3"] | None = None
 
 
-def build_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh], protocol: Protocol) -> World:
+def build_world(
+    hand: HandModel,
+    target: ObjectModel,
+    parts: Sequence[TriangleMesh],
+    protocol: Protocol,
+    support: Plane | None = None,
+    neighbours: Sequence[Neighbour] = (),
+) -> World:
     """Compile the world of one hand and one object.
 
     Args:
@@ -98,6 +121,9 @@ def build_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMe
         target: gives mass, centre of mass and inertia.
         parts: convex collision parts of the object, object frame [m].
         protocol: physics settings.
+        support: a table, with gravity onto it. The hand meets it where it is; the object rests on a plane of its own
+            through its lowest point, because a reconstructed bottom hovers or sinks by millimetres.
+        neighbours: fixed, as their convex hulls. Those that the object touches already let it pass.
     """
     import mujoco
 
@@ -117,14 +143,24 @@ def build_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMe
     option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
     _add_hand(spec, hand, protocol)
     _add_object(spec, target, parts, protocol)
+    obstacles = [_TABLE] if support is not None else []
+    if support is not None:
+        _add_support(spec, hand, parts, protocol, support)
+    for index, neighbour in enumerate(neighbours):
+        obstacles.append(f"neighbour {index + 1}")
+        _add_neighbour(spec, obstacles[-1], neighbour, target, protocol)
     model = spec.compile()
     addresses = [model.joint(f"joint:{name}").qposadr[0] for name in hand.joint_names]
     return World(
         model=model,
         joint_addresses=np.array(addresses),
         object_address=int(model.joint(_OBJECT).qposadr[0]),
+        object_velocity=int(model.joint(_OBJECT).dofadr[0]),
         object_body=int(model.body(_OBJECT).id),
         center_of_mass=target.center_of_mass,
+        hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
+        obstacles=tuple((int(model.geom(name).id), name) for name in obstacles),
+        up=None if support is None else support.normal,
     )
 
 
@@ -219,6 +255,48 @@ def _add_object(spec: Any, target: ObjectModel, parts: Sequence[TriangleMesh], p
             contype=1,
             conaffinity=1,
         )
+
+
+def _add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], protocol: Protocol, support: Plane) -> None:
+    import mujoco
+
+    spec.option.gravity = -_GRAVITY * support.normal
+    lowest = min(float((part.vertices @ support.normal).min()) for part in parts)
+    for name, height in ((_TABLE, support.offset), (_REST, lowest)):
+        body = spec.worldbody.add_body(name=name, mocap=True)
+        body.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0.0, 0.0, 1.0],
+            pos=height * support.normal,
+            quat=_turn_z_to(support.normal),
+            condim=4,
+            friction=protocol.friction,
+        )
+    spec.add_exclude(bodyname1=_TABLE, bodyname2=_OBJECT)
+    for link in hand.link_names:
+        # Real hands carry their own weight.
+        spec.body(f"link:{link}").gravcomp = 1.0
+        spec.add_exclude(bodyname1=_REST, bodyname2=f"link:{link}")
+
+
+def _turn_z_to(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
+    """The shortest rotation of z onto a unit vector, wxyz."""
+    quaternion = np.array([1.0 + normal[2], -normal[1], normal[0], 0.0])
+    length = np.linalg.norm(quaternion)
+    return quaternion / length if length > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def _add_neighbour(spec: Any, name: str, neighbour: Neighbour, target: ObjectModel, protocol: Protocol) -> None:
+    import mujoco
+
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    _add_mesh(spec, name, neighbour.mesh.vertices, neighbour.mesh.faces)
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, condim=4, friction=protocol.friction)
+    surface = torch.as_tensor(surface_samples(target.mesh, 1000, 0)[0]).to(neighbour.sdf.field)
+    if bool((sample_sdf(neighbour.sdf, surface)[0] < 0).any()):
+        # A grown hull that overlaps the object would throw it away.
+        spec.add_exclude(bodyname1=name, bodyname2=_OBJECT)
 
 
 def _add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_core.geometry.camera import PinholeCamera, camera_rays, project
+from graspd_core.geometry.depth import cloud_from_depth
 from graspd_core.geometry.raycast import (
     BACKGROUND,
-    PinholeCamera,
-    cloud_from_depth,
     look_at,
     render_depth,
+    render_scene,
     render_shaded,
     save_png,
 )
@@ -46,11 +47,58 @@ def test_depth_of_a_sphere_is_the_closed_form():
 
 def test_the_cloud_lies_on_the_object():
     pose = look_at((0.3, 0.3, 0.3), (0, 0, 0))
-    points = cloud_from_depth(render_depth(make_shape("sphere"), CAMERA, pose), CAMERA)
+    points = cloud_from_depth(render_depth(make_shape("sphere"), CAMERA, pose), CAMERA).points
     world = points @ pose[:3, :3].T + pose[:3, 3]
     # Flat faces lie up to 0.1 mm inside the ball.
     assert np.linalg.norm(world, axis=1) == pytest.approx(np.full(len(world), SPHERE_RADIUS), abs=2e-4)
     assert len(world) > 50
+
+
+def test_a_scene_is_seen_with_the_name_of_what_each_pixel_shows():
+    sphere = make_shape("sphere")
+    wall = TriangleMesh(
+        np.array([[-1.0, -5, -5], [-1, 5, -5], [-1, 5, 5], [-1, -5, 5]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    pose = look_at((0.5, 0, 0), (0, 0, 0))
+    depth, label = render_scene([wall, sphere], CAMERA, pose)
+    assert set(np.unique(label)) == {0, 1}
+    assert depth[label == 0] == pytest.approx(np.full((label == 0).sum(), 1.5), abs=1e-5)
+    # Of a ray through x, y at unit depth: the nearer root of |z (x, y, 1) - (0, 0, 0.5)| = radius.
+    ray = camera_rays(CAMERA)[label == 1]
+    length = (ray**2).sum(1)
+    z = (0.5 - np.sqrt((0.25 - length * (0.25 - SPHERE_RADIUS**2)).clip(0))) / length
+    steep = (length - 1) < 0.8 * SPHERE_RADIUS**2 / 0.25
+    assert depth[label == 1][steep] == pytest.approx(z[steep], abs=3e-4)
+    alone, nothing = render_scene([sphere], CAMERA, pose)
+    assert (alone[nothing < 0] == 0).all()
+    assert (nothing == label - 1).all()
+
+
+def test_a_scene_appears_where_the_lens_puts_it():
+    lens = PinholeCamera(161, 121, 150.0, 150.0, 80.0, 60.0, (-0.2, 0.05, 0.002, -0.001, 0.0))
+    pose = look_at((0.3, 0.2, 0.25), (0, 0, 0))
+    balls = [make_shape("sphere"), make_shape("box")]
+    balls[1] = TriangleMesh(balls[1].vertices + np.array([0.0, 0.12, 0.0]), balls[1].faces)
+    depth, label = render_scene(balls, lens, pose)
+    points = cloud_from_depth(depth, lens).points
+    row, column = np.nonzero(depth)
+    assert project(points, lens) == pytest.approx(np.stack([column, row], -1), abs=1e-6)
+    world = points @ pose[:3, :3].T + pose[:3, 3]
+    on_ball = label[row, column] == 0
+    assert np.linalg.norm(world[on_ball], axis=1) == pytest.approx(np.full(on_ball.sum(), SPHERE_RADIUS), abs=2e-4)
+
+
+def test_pixels_beyond_the_lens_see_nothing():
+    # Strong barrel distortion folds back before the corners of the image.
+    lens = PinholeCamera(81, 61, 30.0, 30.0, 40.0, 30.0, (-0.3,))
+    blind = np.isnan(camera_rays(lens)[..., 0])
+    assert blind.any()
+    assert not blind.all()
+    ball = make_shape("sphere")
+    depth, label = render_scene([TriangleMesh(ball.vertices * 10, ball.faces)], lens, np.eye(4))
+    assert (label[blind] == -1).all()
+    assert (depth[blind] == 0).all()
+    assert (label[~blind] == 0).all()
 
 
 def test_pictures_show_every_mesh_in_its_colour(tmp_path):

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspd_core.geometry.scene import Scene, load_scene
+from graspd_core.geometry.load import load_scene
+from graspd_core.geometry.scene import Scene
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.optimise.problem import Problem, build_problem

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import dataclasses
 import json
 import os
 import signal
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped
+from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -24,14 +26,19 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from graspd_core.geometry.mesh import save_mesh
 from graspd_core.geometry.shapes import make_shape
+from graspd_core.paths import config_dir
+from graspd_ros.parameters import Settings
 
 DOMAIN = 1 + os.getpid() % 100
 START_TIMEOUT = 60.0  # imports, hand and warm-up; 10 s on a quiet machine
 MATCH_SETTLE = 0.3  # seconds after the match in which the first messages could still be lost
 
+READ_ONLY = {"hand", "device", "torch_threads", "queue_size"}
+DEFAULTS = {n: v for n, v in dataclasses.asdict(Settings()).items() if n not in READ_ONLY} | {"output_dir": "out"}
 TERMINAL = {"result", "error", "cancelled", "superseded"}
 
 Event = dict[str, Any]
@@ -42,6 +49,7 @@ class Client:
 
     def __init__(self) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(config_dir() / "fastdds.xml")  # for large clouds
         self.context = Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node("graspd_test_client", context=self.context)
@@ -54,10 +62,16 @@ class Client:
         self.node.create_subscription(String, "/graspd/status", self._on_status, 100)
         self.node.create_subscription(JointState, "/graspd/joint_states", self.joints.append, latched)
         self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self.poses.append, latched)
+        self.progress: list[GraspProgress] = []
+        self.answers: list[GraspArray] = []
+        self.node.create_subscription(GraspProgress, "/graspd/progress", self.progress.append, 500)
+        deep = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(GraspArray, "/graspd/grasps", self.answers.append, deep)
+        self._request = self.node.create_publisher(GraspRequest, "/graspd/request", 500)
         self._mesh = self.node.create_publisher(String, "/graspd/mesh", 10)
         self._cancel = self.node.create_publisher(String, "/graspd/cancel", 10)
         self._points = self.node.create_publisher(PointCloud2, "/points", 10)
-        self._set_parameters = self.node.create_client(SetParameters, "/graspd/set_parameters")
+        self._services: dict[str, Any] = {}
 
     def _on_status(self, message: String) -> None:
         self.events.append(json.loads(message.data))
@@ -83,7 +97,7 @@ class Client:
         return self.spin_until(find, timeout, f"event {wanted}")
 
     def wait_for_match(self) -> None:
-        publishers = (self._mesh, self._cancel, self._points)
+        publishers = (self._mesh, self._cancel, self._points, self._request)
         matched = lambda: all(p.get_subscription_count() for p in publishers)  # noqa: E731
         self.spin_until(matched, START_TIMEOUT, "match")
         self.spin_for(MATCH_SETTLE)
@@ -95,11 +109,27 @@ class Client:
 
     def forget(self) -> None:
         """Drop what was received so far."""
-        for received in (self.events, self.joints, self.poses):
+        for received in (self.events, self.joints, self.poses, self.progress, self.answers):
             received.clear()
 
     def send_mesh(self, uri: str | Path) -> None:
         self._mesh.publish(String(data=str(uri)))
+
+    def send_request(self, **fields: Any) -> None:
+        self._request.publish(GraspRequest(**fields))
+
+    def answer(self, request_id: str, timeout: float) -> GraspArray:
+        """Wait for the answer to a request."""
+        find = lambda: next((a for a in self.answers if a.request_id == request_id), None)  # noqa: E731
+        return self.spin_until(find, timeout, f"answer to {request_id}")
+
+    def call(self, kind: Any, name: str, request: Any = None, timeout: float = 10.0) -> Any:
+        """Call a service of the node and wait for its answer."""
+        service = self._services.get(name) or self.node.create_client(kind, f"/graspd/{name}")
+        self._services[name] = service
+        self.spin_until(service.service_is_ready, timeout, f"service {name}")
+        future = service.call_async(request or kind.Request())
+        return self.spin_until(lambda: future.done() and future.result(), timeout, f"answer of {name}")
 
     def send_cancel(self, request_id: str) -> None:
         self._cancel.publish(String(data=request_id))
@@ -110,9 +140,7 @@ class Client:
     def set_parameters(self, **values: Any) -> None:
         """Change the node's parameters while it runs."""
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        self.spin_until(self._set_parameters.service_is_ready, 10.0, "parameter service")
-        future = self._set_parameters.call_async(SetParameters.Request(parameters=parameters))
-        answer = self.spin_until(lambda: future.done() and future.result(), 10.0, "answer to set_parameters")
+        answer = self.call(SetParameters, "set_parameters", SetParameters.Request(parameters=parameters))
         refused = [result.reason for result in answer.results if not result.successful]
         assert not refused, refused
 
@@ -133,16 +161,16 @@ class Client:
 
 
 class NodeProcess:
-    """`graspd_node` as a user starts it, with parameters."""
+    """`graspd_node` as a user starts it, with parameters; or a module that does as it does."""
 
-    def __init__(self, directory: Path, parameters: dict[str, Any]) -> None:
+    def __init__(self, directory: Path, parameters: dict[str, Any], module: Path | None = None) -> None:
         arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
         environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": str(directory / "log")}
         self.directory = directory
         self.log = directory / "node.log"
         self._file = self.log.open("w")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "graspd_ros.node", "--ros-args", *arguments],
+            [sys.executable, *([module] if module else ["-m", "graspd_ros.node"]), "--ros-args", *arguments],
             cwd=directory,
             env=environment,
             stdout=self._file,
@@ -188,10 +216,10 @@ def client() -> Iterator[Client]:
     client.close()
 
 
-def start_ready(client: Client, directory: Path, **parameters: Any) -> NodeProcess:
+def start_ready(client: Client, directory: Path, module: Path | None = None, **parameters: Any) -> NodeProcess:
     """A node that has said it is ready and that hears the client."""
     client.forget()
-    process = NodeProcess(directory, parameters)
+    process = NodeProcess(directory, parameters, module)
     try:
         client.event(START_TIMEOUT, event="ready")
         client.wait_for_match()
@@ -202,30 +230,56 @@ def start_ready(client: Client, directory: Path, **parameters: Any) -> NodeProce
     return process
 
 
-@pytest.fixture(scope="module")
-def shared_node(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeProcess]:
-    """One node for the tests of a module: starting one takes seconds. `sphere.obj` and `mug.obj` are in reach."""
-    directory = tmp_path_factory.mktemp("node")
+class SharedNode:
+    """One node for all tests that need no own: starting one takes seconds. It gives way to nodes of a test's own."""
+
+    def __init__(self, client: Client, directory: Path) -> None:
+        self._client = client
+        self._directory = directory
+        self._process: NodeProcess | None = None
+        save_shapes(directory)
+
+    def process(self) -> NodeProcess:
+        """The running node; started anew where it is not."""
+        if self._process is None or not self._process.alive():
+            self._process = start_ready(self._client, self._directory, queue_size=1, output_dir="out")
+        return self._process
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.stop()
+            self._process = None
+
+
+def save_shapes(directory: Path) -> None:
+    """`sphere.obj` and `mug.obj`, in reach of a node that runs there."""
     for shape in ("sphere", "mug"):
         save_mesh(make_shape(shape), directory / f"{shape}.obj")
-    process = start_ready(client, directory, queue_size=1, output_dir="out")
-    yield process
-    process.stop()
+
+
+@pytest.fixture(scope="session")
+def shared_node(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedNode]:
+    shared = SharedNode(client, tmp_path_factory.mktemp("node"))
+    yield shared
+    shared.stop()
 
 
 @pytest.fixture
-def node(client: Client, shared_node: NodeProcess) -> Iterator[NodeProcess]:
-    """The shared node, idle before and after."""
+def node(client: Client, shared_node: SharedNode) -> Iterator[NodeProcess]:
+    """The shared node, idle before and after, dynamic parameters at their defaults, nothing latched or kept."""
+    process = shared_node.process()
+    client.set_parameters(**DEFAULTS)
+    client.call(Trigger, "reset")
     client.forget()
-    yield shared_node
+    yield process
     client.end_all()
 
 
 @pytest.fixture
-def start_node(client: Client, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
+def start_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
     """Starts a node of the test's own; `ready=False` does not wait for it. `sphere.obj` and `mug.obj` are in reach."""
-    for shape in ("sphere", "mug"):
-        save_mesh(make_shape(shape), tmp_path / f"{shape}.obj")
+    shared_node.stop()
+    save_shapes(tmp_path)
     started: list[NodeProcess] = []
 
     def start(ready: bool = True, **parameters: Any) -> NodeProcess:

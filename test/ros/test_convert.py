@@ -45,7 +45,7 @@ def test_the_pose_names_its_frame_and_turns_wxyz_to_xyzw():
 
 
 def test_the_joint_state_names_its_joints_and_carries_positions_only():
-    message = convert.joint_message(grasp(Verdict.VERIFIED), ("a", "b"), "palm", Time())
+    message = convert.joint_message(grasp(Verdict.VERIFIED).grasp, ("a", "b"), "palm", Time())
     assert message.header.frame_id == "palm"
     assert list(message.name) == ["a", "b"]
     assert list(message.position) == [0.25, -1.0]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.errors import MeshError
-from graspd_ros.mesh_path import resolve_mesh
+from graspd_ros.mesh_path import MOST_MESH_BYTES, resolve_mesh
 
 
 @pytest.fixture
@@ -61,7 +61,8 @@ def test_every_form_finds_the_file(root: Path, monkeypatch: pytest.MonkeyPatch):
         ("missing.obj", "no such file"),
         ("sub dir", "a directory"),
         ("mug\0.obj", "not a usable path"),
-        ("m" * 5000, "not a usable path"),
+        ("m" * 300, "not a usable path"),
+        ("m" * 5000, "5000 characters long"),
     ],
 )
 def test_what_may_not_be_read_is_refused_by_name(root: Path, uri: str, culprit: str):
@@ -93,3 +94,10 @@ def test_no_spelling_leads_out(tmp_path_factory: pytest.TempPathFactory, scheme:
     except MeshError:
         return
     assert found == root / "mug.obj"
+
+
+def test_a_mesh_too_large_to_read_is_refused_before_it_is_read(root: Path):
+    with (root / "huge.obj").open("wb") as file:
+        file.truncate(MOST_MESH_BYTES + 1)
+    with pytest.raises(MeshError, match="at most 100 MB"):
+        resolve_mesh("huge.obj", [str(root)])

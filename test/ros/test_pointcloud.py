@@ -14,7 +14,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 from graspd_core.errors import CloudError
 from graspd_ros.pointcloud import points_from_message
 
-VGA_TIME = 0.02  # seconds for 640 x 480 points: a 30 Hz camera leaves 33 ms
+# Seconds for 640 x 480 points on a machine that does other things too; 8 ms on a quiet one, a 30 Hz camera leaves 33.
+VGA_TIME = 0.06
 
 
 def encode(points: np.ndarray, order: str, formats: list[str], offsets: list[int], step: int, row_padding: int):

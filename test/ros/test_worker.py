@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_ros.worker import BusyPolicy, Ending, Worker
+from graspd_ros.worker import BusyPolicy, Ending, Refusal, Report, Worker
 
 TIMEOUT = 10.0  # seconds; what is waited for takes milliseconds
 
@@ -20,7 +20,7 @@ TIMEOUT = 10.0  # seconds; what is waited for takes milliseconds
 class Job:
     id: str
     only_newest: bool = False
-    error: Exception | None = None
+    error: BaseException | None = None
 
 
 class Bench:
@@ -30,7 +30,8 @@ class Bench:
         self.release = threading.Event()
         self.started = threading.Semaphore(0)
         self.reports: list[tuple[str, Ending]] = []
-        self.errors: list[Exception | None] = []
+        self.errors: list[BaseException | None] = []
+        self.values: list[str | None] = []
         self.worker: Worker[Job, str] = Worker(
             work=self._work, finish=self._finish, prepare=lambda: None, queue_size=queue_size
         )
@@ -46,6 +47,7 @@ class Bench:
 
     def _finish(self, job: Job, report) -> None:
         self.errors.append(report.error)
+        self.values.append(report.value)
         self.reports.append((job.id, report.ending))
 
     def run(self, *jobs: Job, policy: BusyPolicy = BusyPolicy.QUEUE) -> list[bool]:
@@ -104,8 +106,10 @@ def test_only_the_newest_waits_and_jobs_go_first(bench: Bench):
     assert bench.reports[2:] == [(name, Ending.DONE) for name in ("0", "1", "cloud2")]
 
 
-def test_an_error_ends_one_request_and_not_the_worker(bench: Bench):
-    error = ZeroDivisionError("in the middle")
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("in the middle"), MemoryError(), SystemExit(1), KeyboardInterrupt(), BaseException()]
+)
+def test_an_error_ends_one_request_and_not_the_worker(bench: Bench, error: BaseException):
     bench.release.set()
     bench.worker.submit(Job("bad", error=error), BusyPolicy.QUEUE)
     assert bench.wait(1) == {"bad": Ending.FAILED}
@@ -122,6 +126,34 @@ def test_cancel_reaches_the_running_and_the_waiting(bench: Bench):
     assert bench.wait(3) == {str(i): Ending.CANCELLED for i in range(3)}
 
 
+def test_what_was_done_before_a_cancel_is_not_lost(bench: Bench):
+    bench.run(Job("0"))
+    bench.worker.cancel("0")
+    bench.wait(1)
+    assert bench.values == ["0"]
+
+
+@pytest.mark.parametrize("policy", list(BusyPolicy))
+def test_an_id_is_taken_once_at_a_time(bench: Bench, policy: BusyPolicy):
+    bench.run(Job("same"))
+    again = bench.worker.submit(Job("same"), policy)
+    assert (again.refusal, again.reason) == (Refusal.DUPLICATE, "a request 'same' is already waiting or running")
+    bench.release.set()
+    assert bench.wait(1) == {"same": Ending.DONE}
+    assert bench.worker.submit(Job("same"), BusyPolicy.REJECT).accepted
+    bench.wait(2)
+
+
+def test_those_who_waited_too_long_are_told_and_the_running_one_goes_on(bench: Bench):
+    bench.run(*jobs(3), Job("cloud", only_newest=True))
+    assert bench.worker.end_waiting(lambda job: job.id != "1", Report(Ending.DONE, value="too late")) == 2
+    assert bench.wait(2) == {"2": Ending.DONE, "cloud": Ending.DONE}
+    assert bench.values == ["too late", "too late"]
+    assert bench.worker.state() == ("0", 1)
+    bench.release.set()
+    assert set(bench.wait(4)) == {"0", "1", "2", "cloud"}
+
+
 def test_a_job_that_raises_on_being_cancelled_is_cancelled(bench: Bench):
     bench.run(Job("0", error=RuntimeError("torn down")))
     bench.worker.cancel("0")
@@ -133,7 +165,8 @@ def test_after_stop_nothing_is_taken(bench: Bench):
     bench.run(*jobs(2))
     assert bench.worker.stop(TIMEOUT)
     assert bench.wait(2) == {"0": Ending.CANCELLED, "1": Ending.CANCELLED}
-    assert "shutting down" in bench.worker.submit(Job("2"), BusyPolicy.QUEUE).reason
+    refused = bench.worker.submit(Job("2"), BusyPolicy.QUEUE)
+    assert (refused.refusal, refused.reason) == (Refusal.STOPPING, "the node is shutting down")
 
 
 ACTIONS = st.lists(

@@ -1,0 +1,67 @@
+"""The command line, one file a command; heavy imports wait for who needs them.
+
+graspd synthesize | replay | reconstruct | hands | doctor
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from graspd_core.cli import reconstruct, replay, synthesize
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
+from graspd_core.errors import ConfigError, GraspdError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
+    try:
+        options = build_parser().parse_args(arguments)
+        return int(options.run(options))
+    except (GraspdError, OSError) as error:
+        print(f"graspd: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print("graspd: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+class _Parser(argparse.ArgumentParser):
+    """Wrong options are errors like any other: one line, no usage text before it."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands; raises ConfigError for options that it does not know."""
+    parser = _Parser(prog="graspd", description="Verified grasps for multi-fingered hands.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    synthesize.add_command(commands)
+    replay.add_command(commands)
+    reconstruct.add_command(commands)
+    hands = commands.add_parser("hands", help="list the hands in the box")
+    hands.set_defaults(run=_hands)
+    doctor = commands.add_parser("doctor", help="check the installation")
+    doctor.set_defaults(run=_doctor)
+    return parser
+
+
+def _hands(options: argparse.Namespace) -> int:
+    import torch
+
+    from graspd_core.pipeline import hand_names, load_hand
+
+    torch.set_num_threads(1)
+    for name in hand_names():
+        hand = load_hand(name)
+        print(f"{name}: {hand.num_joints} joints, {len(hand.candidate_points)} contact candidates, {hand.urdf}")
+    return EXIT_OK
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from graspd_core import doctor
+
+    return doctor.main()

@@ -1,0 +1,7 @@
+"""`python -m graspd_core.cli`."""
+
+import sys
+
+from graspd_core.cli import main
+
+sys.exit(main())

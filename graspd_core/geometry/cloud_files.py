@@ -1,0 +1,177 @@
+"""Clouds from files: point formats, arrays, and depth images with the camera that took them."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import CloudError
+from graspd_core.geometry.camera import camera_from_calibration
+from graspd_core.geometry.cloud import PointCloud
+from graspd_core.geometry.depth import cloud_from_depth, depth_in_metres
+
+CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
+
+_RIGID = 1e-4
+
+
+def is_cloud_file(path: str | Path) -> bool:
+    """Whether a path names a cloud by its ending; a ply counts when its header declares no faces."""
+    path = Path(path)
+    ending = path.suffix.lower().lstrip(".")
+    if ending == "ply":
+        return path.is_file() and not _ply_has_faces(path)
+    return ending in CLOUD_ENDINGS
+
+
+def load_cloud(path: str | Path) -> PointCloud:
+    """Read a file that holds one view; see `load_views`.
+
+    Raises:
+        CloudError: as `load_views`, or the file holds several views.
+    """
+    view, *others = load_views(path)
+    if others:
+        raise CloudError(f"{path}: holds {1 + len(others)} views; one is needed here")
+    return view
+
+
+def load_views(path: str | Path) -> tuple[PointCloud, ...]:
+    """Read what one or several cameras saw, in one frame.
+
+    * ply, pcd, xyz; npy (n×3 or h×w×3): points [m], seen from the origin.
+    * npz with `points`, and where known `viewpoint` [m] and `forward` (the direction of the optical axis).
+    * npz with `depth` (h×w; integers are millimetres, floats metres) and the camera's matrix `K` (3×3), where known
+      also `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
+    * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), where known `distortion`.
+
+    Raises:
+        CloudError: the file is missing, of an unknown ending, unreadable, or does not hold one of these.
+    """
+    path = Path(path)
+    ending = path.suffix.lower().lstrip(".")
+    if path.is_dir():
+        raise CloudError(f"{path}: is a directory; give a cloud file ({', '.join(CLOUD_ENDINGS)})")
+    if not path.exists():
+        raise CloudError(f"{path}: no such cloud file")
+    if ending not in CLOUD_ENDINGS:
+        raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
+    if ending not in ("npy", "npz"):
+        return (PointCloud(_read_open3d(path), np.zeros(3)),)
+    arrays = _read_numpy(path)
+    try:
+        if "depth" in arrays or "depths" in arrays:
+            return _depth_views(arrays)
+        return (_points_view(arrays),)
+    except CloudError as error:
+        raise CloudError(f"{path}: {error}") from None
+
+
+def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
+    if "points" not in arrays:
+        raise CloudError(f"holds no array called 'points', 'depth' or 'depths'; it has: {', '.join(arrays) or 'none'}")
+    points, viewpoint = _numbers(arrays, "points"), np.zeros(3)
+    forward = None
+    if "viewpoint" in arrays:
+        viewpoint = _numbers(arrays, "viewpoint")
+    if "forward" in arrays:
+        forward = _numbers(arrays, "forward")
+    if points.ndim == 3 and points.shape[2] == 3:
+        points = points.reshape(-1, 3)
+    if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):
+        raise CloudError(f"shape {points.shape}, viewpoint {viewpoint.shape}; points × 3 and 3 are needed")
+    if forward is not None:
+        if forward.shape != (3,) or not np.linalg.norm(forward) > 0:
+            raise CloudError("'forward' is no direction; 3 numbers are needed, not all zero")
+        forward = forward / np.linalg.norm(forward)
+    return PointCloud(points, viewpoint, forward)
+
+
+def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
+    several = "depths" in arrays
+    name, place = ("depths", "poses") if several else ("depth", "T_world_camera")
+    for needed in ("K", place) if several else ("K",):
+        if needed not in arrays:
+            raise CloudError(f"holds {name!r} but no {needed!r}; it has: {', '.join(arrays)}")
+    images, poses = arrays[name], arrays.get(place)
+    if not several:
+        images, poses = images[None], None if poses is None else poses[None]
+    if images.ndim != 3 or images.size == 0:
+        raise CloudError(f"{name!r} has shape {arrays[name].shape}; {'views × ' * several}height × width is needed")
+    if poses is not None and poses.shape != (len(images), 4, 4):
+        raise CloudError(f"{place!r} has shape {arrays[place].shape}; {f'{len(images)} × ' * several}4 × 4 is needed")
+    matrix = _numbers(arrays, "K")
+    if matrix.shape != (3, 3):
+        raise CloudError(f"'K' has shape {matrix.shape}; 3 × 3 is needed")
+    distortion = _numbers(arrays, "distortion").reshape(-1).tolist() if "distortion" in arrays else ()
+    _, height, width = images.shape
+    model = "plumb_bob" if len(distortion) <= 5 else "rational_polynomial"
+    camera = camera_from_calibration(width, height, matrix.reshape(-1).tolist(), distortion, model)
+    views = []
+    for index, image in enumerate(images):
+        pose = None if poses is None else _rigid(poses[index], place)
+        views.append(cloud_from_depth(_metres(image, name), camera, pose))
+    return tuple(views)
+
+
+def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
+    if image.dtype.kind in "iu":
+        return depth_in_metres(image.clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
+    if image.dtype.kind == "f":
+        return depth_in_metres(image.astype(np.float32), "32FC1")
+    raise CloudError(f"{name!r} holds {image.dtype}; integers (mm) or floats (m) are needed")
+
+
+def _rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
+    pose = pose.astype(float)
+    turn = pose[:3, :3]
+    square = np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
+    if not (np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1))):
+        raise CloudError(
+            f"{name!r} is no rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
+        )
+    return pose
+
+
+def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    try:
+        return arrays[name].astype(float)
+    except ValueError as error:
+        raise CloudError(f"{name!r} not readable as numbers ({error})") from None
+
+
+def _read_numpy(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz, or that of an npy as `points`."""
+    try:
+        # numpy leaves a spoilt file open when it is given the path.
+        with path.open("rb") as file:
+            stored = np.load(file, allow_pickle=False)
+            if isinstance(stored, np.ndarray):
+                return {"points": stored}
+            return {name: stored[name] for name in stored.files}
+    # A spoilt archive shows as any of these: numpy lets the errors of its zip reader through.
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise CloudError(f"{path}: not readable as numbers ({str(error).splitlines()[0]})") from error
+
+
+def _ply_has_faces(path: Path) -> bool:
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"end_header")[0]
+    faces = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
+    return any(len(words) > 2 and words[2] != b"0" for words in faces)
+
+
+def _read_open3d(path: Path) -> np.ndarray:
+    import open3d as o3d
+
+    # Open3D prints its complaints and returns nothing; the error below says it once.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+    if len(cloud.points) == 0:
+        raise CloudError(f"{path}: empty, or not a readable {path.suffix.lstrip('.')} cloud")
+    return np.array(cloud.points)

@@ -1,0 +1,87 @@
+"""Things in a scene: points linked to their neighbours, and pieces of one thing that occlusion set apart."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+# Of the neighbours that a usual point has, a point of a thing has at least this share: flying pixels, which are spread
+# along their lines of sight between two surfaces, have fewer. The second share is of the weight around a usual point:
+# it tells them where many views have filled the space around an edge with them.
+FEWEST_NEIGHBOURS = 0.3
+LEAST_WEIGHT = 0.04
+# Points are linked over this share of the gap between things; noise takes the rest.
+LINKED = 0.75
+# Where the points are sparse, over this many times the distance to a point's fourth neighbour: surfaces seen at a small
+# angle have their points far apart along the line of sight.
+SPARSE = 2.5
+SAMPLE = 2000
+
+
+def link_length(points: Float[np.ndarray, "n 3"], gap: float) -> float:
+    """Points this near belong together [m]: less than `gap`, unless the points are too sparse."""
+    from scipy.spatial import KDTree
+
+    if len(points) < 5:
+        return gap
+    some = points[:: max(1, len(points) // SAMPLE)]
+    spacing = float(np.median(KDTree(points).query(some, k=5)[0][:, -1]))
+    return max(LINKED * gap, SPARSE * spacing)
+
+
+def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float) -> Int[np.ndarray, "n"]:
+    """Clusters of evenly dense points, numbered from the largest; -1: a stray.
+
+    As in DBSCAN, only points with enough neighbours carry a cluster on; the others join the nearest that does.
+
+    Args:
+        points: one a voxel [m].
+        weight: how well each was seen: full points in its voxel, those that any camera would see taken as equal.
+        link: points this near are neighbours [m].
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    label = np.full(len(points), -1)
+    if len(points) == 0:
+        return label
+    tree = KDTree(points)
+    pairs = tree.query_pairs(link, output_type="ndarray")
+    degree = np.bincount(pairs.ravel(), minlength=len(points))
+    if len(pairs) == 0:
+        return label
+    around = weight + sum(np.bincount(pairs[:, k], weight[pairs[:, 1 - k]], minlength=len(points)) for k in (0, 1))
+    usual = degree > 0
+    core = degree >= max(2.0, FEWEST_NEIGHBOURS * float(np.median(degree[usual])))
+    seen = around >= LEAST_WEIGHT * float(np.median(around[usual]))
+    core &= seen
+    if not core.any():
+        return label
+    both = pairs[core[pairs].all(1)]
+    graph = coo_matrix((np.ones(len(both), dtype=bool), tuple(both.T)), shape=(len(points), len(points)))
+    _, component = connected_components(graph, directed=False)
+    label[core] = component[core]
+    edge = ~core & seen
+    near, nearest = KDTree(points[core]).query(points[edge], distance_upper_bound=link)
+    joins = np.flatnonzero(edge)[np.isfinite(near)]
+    label[joins] = label[core][nearest[np.isfinite(near)]]
+    return renumber(label)
+
+
+def extent(points: Float[np.ndarray, "n 3"]) -> float:
+    """Length along the longest principal axis [m], however the points are turned."""
+    centred = points - points.mean(0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    return float(np.ptp(centred @ axes, axis=0).max())
+
+
+def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Number clusters from the largest, without gaps; strays (-1) stay."""
+    answer = np.full(len(label), -1)
+    known = label >= 0
+    _, which, count = np.unique(label[known], return_inverse=True, return_counts=True)
+    rank = np.empty(len(count), dtype=int)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
+    answer[known] = rank[which]
+    return answer

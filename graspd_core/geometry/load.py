@@ -1,0 +1,73 @@
+"""A scene from whatever names an object: a mesh file, a cloud file, an authored shape, or a mesh."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from graspd_core.errors import MeshError
+from graspd_core.geometry.choice import Target
+from graspd_core.geometry.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.geometry.mesh import MESH_ENDINGS, load_mesh
+from graspd_core.geometry.perceive import scene_from_views
+from graspd_core.geometry.scene import Scene, build_scene, refuse_numbers
+from graspd_core.geometry.shapes import make_shape
+from graspd_core.types import TriangleMesh
+
+SHAPE_PREFIX = "shape:"
+
+
+def load_scene(
+    source: str | Path | TriangleMesh,
+    *,
+    mass: float | None = 0.1,
+    friction: float = 0.6,
+    scale: float = 1.0,
+    resolution: int = 48,
+    device: torch.device | str = "cpu",
+    target: Target | None = None,
+    alone: bool = False,
+) -> Scene:
+    """Build the scene of one object.
+
+    Args:
+        source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
+        mass: [kg]; None takes 300 kg/m³ times the volume.
+        friction: Coulomb coefficient between hand and object.
+        scale: factor on the file's coordinates to make them metres.
+        resolution: nodes along each axis of the distance grid.
+        target: which of the things in a cloud is meant.
+        alone: a cloud shows the object and nothing else.
+
+    Raises:
+        MeshError: the mesh cannot be read or used, or a number is out of range.
+        CloudError: the cloud cannot be read or shows no object.
+    """
+    started = time.perf_counter()
+    given = "mesh" if isinstance(source, TriangleMesh) else str(source)
+    numbers = {"mass": mass, "friction": friction, "resolution": resolution}
+    refuse_numbers(given, scale=scale, **numbers)
+    if not isinstance(source, TriangleMesh) and is_cloud_file(source):
+        views = [
+            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
+        ]
+        scene = scene_from_views(views, target=target, alone=alone, source=given, device=device, **numbers)
+        return replace(scene, object=replace(scene.object, scale=scale))
+    mesh = _read_mesh(source, scale)
+    return build_scene(mesh, source=given, scale=scale, device=device, started=started, **numbers)
+
+
+def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> TriangleMesh:
+    if isinstance(source, TriangleMesh):
+        return TriangleMesh(source.vertices * scale, source.faces)
+    name = str(source)
+    if name.startswith(SHAPE_PREFIX):
+        shape = make_shape(name.removeprefix(SHAPE_PREFIX))
+        return TriangleMesh(shape.vertices * scale, shape.faces)
+    endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
+    if Path(source).is_file() and Path(source).suffix.lower().lstrip(".") not in endings:
+        raise MeshError(f"{name}: unknown ending {Path(source).suffix!r}; valid endings: {', '.join(endings)}")
+    return load_mesh(source, scale=scale)

@@ -1,0 +1,176 @@
+"""Large flat parts of a scene: RANSAC finds them, weighted least squares refines them.
+
+The noise of a depth camera grows with the square of the distance (stereo and structured light both measure disparity),
+so a plane's tolerance does too: the residuals themselves say how fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.types import Plane
+
+RANSAC_TRIALS = 400
+# Within this of a candidate plane while it is looked for, more beyond a metre; the refinement tightens it [m].
+COARSE = 0.01
+# Residuals of a plane gather in the middle of that gate: their median is this share of it at most, and the tolerance
+# they ask for is not much wider. Those of a curved surface fill the gate, and the next, wider one again.
+GATHERED, WIDENED = 0.4, 1.5
+# A point is on the plane within so many standard deviations, and never farther than WIDEST [m].
+DEVIATIONS = 4.0
+# It is fitted to those within so many.
+FITTED = 3.0
+WIDEST = 0.02
+# Side of the cells by which a plane's visible part is measured; occlusion and holes of a few cells are bridged [m].
+CELL = 0.01
+BRIDGED = 3
+
+
+@dataclass(frozen=True)
+class FlatPart:
+    """A plane and the part of it that was seen.
+
+    Attributes:
+        plane: normal towards the cameras.
+        axes: two unit vectors in the plane, columns.
+        noise: standard deviation of the points from it, over the square of their distance from the camera [1/m].
+        least: tolerance where the noise is small [m].
+        inliers: which of the scene's points lie on it.
+        sides: length and width of the seen part [m].
+        hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`; rows n, c.
+        area: inside the hull [m²].
+    """
+
+    plane: Plane
+    axes: Float[np.ndarray, "3 2"]
+    noise: float
+    least: float
+    inliers: Bool[np.ndarray, "points"]
+    sides: tuple[float, float]
+    hull: Float[np.ndarray, "edges 3"]
+    area: float
+
+    def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Above the plane, towards the cameras [m]."""
+        return points @ self.plane.normal - self.plane.offset
+
+    def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """How high a point may be and still belong to the plane, by its distance from the camera [m]."""
+        return np.clip(DEVIATIONS * self.noise * distance**2, self.least, WIDEST)
+
+    def beneath(self, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
+        """Whether points lie over the seen part, or at most `margin` beside it [m]."""
+        flat = points @ self.axes
+        return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
+
+
+def find_planes(
+    points: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    *,
+    least: float,
+    smallest: float,
+    most: int = 4,
+) -> list[FlatPart]:
+    """Flat parts in order of their number of points, each point in at most one.
+
+    Args:
+        points: evenly dense [m].
+        distance: of each from its camera [m].
+        viewpoints: where the cameras stood [m].
+        least: tolerance where the noise is small [m].
+        smallest: parts whose smaller side is less than this are left alone [m].
+    """
+    import open3d as o3d
+
+    left = np.arange(len(points))
+    parts: list[FlatPart] = []
+    for _ in range(most):
+        if len(left) < max(50, (smallest / 0.02) ** 2):
+            break
+        o3d.utility.random.seed(0)
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
+        guess, close = cloud.segment_plane(COARSE, 3, RANSAC_TRIALS)
+        part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), least)
+        if part is not None and part.sides[1] >= smallest:
+            parts.append(part)
+            left = left[~part.inliers[left]]
+        else:
+            left = np.delete(left, np.asarray(close, dtype=int))
+    return parts
+
+
+def _refine(
+    points: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    left: Int[np.ndarray, "left"],
+    guess: Float[np.ndarray, "4"],
+    viewpoint: Float[np.ndarray, "3"],
+    least: float,
+) -> FlatPart | None:
+    """Weighted least squares over points that the last fit calls near; None where too few are."""
+    size = float(np.linalg.norm(guess[:3]))
+    if not size > 0:
+        return None
+    normal, offset = guess[:3] / size, -float(guess[3]) / size
+    near, far = points[left], distance[left] ** 2
+    coarse = gate = COARSE * far.clip(1.0)
+    noise = 0.0
+    for step in range(4):
+        residual = near @ normal - offset
+        inlier = np.abs(residual) < gate
+        if inlier.sum() < 20:
+            return None
+        weight = 1.0 / far[inlier].clip(1e-4) ** 2
+        centre = weight @ near[inlier] / weight.sum()
+        spread = near[inlier] - centre
+        _, vectors = np.linalg.eigh((spread * weight[:, None]).T @ spread)
+        normal = vectors[:, 0]
+        offset = float(normal @ centre)
+        residual = np.abs(near[inlier] @ normal - offset)
+        noise = 1.4826 * float(np.median(residual / far[inlier].clip(1e-4)))
+        runs_away = DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > WIDENED
+        if runs_away or (step == 0 and np.median(residual / gate[inlier]) > GATHERED):
+            return None
+        # Tighter than the tolerance: the feet of what stands on it would tilt it.
+        gate = np.clip(FITTED * noise * far, 0.25 * least, WIDEST)
+    if normal @ viewpoint < offset:
+        normal, offset = -normal, -offset
+    inliers = np.zeros(len(points), dtype=bool)
+    inliers[left] = np.abs(near @ normal - offset) < np.clip(DEVIATIONS * noise * far, least, WIDEST)
+    return _measure(points, inliers, Plane(normal, offset), noise, least)
+
+
+def _measure(
+    points: Float[np.ndarray, "n 3"], inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, least: float
+) -> FlatPart | None:
+    """The largest connected part of the inliers, by a raster in the plane; the others are no inliers."""
+    from scipy.ndimage import binary_dilation, label
+    from scipy.spatial import ConvexHull, QhullError
+
+    axes = np.linalg.svd(plane.normal[None])[2][1:].T
+    rows = np.flatnonzero(inliers)
+    flat = points[rows] @ axes
+    low = flat.min(0)
+    cell = np.round((flat - low) / CELL).astype(int) + BRIDGED
+    raster = np.zeros(cell.max(0) + 2 * BRIDGED, dtype=bool)
+    raster[tuple(cell.T)] = True
+    names, _ = label(binary_dilation(raster, iterations=BRIDGED))  # pyright: ignore[reportGeneralTypeIssues]
+    name = names[tuple(cell.T)]
+    largest = name == np.bincount(name)[1:].argmax() + 1
+    flat = flat[largest]
+    try:
+        hull = ConvexHull(flat)
+    except QhullError:
+        return None
+    kept = np.zeros(len(points), dtype=bool)
+    kept[rows[largest]] = True
+    _, turn = np.linalg.eigh(np.cov(flat.T))
+    sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
+    return FlatPart(
+        plane, axes, noise, least, kept, (float(sides.max()), float(sides.min())), hull.equations, float(hull.volume)
+    )

@@ -1,0 +1,187 @@
+"""Where frames stand relative to each other over time: the tree of /tf and /tf_static, without any node.
+
+`T_a_b` maps coordinates in frame b to frame a. Stamps are integer nanoseconds. Between two samples the position is
+interpolated on a line and the rotation on a great circle, as tf2 does; before the first and after the last, nothing is
+known, and asking is an error that says from when to when.
+"""
+
+from __future__ import annotations
+
+import bisect
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import TransformError
+
+SECOND = 1_000_000_000
+HISTORY = 10 * SECOND
+
+_RIGID = 1e-3
+
+
+@dataclass
+class _Link:
+    """Poses of one frame in its parent over time, stamps ascending; a static one has a single pose."""
+
+    parent: str
+    static: bool
+    stamps: list[int] = field(default_factory=list)
+    poses: list[Float[np.ndarray, "4 4"]] = field(default_factory=list)
+
+
+class TransformBuffer:
+    """Takes transforms as they come, answers for any two connected frames. Safe to use from several threads.
+
+    Args:
+        history: how far behind a frame's newest sample older ones are kept [ns]; None keeps all.
+    """
+
+    def __init__(self, history: int | None = HISTORY) -> None:
+        self._history = history
+        self._links: dict[str, _Link] = {}
+        self._lock = threading.Lock()
+
+    def add(
+        self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"], stamp: int = 0, static: bool = False
+    ) -> None:
+        """Learn where `child` stood in `parent` at `stamp` [ns]; a static one stands there always.
+
+        A child that comes under a new parent, or turns static, forgets what was known of it.
+
+        Raises:
+            TransformError: a frame without a name, a frame under itself, a loop, or no rigid transform.
+        """
+        parent, child = _name(parent), _name(child)
+        pose = _rigid(T_parent_child, parent, child)
+        with self._lock:
+            above = self._chain(parent)
+            if child in above:
+                loop = " -> ".join([*reversed(above[: above.index(child) + 1]), child])
+                raise TransformError(f"transform {parent} -> {child}: closes the loop {loop}")
+            link = self._links.get(child)
+            if link is None or link.parent != parent or static or link.static:
+                link = self._links[child] = _Link(parent, static)
+            self._insert(link, stamp, pose)
+
+    def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
+        """`T_target_source` at `stamp` [ns], or at the newest time that every link between the two knows.
+
+        Raises:
+            TransformError: an unknown frame, frames that no chain connects, or a time outside what is known.
+        """
+        target, source = _name(target), _name(source)
+        with self._lock:
+            for name in (target, source):
+                self._refuse_unknown(name)
+            up_target, up_source = self._chain(target), self._chain(source)
+            common = next((name for name in up_source if name in up_target), None)
+            if common is None:
+                raise TransformError(
+                    f"transform {source} -> {target}: not connected; {source} hangs under {up_source[-1]}, "
+                    f"{target} under {up_target[-1]}"
+                )
+            below_source = up_source[: up_source.index(common)]
+            below_target = up_target[: up_target.index(common)]
+            if stamp is None:
+                moving = [link for name in (*below_source, *below_target) if not (link := self._links[name]).static]
+                stamp = min((link.stamps[-1] for link in moving), default=0)
+            asked = f"transform {source} -> {target}"
+            return _inverse(self._down(below_target, stamp, asked)) @ self._down(below_source, stamp, asked)
+
+    def frames(self) -> tuple[str, ...]:
+        """Every frame heard of, in alphabetical order."""
+        with self._lock:
+            return self._frames()
+
+    def clear(self) -> None:
+        """Forget everything, as when time has jumped back."""
+        with self._lock:
+            self._links.clear()
+
+    def _frames(self) -> tuple[str, ...]:
+        return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
+
+    def _refuse_unknown(self, name: str) -> None:
+        known = self._frames()
+        if name not in known:
+            raise TransformError(f"unknown frame {name!r}; known: {', '.join(known) or 'none'}")
+
+    def _chain(self, name: str) -> list[str]:
+        """The frame, its parent, and so on to the root."""
+        chain = [name]
+        while chain[-1] in self._links:
+            chain.append(self._links[chain[-1]].parent)
+        return chain
+
+    def _insert(self, link: _Link, stamp: int, pose: np.ndarray) -> None:
+        place = bisect.bisect_left(link.stamps, stamp)
+        if place < len(link.stamps) and link.stamps[place] == stamp:
+            link.poses[place] = pose
+            return
+        link.stamps.insert(place, stamp)
+        link.poses.insert(place, pose)
+        if self._history is not None:
+            old = bisect.bisect_left(link.stamps, link.stamps[-1] - self._history)
+            del link.stamps[:old], link.poses[:old]
+
+    def _down(self, names: list[str], stamp: int, asked: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of the first frame in the parent of the last."""
+        pose = np.eye(4)
+        for name in names:
+            pose = _pose_at(self._links[name], name, stamp, asked) @ pose
+        return pose
+
+
+def _pose_at(link: _Link, name: str, stamp: int, asked: str) -> Float[np.ndarray, "4 4"]:
+    if link.static:
+        return link.poses[0]
+    first, last = link.stamps[0], link.stamps[-1]
+    if not first <= stamp <= last:
+        raise TransformError(
+            f"{asked} at {_seconds(stamp)}: {name} in {link.parent} is known from {_seconds(first)} to {_seconds(last)}"
+        )
+    after = bisect.bisect_left(link.stamps, stamp)
+    if link.stamps[after] == stamp:
+        return link.poses[after]
+    share = (stamp - link.stamps[after - 1]) / (link.stamps[after] - link.stamps[after - 1])
+    return _between(link.poses[after - 1], link.poses[after], share)
+
+
+def _between(a: np.ndarray, b: np.ndarray, share: float) -> Float[np.ndarray, "4 4"]:
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    pose[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
+    return pose
+
+
+def _inverse(T_a_b: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, :3] = T_a_b[:3, :3].T
+    pose[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return pose
+
+
+def _rigid(pose: np.ndarray, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
+    turn = pose[:3, :3]
+    square = np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
+    if not (np.isfinite(pose).all() and square):
+        raise TransformError(f"transform {parent} -> {child}: not a rotation and a position in finite numbers")
+    return np.array(pose, dtype=float)
+
+
+def _name(frame: str) -> str:
+    # ROS 1 wrote a slash before names, and old drivers still do.
+    name = frame.removeprefix("/")
+    if not name:
+        raise TransformError("transform: a frame without a name")
+    return name
+
+
+def _seconds(stamp: int) -> str:
+    return f"{stamp // SECOND}.{stamp % SECOND:09d} s"

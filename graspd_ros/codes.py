@@ -1,0 +1,76 @@
+"""What kind of trouble an answer tells of: words for programs, beside the sentences for people."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from graspd_core.errors import (
+    CloudError,
+    ConfigError,
+    GraspdError,
+    HandError,
+    MeshError,
+    NoObjectError,
+    TransformError,
+)
+
+
+class ErrorCode(StrEnum):
+    """`error_code` of a GraspArray, and `code` of an error or refusal on `~/status`; empty where nothing is wrong."""
+
+    NONE = ""
+    BAD_REQUEST = "BAD_REQUEST"  # a field is out of range or unknown
+    BAD_MESH = "BAD_MESH"  # the mesh cannot be read, used or reached
+    BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows nothing usable
+    NO_OBJECT = "NO_OBJECT"  # the scene was seen, and what was asked for is not in it
+    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD, and none has come; VIEWS, and none is kept
+    STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
+    NO_TRANSFORM = "NO_TRANSFORM"  # /tf does not connect the frames
+    WRONG_HAND = "WRONG_HAND"  # another hand than the node's
+    DUPLICATE_ID = "DUPLICATE_ID"  # a request of this id is waiting or running
+    BUSY = "BUSY"  # refused under busy_policy, or the queue is full
+    SHUTTING_DOWN = "SHUTTING_DOWN"  # the node is ending
+    CANCELLED = "CANCELLED"  # by ~/cancel, ~/reset, the action's client or the node's end
+    SUPERSEDED = "SUPERSEDED"  # a newer request took its place
+    DEADLINE = "DEADLINE"  # time_budget passed before as many grasps as asked for were found
+    NO_GRASP = "NO_GRASP"  # fewer grasps than asked for, or none, held in the trial
+    OUT_OF_MEMORY = "OUT_OF_MEMORY"
+    INTERNAL = "INTERNAL"  # a fault of graspd: the node's log has the traceback
+
+
+class RequestError(GraspdError):
+    """A request that cannot be worked on; `code` says what kind of trouble it is."""
+
+    def __init__(self, code: ErrorCode, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+# The first that fits: subclasses stand before their bases.
+_CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
+    (NoObjectError, ErrorCode.NO_OBJECT),
+    (CloudError, ErrorCode.BAD_CLOUD),
+    (MeshError, ErrorCode.BAD_MESH),
+    (TransformError, ErrorCode.NO_TRANSFORM),
+    (HandError, ErrorCode.WRONG_HAND),
+    (ConfigError, ErrorCode.BAD_REQUEST),
+    (MemoryError, ErrorCode.OUT_OF_MEMORY),
+)
+
+
+def code_of(error: BaseException) -> ErrorCode:
+    """The code of whatever ended a request."""
+    if isinstance(error, RequestError):
+        return error.code
+    if isinstance(error, RuntimeError) and "allocate memory" in str(error):  # torch's way of saying it
+        return ErrorCode.OUT_OF_MEMORY
+    return next((code for kind, code in _CODES if isinstance(error, kind)), ErrorCode.INTERNAL)
+
+
+def sentence_of(error: BaseException) -> str:
+    """One line for people; an error that graspd did not raise on purpose is told as internal."""
+    if isinstance(error, GraspdError | OSError):
+        text = str(error)
+    else:
+        text = f"internal error: {type(error).__name__}: {error}"
+    return " ".join(text.split())

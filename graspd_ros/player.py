@@ -1,0 +1,190 @@
+"""`graspd_play BAG`: a recording's topics over DDS as they were recorded, where `ros2 bag play` is not at hand.
+
+graspd_play BAG [--rate R] [--loop] [--topics NAME ...] [--now] [--wait SEC] [--ros-args -r /recorded:=/wanted]
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, NoReturn
+
+from graspd_core.bags.reader import BagTopic, bag_topics, read_raw
+from graspd_core.errors import BagError, ConfigError, GraspdError
+from graspd_core.transforms import SECOND
+
+EXIT_DONE = 0
+EXIT_BAD_INPUT = 2
+
+DEPTH = 10
+SETTLE = 0.3  # seconds after a match in which the first messages could still be lost
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a recording to its end or until a signal; 0 when done or stopped, 2 for bad input."""
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args, try_shutdown
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    arguments = sys.argv if args is None else ["graspd_play", *args]
+    try:
+        options = _parse(remove_ros_args(arguments)[1:])
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("graspd_play")
+        play(
+            node,
+            options.bag,
+            topics=tuple(options.topics),
+            rate=options.rate,
+            loop=options.loop,
+            now=options.now,
+            wait=options.wait,
+            stop=stop,
+        )
+        node.destroy_node()
+    except GraspdError as error:
+        sys.stderr.write(f"graspd_play: {error}\n")
+        return EXIT_BAD_INPUT
+    finally:
+        try_shutdown()
+    return EXIT_DONE
+
+
+def play(
+    node: Any,
+    bag: Path,
+    *,
+    topics: tuple[str, ...] = (),
+    rate: float = 1.0,
+    loop: bool = False,
+    now: bool = False,
+    wait: float = 0.0,
+    stop: threading.Event | None = None,
+) -> int:
+    """Publish a recording's messages at the times they were recorded at; returns how many were published.
+
+    Args:
+        node: whose publishers send them.
+        bag: a rosbag2 directory or storage file.
+        topics: only these; all of the bag unless some are named.
+        rate: how many times as fast as recorded.
+        loop: begin again at the end, until stopped.
+        now: shift the stamps in the messages, so that the recording seems to happen now.
+        wait: wait for a subscriber of any of the topics before the first message, at most so long [s].
+        stop: ends it when set.
+
+    Raises:
+        BagError: the bag cannot be read, lacks a topic, or holds none of a type known here.
+    """
+    stop = stop or threading.Event()
+    publishers = _publishers(node, bag, topics)
+    _wait_for_subscriber(publishers, wait, stop)
+    published = 0
+    while True:
+        begun, start = time.monotonic(), None
+        shift = 0
+        for topic, recorded, data in read_raw(bag, tuple(publishers)):
+            if start is None:
+                start = recorded
+                shift = time.time_ns() - recorded
+            due = begun + (recorded - start) / SECOND / rate
+            if stop.wait(max(0.0, due - time.monotonic())):
+                return published
+            publisher, kind = publishers[topic.name]
+            publisher.publish(_shifted(data, kind, shift) if now else data)
+            published += 1
+        if not loop or stop.is_set():
+            return published
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = _Parser(prog="graspd_play", description="Publish the topics of a rosbag2 recording.")
+    parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast as recorded (default 1)")
+    parser.add_argument("--loop", action="store_true", help="begin again at the end")
+    parser.add_argument("--topics", nargs="+", default=[], metavar="NAME", help="only these")
+    parser.add_argument("--now", action="store_true", help="shift stamps as if the recording happened now")
+    parser.add_argument("--wait", type=float, default=0.0, metavar="SEC", help="for a subscriber, before the start")
+    options = parser.parse_args(arguments)
+    if not options.rate > 0:
+        raise ConfigError(f"rate: {options.rate}; it must be positive")
+    return options
+
+
+def _publishers(node: Any, bag: Path, wanted: tuple[str, ...]) -> dict[str, tuple[Any, type]]:
+    """A publisher and the message type for each topic whose type is known here; warns of the others."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    recorded = bag_topics(bag)
+    for name in wanted:
+        if name not in {topic.name for topic in recorded}:
+            raise BagError(f"{bag}: no topic {name!r}; it has: {', '.join(t.name for t in recorded) or 'none'}")
+    publishers = {}
+    for topic in recorded:
+        if wanted and topic.name not in wanted:
+            continue
+        kind = _message_type(topic)
+        if kind is None:
+            node.get_logger().warning(f"{topic.name} is left out: no Python package for {topic.type} is installed")
+            continue
+        latched = topic.name.endswith("tf_static")
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=100 if latched else DEPTH, durability=durability)
+        publishers[topic.name] = node.create_publisher(kind, topic.name, qos), kind
+    if not publishers:
+        raise BagError(f"{bag}: no topic of a type that is installed here; it has: {_types(recorded)}")
+    return publishers
+
+
+def _message_type(topic: BagTopic) -> type | None:
+    package, _, name = topic.type.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name, None)
+    except ImportError:
+        return None
+
+
+def _types(topics: tuple[BagTopic, ...]) -> str:
+    return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
+
+
+def _wait_for_subscriber(publishers: dict[str, tuple[Any, type]], timeout: float, stop: threading.Event) -> None:
+    end = time.monotonic() + timeout
+    while time.monotonic() < end and not stop.is_set():
+        if any(publisher.get_subscription_count() for publisher, _ in publishers.values()):
+            stop.wait(SETTLE)
+            return
+        stop.wait(0.02)
+
+
+def _shifted(data: bytes, kind: type, shift: int) -> Any:
+    """The message with every header's stamp later by `shift` [ns]; messages without headers as they are."""
+    from rclpy.serialization import deserialize_message
+
+    message = deserialize_message(data, kind)
+    for stamped in (message, *getattr(message, "transforms", ())):
+        if hasattr(stamped, "header"):
+            stamp = stamped.header.stamp
+            moved = max(0, stamp.sec * SECOND + stamp.nanosec + shift)
+            stamp.sec, stamp.nanosec = moved // SECOND, moved % SECOND
+    return message
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,295 @@
+"""Recordings written and read back, both storages; and one line for whatever is wrong with one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspd_core.bags.messages import camera_from_message, points_from_message
+from graspd_core.bags.reader import bag_topics, is_bag, read_frames, read_raw, read_transforms
+from graspd_core.bags.writer import (
+    Record,
+    camera_info_message,
+    cloud_message,
+    depth_message,
+    transforms_message,
+    write_bag,
+)
+from graspd_core.errors import BagError, CloudError, TransformError
+from graspd_core.geometry.camera import PinholeCamera
+from graspd_core.geometry.raycast import look_at, render_depth
+from graspd_core.geometry.shapes import SPHERE_RADIUS, make_shape
+from graspd_core.transforms import SECOND
+
+CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5, (0.1, -0.2, 0.001, -0.001, 0.05))
+OPTICAL = "camera_optical_frame"
+START = 1_700_000_000 * SECOND
+STORAGES = ["sqlite3", "mcap"]
+
+
+def flown_records(eyes, *, encoding="16UC1") -> list[Record]:
+    """A camera that flies round the sphere, one second from eye to eye, with its pose half a second earlier and later.
+
+    The frames are world -> mount (moving) -> camera_optical_frame (fixed).
+    """
+    T_mount_camera = look_at((0.1, 0.0, 0.0), (0.0, 0.1, 0.0))
+    fixed = transforms_message([("mount", OPTICAL, T_mount_camera)], START)
+    records = [Record("/tf_static", START, fixed)]
+    for index, eye in enumerate(eyes):
+        stamp = START + (index + 1) * SECOND
+        T_world_camera = look_at(eye, (0, 0, 0))
+        depth = render_depth(make_shape("sphere"), CAMERA, T_world_camera)
+        T_world_mount = T_world_camera @ np.linalg.inv(T_mount_camera)
+        for side in (-1, 1):
+            moved = T_world_mount.copy()
+            moved[:3, 3] += (0, 0, side * 0.02)
+            near = stamp + side * SECOND // 4
+            records.append(Record("/tf", near, transforms_message([("world", "mount", moved)], near)))
+        records += [
+            Record("/depth/camera_info", stamp, camera_info_message(CAMERA, OPTICAL, stamp)),
+            Record("/depth/image_raw", stamp, depth_message(depth, OPTICAL, stamp, encoding=encoding)),
+        ]
+    return sorted(records, key=lambda record: record.stamp)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_a_rendered_scene_comes_back_through_depth_camera_and_transforms(tmp_path, storage, encoding):
+    eyes = [(0.4, 0.0, 0.2), (0.0, -0.4, 0.2), (-0.3, 0.3, 0.1)]
+    write_bag(tmp_path / "bag", flown_records(eyes, encoding=encoding), storage=storage)
+    transforms = read_transforms(tmp_path / "bag")
+    frames = list(read_frames(tmp_path / "bag"))
+    assert [frame.stamp for frame in frames] == [START + (i + 1) * SECOND for i in range(3)]
+    for frame, eye in zip(frames, eyes, strict=True):
+        cloud = frame.view(transforms, "world")
+        # Half a millimetre of rounding in 16UC1, and a tenth of the mesh's facets.
+        bound = 7e-4 if encoding == "16UC1" else 2e-4
+        assert np.linalg.norm(cloud.points, axis=1) == pytest.approx(
+            np.full(len(cloud.points), SPHERE_RADIUS), abs=bound
+        )
+        assert len(cloud.points) > 300
+        assert cloud.viewpoint == pytest.approx(eye, abs=1e-6)
+        assert cloud.forward == pytest.approx(-np.array(eye) / np.linalg.norm(eye), abs=1e-6)
+        assert frame.view().viewpoint.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_clouds_come_back_in_order_some_or_all(tmp_path, storage):
+    points = np.random.default_rng(0).normal(size=(7, 30, 3)).astype("f4").astype(float)
+    points[:, 3] = np.nan
+    records = [Record("/points", START + i, cloud_message(cloud, "lidar", START + i)) for i, cloud in enumerate(points)]
+    write_bag(tmp_path / "bag", records, storage=storage)
+    (topic,) = bag_topics(tmp_path / "bag")
+    assert (topic.name, topic.type, topic.count) == ("/points", "sensor_msgs/msg/PointCloud2", 7)
+    for options, expected in [
+        ({}, range(7)),
+        ({"every": 3}, (0, 3, 6)),
+        ({"limit": 2}, (0, 1)),
+        ({"every": 2, "limit": 3}, (0, 2, 4)),
+    ]:
+        frames = list(read_frames(tmp_path / "bag", **options))
+        assert [frame.index for frame in frames] == list(expected)
+        for frame in frames:
+            assert frame.frame == "lidar"
+            np.testing.assert_array_equal(frame.view().points, np.delete(points[frame.index], 3, axis=0))
+            assert frame.view().forward is None
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_storage_file_alone_is_a_bag(tmp_path, storage):
+    write_bag(tmp_path / "bag", flown_records([(0.4, 0, 0.2)]), storage=storage)
+    file = next(path for path in (tmp_path / "bag").iterdir() if path.suffix != ".yaml")
+    assert is_bag(file)
+    (tmp_path / "bag" / "metadata.yaml").unlink()  # as a recorder leaves it that was killed
+    assert is_bag(tmp_path / "bag")
+    for path in (file, tmp_path / "bag"):
+        (frame,) = read_frames(path)
+        assert len(frame.view(read_transforms(path), "world").points) > 300
+
+
+def test_a_rectified_image_is_not_undistorted_again(tmp_path):
+    info = camera_info_message(CAMERA, OPTICAL, START)
+    image = depth_message(np.full((120, 160), 0.5), OPTICAL, START)
+    seen = {}
+    for name in ("image_raw", "image_rect", "image_rect_raw"):
+        records = [Record("/d/camera_info", START, info), Record(f"/d/{name}", START, image)]
+        write_bag(tmp_path / name, records)
+        (frame,) = read_frames(tmp_path / name)
+        seen[name] = frame.view().points
+    ideal = np.array([-79.5, -59.5]) / 150 * 0.5
+    assert seen["image_rect"][0, :2] == pytest.approx(ideal)
+    assert seen["image_rect_raw"][0, :2] == pytest.approx(ideal)
+    assert np.abs(seen["image_raw"][0, :2] - ideal).max() > 1e-3
+
+
+def test_binned_and_cropped_images_have_their_own_camera():
+    info = camera_info_message(CAMERA, OPTICAL, START)
+    info.binning_x = info.binning_y = 2
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 40, 20, 80, 60
+    camera = camera_from_message(info)
+    assert (camera.width, camera.height) == (40, 30)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (75, 75, 39.5 / 2, 39.5 / 2)
+    assert camera.distortion == CAMERA.distortion
+    assert camera_from_message(info, rectified=True).distortion == ()
+
+
+def test_raw_messages_come_back_in_order_of_recording(tmp_path):
+    write_bag(tmp_path / "bag", flown_records([(0.4, 0, 0.2), (0, 0.4, 0.2)]), storage="mcap")
+    times = [time for _, time, _ in read_raw(tmp_path / "bag")]
+    assert len(times) == 9
+    assert times == sorted(times)
+    assert {topic.name for topic, _, _ in read_raw(tmp_path / "bag", ("/tf",))} == {"/tf"}
+    with pytest.raises(BagError, match="no topic '/gone'; it has: /depth/camera_info, /depth/image_raw, /tf"):
+        list(read_raw(tmp_path / "bag", ("/gone",)))
+
+
+def test_one_broken_cloud_does_not_end_the_others(tmp_path):
+    good = np.ones((60, 3))
+    records = [
+        Record("/points", START + i, cloud_message(cloud, "lidar", START))
+        for i, cloud in enumerate([good, np.full((60, 3), np.nan), good])
+    ]
+    write_bag(tmp_path / "bag", records)
+    frames = list(read_frames(tmp_path / "bag"))
+    assert len(frames[0].view().points) == len(frames[2].view().points) == 60
+    with pytest.raises(CloudError, match="no finite point"):
+        frames[1].view()
+
+
+def test_times_and_frames_that_the_bag_does_not_know_are_named(tmp_path):
+    records = flown_records([(0.4, 0, 0.2)])
+    late = START + 60 * SECOND
+    write_bag(tmp_path / "bag", [*records, Record("/late", late, cloud_message(np.ones((60, 3)), OPTICAL, late))])
+    transforms = read_transforms(tmp_path / "bag")
+    (frame,) = read_frames(tmp_path / "bag", topic="/late")
+    with pytest.raises(TransformError, match=r"mount in world is known from 1700000000\.75"):
+        frame.view(transforms, "world")
+    with pytest.raises(TransformError, match="unknown frame 'wolrd'; known: camera_optical_frame, mount, world"):
+        frame.view(transforms, "wolrd")
+    # Of its own frame it needs to know nothing.
+    assert len(frame.view(transforms, "/" + OPTICAL).points) == 60
+
+
+def bag_of(path: Path, *topics: str) -> Path:
+    """Clouds on topics called points*, images on others, camera info where the name says so."""
+    records = []
+    for topic in topics:
+        if "camera_info" in topic:
+            message = camera_info_message(CAMERA, OPTICAL, START)
+        elif "points" in topic:
+            message = cloud_message(np.ones((60, 3)), OPTICAL, START)
+        else:
+            message = depth_message(np.full((120, 160), 0.5), OPTICAL, START)
+            if "color" in topic:
+                message.encoding = "rgb8"
+        records.append(Record(topic, START, message))
+    write_bag(path, records)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("topics", "options", "chosen"),
+    [
+        (("/points",), {}, "/points"),
+        (("/points", "/a/depth", "/a/camera_info"), {}, "/points"),
+        (("/points", "/a/depth", "/a/camera_info"), {"topic": "/a/depth"}, "/a/depth"),
+        (("/color/image", "/a/depth", "/b/camera_info"), {}, "/a/depth"),
+        (("/a/depth", "/b/camera_info", "/c/camera_info"), {"info_topic": "/c/camera_info"}, "/a/depth"),
+        (("/points_1", "/points_2"), {"topic": "/points_2"}, "/points_2"),
+    ],
+)
+def test_the_topic_is_the_one_that_is_meant(tmp_path, topics, options, chosen):
+    (frame,) = read_frames(bag_of(tmp_path / "bag", *topics), **options)
+    assert frame.topic == chosen
+    assert len(frame.view().points) >= 60
+
+
+@pytest.mark.parametrize(
+    ("topics", "options", "culprit"),
+    [
+        (("/points_1", "/points_2"), {}, "several topics could be meant, name one: /points_1, /points_2"),
+        (("/a/depth", "/b/depth", "/a/camera_info"), {}, "several topics could be meant, name one: /a/depth, /b/depth"),
+        (("/points",), {"topic": "/cloud"}, "no clouds or depth images on '/cloud'; topics with some: /points"),
+        (("/color/image",), {}, "no topic with clouds or depth images; it has: /color/image (Image)"),
+        (("/a/depth",), {}, "no camera info on '/a/camera_info' for /a/depth; topics with some: none"),
+        (
+            ("/a/depth", "/b/camera_info", "/c/camera_info"),
+            {},
+            "no camera info on '/a/camera_info' for /a/depth; topics with some: /b/camera_info, /c/camera_info",
+        ),
+    ],
+)
+def test_a_topic_that_is_missing_or_ambiguous_is_named(tmp_path, topics, options, culprit):
+    path = bag_of(tmp_path / "bag", *topics)
+    with pytest.raises(BagError) as refused:
+        list(read_frames(path, **options))
+    assert culprit in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_bag_without_transforms_says_so(tmp_path):
+    with pytest.raises(BagError, match="holds no transforms"):
+        read_transforms(bag_of(tmp_path / "bag", "/points"))
+
+
+def cut(path: Path, share: float) -> None:
+    """Lose the end of a storage file, as a full disk or a pulled plug does."""
+    file = next(p for p in path.iterdir() if p.suffix != ".yaml")
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9])
+def test_a_bag_that_was_cut_short_is_named(tmp_path, storage, share):
+    write_bag(tmp_path / "bag", flown_records([(0.4, 0, 0.2), (0, 0.4, 0.2)]), storage=storage)
+    cut(tmp_path / "bag", share)
+    with pytest.raises(BagError) as refused:
+        list(read_frames(tmp_path / "bag"))
+    assert str(tmp_path / "bag") in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "culprit"),
+    [
+        (lambda path: None, "no such bag"),
+        (lambda path: path.mkdir(), "not a bag; a bag is a directory of rosbag2, or a file ending in .mcap or .db3"),
+        (lambda path: path.write_text("hello"), "not a bag"),
+        (lambda path: (path.mkdir(), (path / "metadata.yaml").write_text("a: [1\n")), "not a readable bag"),
+        (lambda path: (path.mkdir(), (path / "metadata.yaml").write_text("")), "not a readable bag"),
+        (lambda path: (path.mkdir(), (path / "a.mcap").touch(), (path / "b.mcap").touch()), "2 storage files"),
+        (lambda path: (path.mkdir(), (path / "a.db3").write_text("not sqlite")), "not a readable bag"),
+    ],
+)
+def test_what_is_no_bag_is_named(tmp_path, make, culprit):
+    make(tmp_path / "bag")
+    with pytest.raises(BagError) as refused:
+        bag_topics(tmp_path / "bag")
+    assert culprit in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_writing_refuses_what_would_be_lost(tmp_path):
+    cloud = Record("/x", START, cloud_message(np.ones((3, 3)), "lidar", START))
+    write_bag(tmp_path / "bag", [cloud])
+    with pytest.raises(BagError, match="exists already"):
+        write_bag(tmp_path / "bag", [cloud])
+    with pytest.raises(BagError, match="/x has sensor_msgs/msg/PointCloud2 and tf2_msgs/msg/TFMessage"):
+        write_bag(tmp_path / "two", [cloud, Record("/x", START, transforms_message([], START))])
+    with pytest.raises(BagError, match="storage: 'zip'; valid: sqlite3, mcap"):
+        write_bag(tmp_path / "three", [cloud], storage="zip")
+
+
+def test_an_encoding_that_is_no_depth_is_not_written():
+    with pytest.raises(BagError, match="encoding: 'rgb8'; valid: 16UC1, mono16, 32FC1"):
+        depth_message(np.ones((2, 2)), OPTICAL, START, encoding="rgb8")
+
+
+def test_nan_in_a_cloud_is_written_and_dropped_when_read():
+    points = np.ones((4, 3))
+    points[2, 1] = np.nan
+    message = cloud_message(points, "lidar", START)
+    assert not message.is_dense
+    assert len(points_from_message(message)) == 3

@@ -1,0 +1,29 @@
+"""A node like any other, but for its planner: it raises what the seed says. Started by test_faults.py."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from graspd_ros import planning
+from graspd_ros.node import main
+
+ERRORS: dict[int, BaseException] = {
+    1: MemoryError(),
+    2: RuntimeError("[enforce fail at alloc_cpu.cpp:1] DefaultCPUAllocator: can't allocate memory: you tried 8 GB"),
+    3: RuntimeError("shapes differ"),
+    4: SystemExit(3),
+    5: BaseException("no reason at all"),
+}
+honest = planning.plan_grasps
+
+
+def rigged(*args: Any, seed: int, **kwargs: Any):
+    if seed in ERRORS:
+        raise ERRORS[seed]
+    return honest(*args, seed=seed, **kwargs)
+
+
+if __name__ == "__main__":
+    planning.plan_grasps = rigged
+    sys.exit(main())

@@ -1,0 +1,234 @@
+"""Requests over DDS: the action-like topics, the camera sources and the services of a running node."""
+
+from __future__ import annotations
+
+import array
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Point, Pose, Quaternion
+from graspd_msgs.msg import Grasp, GraspArray, GraspRequest
+from graspd_msgs.srv import ListHands
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+RESULT_TIMEOUT = 60.0
+FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 40.0}
+LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 60.0}
+SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
+BALL, RADIUS = np.array([0.0, 0.0, 0.5]), 0.035  # metres, camera frame
+HAND_LENGTH = 0.25
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def place(pose: Pose) -> np.ndarray:
+    return np.array([pose.position.x, pose.position.y, pose.position.z])
+
+
+def seen_ball(count: int = 4000) -> np.ndarray:
+    """The half of the ball that a camera at the origin sees [m]."""
+    directions = np.random.default_rng(0).normal(size=(2 * count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return BALL + RADIUS * directions[directions[:, 2] < 0]
+
+
+def stamp_now(client):
+    return client.node.get_clock().now().to_msg()
+
+
+def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, node):
+    markers: list[MarkerArray] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    client.node.create_subscription(MarkerArray, "/graspd/markers", markers.append, latched)
+    turned = Quaternion(z=np.sqrt(0.5), w=np.sqrt(0.5))
+    header = Header(frame_id="table", stamp=stamp_now(client))
+    begun = time.monotonic()
+    client.send_request(
+        id="mine-1", header=header, object_pose=Pose(position=Point(x=1.0), orientation=turned), **SPHERE, **FEW
+    )
+    client.spin_until(lambda: client.progress, 10.0, "progress")
+    print(f"first progress after {(time.monotonic() - begun) * 1e3:.0f} ms")
+    answer = client.answer("mine-1", RESULT_TIMEOUT)
+    assert (answer.status, answer.error_code, answer.outcome) == (GraspArray.SUCCEEDED, "", "succeeded")
+    assert answer.header == header
+    assert 0 < answer.elapsed < RESULT_TIMEOUT
+    verified = [grasp for grasp in answer.grasps if grasp.verdict == Grasp.VERIFIED]
+    assert len(verified) == 2
+    best = answer.grasps[0]
+    assert (best.id, best.rank, best.hand, best.base_link) == ("mine-1/0", 0, "allegro_right", "base_link")
+    assert np.linalg.norm(place(best.grasp_pose) - [1.0, 0.0, 0.0]) < HAND_LENGTH
+    assert np.linalg.norm([best.contacts[0].position.x - 1.0, best.contacts[0].position.y]) < RADIUS + 0.01
+    for joints in (best.pregrasp_joints, best.grasp_joints, best.squeeze_joints):
+        assert len(joints.name) == len(joints.position) == 16
+    assert list(best.trajectory.joint_names) == list(best.grasp_joints.name)
+    assert len(best.trajectory.points) == len(best.trajectory_base_poses) == 3
+    assert best.epsilon > 0
+    assert 0 <= best.hold_displacement < 0.02
+    assert {p.request_id for p in client.progress} == {"mine-1"}
+    assert {p.stage for p in client.progress} >= {"load", "optimise", "verify"}
+    assert all(0 <= p.fraction <= 1 and p.message for p in client.progress)
+    elapsed = [p.elapsed for p in client.progress]
+    assert np.diff(elapsed).min() > 0.09, "more than 10 progress reports a second"
+    client.spin_until(lambda: markers, 5.0, "markers")
+    assert {marker.header.frame_id for marker in markers[-1].markers} == {"table"}
+    client.spin_for(0.3)
+    assert len(client.answers) == 1
+
+
+def test_whatever_cannot_be_served_is_refused_by_name(client, node):
+    cases = [
+        ({"source": 9}, "BAD_REQUEST", "source: 9"),
+        ({**SPHERE, "hand": "no_such_hand"}, "WRONG_HAND", "'no_such_hand' is not loaded"),
+        ({**SPHERE, "preset": "no_such_preset"}, "BAD_REQUEST", "valid: accurate, balanced, fast"),
+        ({**SPHERE, "time_budget": float("nan")}, "BAD_REQUEST", "time_budget: nan"),
+        ({**SPHERE, "num_grasps": 100_000}, "BAD_REQUEST", "num_grasps: 100000"),
+        ({**SPHERE, "object_pose": Pose(position=Point(x=float("nan")))}, "BAD_REQUEST", "object_pose"),
+        ({**SPHERE, "object_pose": Pose(orientation=Quaternion(w=3.0))}, "BAD_REQUEST", "length 3"),
+        ({"source": GraspRequest.MESH, "mesh_uri": "/etc/passwd"}, "BAD_MESH", "outside the allowed mesh_roots"),
+        ({"source": GraspRequest.MESH, "mesh_uri": "m" * 10**6}, "BAD_MESH", "1000000 characters long"),
+        ({"source": GraspRequest.LATEST_CLOUD}, "NO_CLOUD", "no cloud or depth image"),
+        ({"source": GraspRequest.VIEWS}, "NO_CLOUD", "~/add_view"),
+    ]
+    for number, (fields, _, _) in enumerate(cases):
+        client.send_request(id=f"bad-{number}", **fields)
+    client.send_request(id="../escape", **SPHERE)
+    for number, (_, code, culprit) in enumerate(cases):
+        answer = client.answer(f"bad-{number}", 10.0)
+        assert (answer.status, answer.error_code) == (GraspArray.REFUSED, code)
+        assert culprit in answer.message
+        assert "\n" not in answer.message
+    assert client.answer("../escape", 10.0).error_code == "BAD_REQUEST"
+    assert len(client.answers) == len(cases) + 1
+    client.send_request(id="empty-cloud")
+    answer = client.answer("empty-cloud", 10.0)
+    assert (answer.status, answer.error_code) == (GraspArray.FAILED, "BAD_CLOUD")
+    assert node.alive()
+
+
+def test_a_live_id_is_not_taken_twice_and_a_queued_request_can_be_cancelled(client, node):
+    client.send_request(id="a", **SPHERE, **LONG)
+    client.event(10.0, event="progress", request="a")
+    client.send_request(id="a", **SPHERE, **LONG)
+    again = client.answer("a", 10.0)
+    assert (again.status, again.error_code) == (GraspArray.REFUSED, "DUPLICATE_ID")
+    client.forget()
+    client.send_request(id="b", **SPHERE, **LONG)
+    queued = client.spin_until(lambda: [p for p in client.progress if p.request_id == "b"], 5.0, "queued")
+    assert (queued[0].stage, queued[0].message) == ("queued", "queued: 1 ahead")
+    begun = time.monotonic()
+    client.send_cancel("b")
+    assert client.answer("b", 10.0).status == GraspArray.CANCELLED
+    print(f"queued request cancelled in {(time.monotonic() - begun) * 1e3:.0f} ms")
+    client.send_cancel("a")
+    assert client.answer("a", 10.0).status == GraspArray.CANCELLED
+
+
+def test_a_deadline_that_passes_in_the_queue_is_answered_then(client, node):
+    client.send_request(id="long", **SPHERE, **LONG)
+    client.event(10.0, event="progress", request="long")
+    client.send_request(id="brief", **SPHERE, time_budget=0.5)
+    answer = client.answer("brief", 5.0)
+    assert (answer.status, answer.error_code) == (GraspArray.FAILED, "DEADLINE")
+    assert 0.5 <= answer.elapsed < 1.5
+    client.send_cancel("long")
+
+
+def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud):
+    client.set_parameters(cloud_policy="off")
+    cloud = make_cloud(seen_ball())
+    cloud.header.stamp = stamp_now(client)
+    cloud.header.stamp.sec -= 60
+    client.send_cloud(cloud)
+    client.spin_for(0.5)
+    client.send_request(id="old", source=GraspRequest.LATEST_CLOUD, **FEW)
+    old = client.answer("old", 10.0)
+    assert (old.status, old.error_code) == (GraspArray.REFUSED, "STALE_CLOUD")
+    assert "cloud_max_age" in old.message
+    cloud.header.stamp = stamp_now(client)
+    client.send_cloud(cloud)
+    client.spin_for(0.5)
+    client.send_request(id="new", source=GraspRequest.LATEST_CLOUD, **FEW)
+    answer = client.answer("new", RESULT_TIMEOUT)
+    assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL)
+    assert answer.header == cloud.header
+    assert np.linalg.norm(place(answer.grasps[0].grasp_pose) - BALL) < HAND_LENGTH
+
+
+def depth_of_ball(client) -> tuple[Image, CameraInfo]:
+    """The ball and nothing else, in millimetres, seen by a camera of 200 x 150 pixels."""
+    width, height, f = 200, 150, 400.0
+    u, v = np.meshgrid(np.arange(width) - 99.5, np.arange(height) - 74.5)
+    rays = np.stack([u / f, v / f, np.ones_like(u)], -1)
+    a, b, c = (rays**2).sum(-1), rays @ BALL, BALL @ BALL - RADIUS**2
+    hit = b**2 - a * c > 0
+    depth = np.where(hit, (b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a, 0)
+    header = Header(frame_id="optical", stamp=stamp_now(client))
+    image = Image(header=header, width=width, height=height, encoding="16UC1", step=2 * width)
+    image.data = array.array("B", (depth * 1000).round().astype("<u2").tobytes())
+    k = [f, 0.0, 99.5, 0.0, f, 74.5, 0.0, 0.0, 1.0]
+    return image, CameraInfo(header=header, width=width, height=height, k=k, distortion_model="plumb_bob")
+
+
+def test_depth_images_become_views_and_views_a_grasp(client, node):
+    client.set_parameters(cloud_policy="off")
+    images = client.node.create_publisher(Image, "/depth/image_rect", qos_profile_sensor_data)
+    infos = client.node.create_publisher(CameraInfo, "/depth/camera_info", qos_profile_sensor_data)
+    client.spin_until(lambda: images.get_subscription_count() and infos.get_subscription_count(), 10.0, "match")
+    refused = client.call(Trigger, "add_view")
+    assert not refused.success
+    assert "no cloud or depth image" in refused.message
+    for views in (1, 2):
+        image, info = depth_of_ball(client)
+        images.publish(image)
+        infos.publish(info)
+        client.spin_for(0.4)
+        added = client.call(Trigger, "add_view")
+        assert (added.success, added.message) == (True, f"{views} views in 'optical'")
+    client.send_request(id="views", source=GraspRequest.VIEWS, **FEW)
+    answer = client.answer("views", RESULT_TIMEOUT)
+    assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL), answer.message
+    assert answer.header == image.header
+    assert np.linalg.norm(place(answer.grasps[0].grasp_pose) - BALL) < HAND_LENGTH
+    assert client.call(Trigger, "reset_views").message == "dropped 2 views"
+    client.send_request(id="none", source=GraspRequest.VIEWS)
+    assert client.answer("none", 10.0).error_code == "NO_CLOUD"
+
+
+def test_hands_are_listed_and_a_reset_leaves_nothing_to_late_joiners(client, node):
+    hands = client.call(ListHands, "list_hands")
+    assert hands.current in hands.names
+    assert (hands.current, len(hands.joint_names), hands.base_link) == ("allegro_right", 16, "base_link")
+
+    def joiner() -> list[GraspArray]:
+        got: list[GraspArray] = []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        client.node.create_subscription(GraspArray, "/graspd/grasps", got.append, latched)
+        return got
+
+    client.send_request(id="refused", source=9)
+    client.answer("refused", 10.0)
+    late = joiner()
+    client.spin_until(lambda: late, 5.0, "the last answer for a late joiner")
+    assert late[0].request_id == "refused"
+    client.forget()
+    client.send_request(id="running", **SPHERE, **LONG)
+    client.event(10.0, event="progress", request="running")
+    assert client.call(Trigger, "reset").message == "cancelled 1 requests, dropped 0 views"
+    assert client.answer("running", 10.0).status == GraspArray.CANCELLED
+    client.call(Trigger, "reset")
+    later = joiner()
+    client.spin_for(1.0)
+    assert later == []
+
+
+def test_an_output_frame_that_nothing_connects_is_named_before_any_work(client, node):
+    client.set_parameters(output_frame="base")
+    client.send_request(id="nowhere", header=Header(frame_id="table"), **SPHERE, **FEW)
+    answer = client.answer("nowhere", 10.0)
+    assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_TRANSFORM")
+    assert answer.elapsed < 3.0

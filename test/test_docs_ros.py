@@ -1,0 +1,349 @@
+"""docs/ros.md against a live node: every name, type, QoS and parameter, every command line, and the client runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import inspect
+import os
+import re
+import shlex
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import rclpy
+import yaml
+from builtin_interfaces.msg import Time
+from graspd_msgs.msg import Grasp, GraspArray, GraspRequest
+from rclpy.action.graph import get_action_server_names_and_types_by_node
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+
+from graspd_core.cli import build_parser
+from graspd_ros import player
+from graspd_ros.codes import ErrorCode
+from graspd_ros.diagnostics import Health, health_message
+from graspd_ros.moveit import moveit_grasp
+from graspd_ros.parameters import Settings, check_parameters
+from graspd_ros.requests import check_request
+from graspd_ros.service import GraspNode
+from graspd_ros.worker import Ending
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "ros.md").read_text()
+DOMAIN = 1 + os.getpid() % 100
+LINES = [line.strip() for line in PAGE.splitlines() if line.startswith("    ")]
+PYTHON = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+TF = {"/tf", "/tf_static"}
+
+
+def section(title: str) -> str:
+    return re.split(r"^## ", PAGE.split(f"\n## {title}\n")[1], flags=re.MULTILINE)[0]
+
+
+def tables(title: str) -> list[list[list[str]]]:
+    """The tables of a section, as rows of cells; headers left out."""
+    found: list[list[list[str]]] = []
+    for block in re.findall(r"(?:^\|.*\|\n)+", section(title), re.MULTILINE):
+        rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in block.splitlines()]
+        found.append(rows[2:])
+    return found
+
+
+def commands(*words: str) -> list[list[str]]:
+    found = [shlex.split(line, comments=True) for line in LINES]
+    return [parts for parts in found if parts[: len(words)] == list(words)]
+
+
+def quoted(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def full(name: str) -> str:
+    return name.replace("~", "/graspd") if name.startswith("~") else f"/{name.lstrip('/')}"
+
+
+def type_of(name: str) -> Any:
+    module, _, name = name.rpartition("/")
+    return getattr(importlib.import_module(module.replace("/", ".")), name)
+
+
+def fill(message: Any, values: dict[str, Any]) -> None:
+    """Set fields as `ros2 topic pub` does, without its leniency: unknown fields and other types are errors."""
+    for name, value in values.items():
+        assert name in message.get_fields_and_field_types(), f"{type(message).__name__} has no field {name}"
+        present = getattr(message, name)
+        if isinstance(value, dict):
+            fill(present, value)
+        else:
+            value = float(value) if isinstance(present, float) and isinstance(value, int) else value
+            assert type(value) is type(present), f"{name}: {value!r}"
+            setattr(message, name, value)
+
+
+def descend(kind: Any, path: str) -> None:
+    """Follow a `--field` path through message types."""
+    for part in path.split("."):
+        name, indexed = re.fullmatch(r"(\w+)(\[\d+\])?", part).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        field = kind.get_fields_and_field_types()[name]
+        sequence = re.fullmatch(r"sequence<(.+)>", field)
+        assert bool(indexed) <= bool(sequence)
+        inner = sequence[1] if sequence else field
+        if "/" in inner and (indexed or not sequence):
+            kind = type_of(inner.replace("/", "/msg/"))
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("docs")
+
+
+@pytest.fixture(scope="module")
+def node(directory: Path) -> Iterator[GraspNode]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        arguments = ["--ros-args", "-p", f"mesh_roots:=['{directory}']"]
+        rclpy.init(args=arguments, domain_id=DOMAIN)
+        node = GraspNode(on_failure=lambda: None)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        spinner = threading.Thread(target=executor.spin)
+        spinner.start()
+        yield node
+        node.close(10.0)
+        executor.shutdown()
+        spinner.join()
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def endpoints(node: GraspNode) -> dict[str, tuple[str, str, QoSProfile]]:
+    """Type, direction and QoS of every topic of the node's own."""
+    found = {}
+    sides: tuple[tuple[str, Any], ...] = (("in", node.subscriptions), ("out", node.publishers))
+    for direction, ends in sides:
+        for end in ends:
+            kind: Any = end.msg_type
+            package = kind.__module__.split(".")[0]
+            if package not in ("rcl_interfaces", "rosgraph_msgs"):
+                found[end.topic_name] = f"{package}/{kind.__name__}", direction, end.qos_profile
+    return found
+
+
+def qos_words(qos: QoSProfile) -> str:
+    words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
+    words += ["transient local"] if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL else []
+    return ", ".join([*words, str(qos.depth)])
+
+
+def test_topics_are_those_of_the_node_in_type_direction_and_qos(node: GraspNode):
+    documented = {full(quoted(row[0])[0]): row[1:] for row in tables("Names")[0]}
+    live = endpoints(node)
+    assert set(documented) - TF == set(live) - TF
+    assert (set(live) >= TF) == bool(importlib.util.find_spec("tf2_msgs"))
+    for topic, (kind, direction, qos) in live.items():
+        cells = documented[topic]
+        assert re.match(re.escape(kind) + r"\b", cells[0]), f"{topic}: {kind}"
+        assert cells[1:] == [direction, qos_words(qos)], topic
+
+
+def test_services_and_actions_are_those_of_the_node(node: GraspNode):
+    documented = {full(quoted(row[0])[0]): row[1] for row in tables("Names")[1]}
+    services: Any = node.services
+    types = {node.resolve_service_name(service.srv_name): service.srv_type for service in services}
+    live = {name: f"{kind.__module__.split('.')[0]}/{kind.__name__}" for name, kind in types.items()}
+    of_rcl = ("rcl_interfaces/", "type_description_interfaces/")
+    live = {name: kind for name, kind in live.items() if not kind.startswith(of_rcl)}
+    for name, (kind,) in get_action_server_names_and_types_by_node(node, "graspd", "/"):
+        live[name] = kind.replace("/action/", "/")
+    assert live == documented
+    calls = commands("ros2", "service", "call")
+    assert calls
+    assert all(types[name] is type_of(kind) for name, kind in (parts[3:] for parts in calls))
+
+
+def test_documented_messages_fit_their_types_and_topics(node: GraspNode):
+    live = endpoints(node)
+    published = commands("ros2", "topic", "pub")
+    assert len(published) >= 6
+    for parts in published:
+        options, (topic, kind, text) = parts[3:-3], parts[-3:]
+        assert options == ["--once"]
+        assert live[topic][:2] == (kind.replace("/msg/", "/"), "in")
+        message = type_of(kind)()
+        fill(message, yaml.safe_load(text))
+        if isinstance(message, GraspRequest):
+            check_request(message, "allegro_right")
+
+
+def test_documented_goals_fit_the_action():
+    goals = commands("ros2", "action", "send_goal")
+    assert goals
+    for parts in goals:
+        name, kind, text = parts[-3:]
+        assert name == "/graspd/synthesize"
+        goal = type_of(kind).Goal()
+        fill(goal, yaml.safe_load(text))
+        check_request(goal.request, "allegro_right")
+
+
+def test_documented_echoes_name_topics_and_fields(node: GraspNode):
+    live = endpoints(node)
+    echoed = commands("ros2", "topic", "echo")
+    assert len(echoed) >= 5
+    for parts in echoed:
+        topic = next(part for part in parts[3:] if part.startswith("/"))
+        assert live[topic][1] == "out"
+        if "--field" in parts:
+            kind = type_of(live[topic][0].replace("/", "/msg/"))
+            descend(kind, parts[parts.index("--field") + 1])
+
+
+def check_type(node: GraspNode, parameter: Parameter) -> None:
+    declared = node.get_parameter(parameter.name).type_
+    assert parameter.type_ == declared or node.describe_parameter(parameter.name).dynamic_typing, parameter.name
+
+
+def test_documented_parameters_can_be_set(node: GraspNode):
+    settings = commands("ros2", "param", "set")
+    assert settings
+    for name, text in (parts[4:] for parts in settings):
+        parameter = Parameter(name, value=yaml.safe_load(text))  # as the command reads it
+        check_type(node, parameter)
+        assert not node.describe_parameter(name).read_only
+        assert check_parameters([parameter]).successful
+
+
+def test_documented_starts_of_the_node_name_parameters_and_topics(node: GraspNode):
+    """A node of no topics reads the arguments, as ROS does, and tells what it read."""
+    starts = commands("graspd_node")
+    assert starts
+    names = set(endpoints(node))
+    for parts in starts:
+        probe = rclpy.create_node(
+            "probe",
+            cli_args=parts[1:],
+            use_global_arguments=False,
+            automatically_declare_parameters_from_overrides=True,
+        )
+        given = {part.split(":=")[0] for flag, part in zip(parts[2::2], parts[3::2], strict=True) if flag == "-p"}
+        for name in given:
+            assert node.has_parameter(name), name
+            check_type(node, probe.get_parameter(name))
+        assert check_parameters([probe.get_parameter(name) for name in given]).successful
+        probe.destroy_node()
+        renamed = {part.split(":=")[0] for flag, part in zip(parts[2::2], parts[3::2], strict=True) if flag == "-r"}
+        assert {full(name) for name in renamed} <= names
+
+
+def test_documented_commands_parse():
+    plays = commands("graspd_play")
+    assert plays
+    for parts in plays:
+        player._parse(remove_ros_args(parts)[1:])
+    replays = [shlex.split(text) for text in re.findall(r"`graspd (replay [^`]+)`", PAGE)]
+    assert replays
+    for parts in replays:
+        build_parser().parse_args(parts)
+
+
+def parameter_rows() -> list[str]:
+    """The table of parameters as it has to be."""
+    rows = ["| parameter | default | valid | |", "|---|---|---|---|"]
+    for field in dataclasses.fields(Settings):
+        default = field.default if field.default is not dataclasses.MISSING else field.default_factory()  # pyright: ignore
+        limits, choices = field.metadata["range"], field.metadata["choices"]
+        valid = ", ".join(choices) if choices else "" if limits is None else f"{limits[0]:g} to {limits[1]:g}"
+        shown = str(default).lower() if isinstance(default, bool) else default if default != "" else '""'
+        text = field.metadata["description"] + (" *(at the start)*" if field.metadata["read_only"] else "")
+        rows.append(f"| `{field.name}` | {shown} | {valid} | {text} |")
+    return rows
+
+
+def test_the_table_of_parameters_is_that_of_the_code():
+    """Where it is not, what has to stand there is what this prints."""
+    found = re.search(r"<!-- parameters:begin -->\n(.*?)<!-- parameters:end -->", PAGE, re.DOTALL)
+    assert found is not None
+    assert found[1].strip() == "\n".join(parameter_rows()), "\n".join(["", *parameter_rows()])
+
+
+def test_constants_are_those_of_the_messages():
+    sources, statuses, codes, _ = tables("Requests and answers")
+    for rows, kind, text in (
+        (sources, GraspRequest, "GraspRequest.msg"),
+        (statuses, GraspArray, "GraspArray.msg"),
+    ):
+        defined = dict(re.findall(r"^uint8 ([A-Z_]+)=(\d+)", (ROOT / "msg_defs/msg" / text).read_text(), re.MULTILINE))
+        documented = dict(quoted(row[0])[0].split("=") for row in rows)
+        assert documented == defined
+        assert all(getattr(kind, name) == int(value) for name, value in defined.items())  # and as built
+    assert [quoted(row[0])[0] for row in codes] == [code.value for code in ErrorCode if code]
+    for name, value in re.findall(r"`([A-Z]+)=(\d)` \(", section("Requests and answers")):
+        assert getattr(Grasp, name) == int(value)
+
+
+def test_events_are_those_that_the_node_tells():
+    told = set()
+    for path in (ROOT / "graspd_ros").glob("*.py"):
+        told |= set(re.findall(r"\.tell\(\s*\"(\w+)\"", path.read_text()))
+    told |= {Ending.CANCELLED.value, Ending.SUPERSEDED.value}
+    assert {quoted(row[0])[0] for row in tables("Requests and answers")[3]} == told
+
+
+def test_keys_of_the_diagnostics_are_those_that_are_sent():
+    health = Health(name="/graspd", hand="", ready=True, worker_alive=True)
+    (status,) = health_message(health, Time(), 1).status
+    documented = [key for row in tables("RViz and diagnostics")[0] for key in quoted(row[0])]
+    assert sorted(documented) == sorted(pair.key for pair in status.values)
+    assert f"`{status.name}`" in section("RViz and diagnostics")
+
+
+def test_every_fault_names_a_test_that_exists():
+    tests = "".join(path.read_text() for path in (ROOT / "test" / "ros").glob("test_*.py"))
+    named = [quoted(row[2])[0] for row in tables("Faults")[0]]
+    assert named
+    assert not [name for name in named if f"def {name}(" not in tests]
+
+
+def test_launch_arguments_are_those_of_the_launch_file():
+    launch = (ROOT / "graspd_ros" / "launch" / "graspd.launch.py").read_text()
+    declared = re.findall(r"DeclareLaunchArgument\(\s*\"(\w+)\"", launch)
+    documented = re.search(r"Launch arguments: (.*?)\.\n", PAGE, re.DOTALL)
+    assert documented is not None
+    assert quoted(documented[1]) == declared
+
+
+def test_the_figure_is_a_picture_of_the_frames():
+    picture = ElementTree.parse(ROOT / "docs" / "figures" / "frames.svg").getroot()
+    assert picture.tag.endswith("svg")
+    words = " ".join(picture.itertext())
+    assert all(name in words for name in ("base_link", "camera optical frame", "grasp_pose"))
+
+
+def test_the_call_for_moveit_fits_its_signature():
+    (call,) = (block for block in PYTHON if "moveit" in block)
+    compile(call, "docs/ros.md", "exec")
+    keywords = set(re.findall(r"(\w+)=", call.split("moveit_grasp(")[1]))
+    assert keywords <= set(inspect.signature(moveit_grasp).parameters)
+
+
+def test_the_client_gets_a_verified_grasp_of_the_can(node: GraspNode, directory: Path):
+    """The can is made, and the action's client run, as the page shows them."""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    (can,) = commands("python", "-c")
+    subprocess.run([sys.executable, *can[1:]], cwd=directory, check=True)
+    (client,) = (block for block in PYTHON if "ActionClient" in block)
+    ran = subprocess.run(
+        [sys.executable, "-c", client], cwd=directory, env=environment, capture_output=True, text=True, timeout=90
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert re.search(r"^\S+/0 object base_link geometry_msgs.msg.Point", ran.stdout, re.MULTILINE), ran.stdout
