@@ -8,17 +8,21 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, PlanConfig, load_preset
 from graspd_core.errors import ConfigError
-from graspd_core.geometry.camera import PinholeCamera, camera_from_calibration
+from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.geometry.choice import Target
 from graspd_core.geometry.cloud import PointCloud, transform_cloud
-from graspd_core.geometry.depth import cloud_from_depth, depth_from_bytes
+from graspd_core.geometry.depth import cloud_from_depth
 from graspd_core.geometry.load import load_scene
+from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.perceive import scene_from_views
+from graspd_core.geometry.poisson import fit_elsewhere
 from graspd_core.geometry.scene import Scene, object_parts
+from graspd_core.geometry.shapes import make_shape
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel
@@ -48,10 +52,8 @@ __all__ = [
     "PointCloud",
     "Scene",
     "Target",
-    "camera_from_calibration",
     "check_request",
     "cloud_from_depth",
-    "depth_from_bytes",
     "hand_names",
     "link_poses",
     "load_hand",
@@ -167,8 +169,15 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 
 
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
-    """Do the first-use work of torch and MuJoCo on a small sphere, so that the first request is as fast as others."""
-    plan_grasps(load_scene("shape:sphere"), hand, count=1, preset="fast", verify="standard", stop=stop)
+    """Do the first-use work of all libraries on a small sphere, so that the first request is as fast as others.
+
+    For a process that serves: from then on surfaces are fitted to clouds in a process of their own, since threads
+    beside would stand still meanwhile.
+    """
+    fit_elsewhere()
+    ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
+    scene = scene_from_views([PointCloud(ball, np.zeros(3))], alone=True)
+    plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)
 
 
 def _in_background(work: Callable[[T], R], argument: T) -> Future[R]:

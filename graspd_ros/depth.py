@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from sensor_msgs.msg import CameraInfo, Image
 
+from graspd_core.bags import messages
 from graspd_core.errors import CloudError
-from graspd_core.pipeline import PinholeCamera, camera_from_calibration, depth_from_bytes
+from graspd_core.pipeline import PinholeCamera
 
 SECOND = 1_000_000_000
 
@@ -49,32 +50,8 @@ def frame_of(image: Image, info: CameraInfo, rectified: bool = True) -> DepthFra
     """
     if info.header.frame_id and info.header.frame_id != image.header.frame_id:
         raise CloudError(f"depth image in {image.header.frame_id!r}, but its camera_info in {info.header.frame_id!r}")
-    depth = depth_from_bytes(
-        memoryview(image.data),
-        width=image.width,
-        height=image.height,
-        step=image.step,
-        encoding=image.encoding,
-        is_bigendian=bool(image.is_bigendian),
-    )
-    return DepthFrame(depth, camera_of(info, rectified), image.header.frame_id, _stamp(image))
-
-
-def camera_of(info: CameraInfo, rectified: bool = True) -> PinholeCamera:
-    """The camera that the images beside this message have. Raises CloudError: it is not calibrated."""
-    # Drivers of cameras without distortion often leave P empty.
-    by_projection = rectified and info.p[0] > 0
-    matrix = [*info.p[0:3], *info.p[4:7], *info.p[8:11]] if by_projection else list(info.k)
-    bin_x, bin_y = max(info.binning_x, 1), max(info.binning_y, 1)
-    roi = info.roi
-    width, height = roi.width or info.width, roi.height or info.height
-    shown = [
-        matrix[0] / bin_x, 0.0, (matrix[2] - roi.x_offset) / bin_x,
-        0.0, matrix[4] / bin_y, (matrix[5] - roi.y_offset) / bin_y,
-        0.0, 0.0, 1.0,
-    ]  # fmt: skip
-    distortion = () if rectified else tuple(info.d)
-    return camera_from_calibration(width // bin_x, height // bin_y, shown, distortion, info.distortion_model)
+    camera = messages.camera_from_message(info, rectified=rectified)
+    return DepthFrame(messages.depth_from_message(image), camera, image.header.frame_id, messages.stamp_of(image))
 
 
 class ImagePairs:
@@ -110,7 +87,7 @@ class ImagePairs:
         return len(self._images) + len(self._infos)
 
     def _keep(self, kept: OrderedDict[int, M], message: M) -> int:
-        stamp = _stamp(message)
+        stamp = messages.stamp_of(message)
         kept[stamp] = message
         kept.move_to_end(stamp)
         while len(kept) > self._capacity:
@@ -129,7 +106,3 @@ class ImagePairs:
         for stamp in [stamp for stamp in self._infos if stamp < info_stamp]:
             del self._infos[stamp]
         return pair
-
-
-def _stamp(message: Image | CameraInfo) -> int:
-    return message.header.stamp.sec * SECOND + message.header.stamp.nanosec

@@ -1,11 +1,13 @@
 """Arrays remembered by key: in this process always, and on disk between processes.
 
 Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`); `GRASPD_CACHE=off` keeps everything in memory. A file
-that cannot be read back whole is built again, and a disk that cannot be written is done without.
+that cannot be read back whole is built again, and a disk that cannot be written is done without. Clouds are never the same
+twice, so that a node that sees them would fill the disk: the files not used for longest give way.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 import threading
@@ -20,10 +22,13 @@ Arrays = dict[str, np.ndarray]
 
 # Part of every file's name: raise it when what is computed from the same mesh changes.
 VERSION = 1
-CAPACITY = 64
+CAPACITY = 16
+# Size of all files together [bytes], and how many are written between two looks at it.
+MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16
 
 _memory: OrderedDict[str, Arrays] = OrderedDict()
 _lock = threading.Lock()
+_written = itertools.count(1)
 
 
 def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
@@ -63,7 +68,9 @@ def _read(path: Path) -> Arrays | None:
     try:
         # Opening by hand closes the file whatever happens; npz members carry a CRC, so a damaged one is noticed.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files}
+        os.utime(path)
+        return arrays
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
         return None
 
@@ -77,6 +84,19 @@ def _write(path: Path, arrays: Arrays) -> None:
             np.savez(file, allow_pickle=False, **arrays)
         # Renaming is atomic: another process sees the whole file or none.
         temporary.replace(path)
+        if next(_written) % LOOK_EVERY == 0:
+            _prune(path.parent)
     except OSError:
         if temporary:
             temporary.unlink(missing_ok=True)
+
+
+def _prune(directory: Path) -> None:
+    """Remove the files that were not used for longest until the rest is small enough."""
+    files = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in directory.glob("*.npz"))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in files:
+        if total <= MOST_BYTES:
+            break
+        path.unlink(missing_ok=True)
+        total -= size

@@ -12,7 +12,9 @@ FEWEST_NEIGHBOURS = 0.3
 LEAST_WEIGHT = 0.04
 # Points are linked over this share of the gap between things; noise takes the rest.
 LINKED = 0.75
-# Where the points are sparse, over this many times the distance to a point's fourth neighbour: surfaces seen at a small
+# Points are dense if their fourth neighbours are so many times nearer than that.
+DENSE = 1.6
+# Where they are sparse they are linked over this many times the distance to a point's fourth neighbour: surfaces seen at a small
 # angle have their points far apart along the line of sight.
 SPARSE = 2.5
 SAMPLE = 2000
@@ -26,7 +28,7 @@ def link_length(points: Float[np.ndarray, "n 3"], gap: float) -> float:
         return gap
     some = points[:: max(1, len(points) // SAMPLE)]
     spacing = float(np.median(KDTree(points).query(some, k=5)[0][:, -1]))
-    return max(LINKED * gap, SPARSE * spacing)
+    return LINKED * gap if DENSE * spacing <= LINKED * gap else SPARSE * spacing
 
 
 def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float) -> Int[np.ndarray, "n"]:
@@ -80,7 +82,8 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """Number clusters from the largest, without gaps; strays (-1) stay."""
     answer = np.full(len(label), -1)
     known = label >= 0
-    _, which, count = np.unique(label[known], return_inverse=True, return_counts=True)
+    _, which = np.unique(label[known], return_inverse=True)
+    count = np.bincount(which)
     rank = np.empty(len(count), dtype=int)
     rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
     answer[known] = rank[which]

@@ -13,6 +13,9 @@ from jaxtyping import Float, Integer
 
 from graspd_core.types import TriangleMesh
 
+# Questions per call: Open3D holds Python's lock during one, so this bounds how long other threads wait (some 10 ms).
+_CHUNK = 4096
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -39,16 +42,20 @@ def make_surface(mesh: TriangleMesh) -> Surface:
 
 def surface_distance(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """Unsigned distance to the nearest triangle [m]."""
-    return surface.hierarchy.compute_distance(_tensor(points - surface.centre, np.float32)).numpy().astype(float)
+    parts = [surface.hierarchy.compute_distance(part).numpy() for part in _slices(points - surface.centre)]
+    return np.concatenate(parts).astype(float)
 
 
 def closest_points(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """The closest surface points [m], and the unit normals of the faces they lie on."""
-    answer = surface.hierarchy.compute_closest_points(_tensor(points - surface.centre, np.float32))
-    closest = answer["points"].numpy().astype(float) + surface.centre
-    return closest, answer["primitive_normals"].numpy().astype(float)
+    answers = [surface.hierarchy.compute_closest_points(part) for part in _slices(points - surface.centre)]
+    closest, normals = (
+        np.concatenate([answer[name].numpy() for answer in answers]).astype(float)
+        for name in ("points", "primitive_normals")
+    )
+    return closest + surface.centre, normals
 
 
 def first_hits(
@@ -60,6 +67,11 @@ def first_hits(
     hits = surface.hierarchy.cast_rays(_tensor(np.concatenate([origins, directions], -1), np.float32))
     normals = hits["primitive_normals"].numpy().astype(float)
     return hits["t_hit"].numpy().astype(float), hits["primitive_ids"].numpy(), normals
+
+
+def _slices(points: Float[np.ndarray, "n 3"]):
+    """Tensors of the points, a few thousand each; one at least."""
+    return [_tensor(points[i : i + _CHUNK], np.float32) for i in range(0, max(len(points), 1), _CHUNK)]
 
 
 def _tensor(array: np.ndarray, dtype: type):

@@ -16,7 +16,7 @@ from graspd_core.geometry.cloud import PointCloud
 # Depth images of more cells than this across the object tell no more.
 MOST_CELLS = 160
 
-# Outlines and surfaces are seen to within this [m]; a point deeper in empty space than that and this more is impossible.
+# Outlines and surfaces are seen to within the first [m]; a point the second deeper in empty space is impossible.
 SLACK, CONTRADICTION = 0.003, 0.01
 # A guessed point this near to a seen surface [m] confirms the guess.
 TOLERANCE = 0.004
@@ -65,7 +65,7 @@ def make_sight(view: PointCloud) -> Sight:
     from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
     from scipy.spatial import KDTree
 
-    frame = _frame(view)
+    frame = view_frame(view)
     local = (view.points - view.viewpoint) @ frame
     local = local[local[:, 2] > 1e-3]
     plane = local[:, :2] / local[:, 2:]
@@ -94,7 +94,7 @@ def empty_depth(evidence: Evidence, points: Float[np.ndarray, "*batch 3"]) -> Fl
 def weigh(
     evidence: Evidence, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
-    """Whether guessed points lie on a surface that was seen, facing its camera; and, 0 to 1, what speaks against them."""
+    """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
     confirmed, deep = _judge(evidence, points, normals)
     return confirmed, np.clip((deep - SLACK) / CONTRADICTION, 0.0, 1.0)
 
@@ -151,9 +151,11 @@ def _look(
     return np.where(within, before, beside), np.where(within, local[..., 2] - sight.depth[index], np.inf)
 
 
-def _frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:
+def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:
+    """Columns: right, down and forward, towards the middle of the points; any, from there itself."""
     forward = view.points.mean(0) - view.viewpoint
-    forward = forward / max(float(np.linalg.norm(forward)), 1e-9)
+    length = float(np.linalg.norm(forward))
+    forward = forward / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(forward, right), forward])

@@ -39,7 +39,7 @@ def extrude(seen: Surfels, evidence: Evidence, step: float) -> Surfels:
     _, at = distance_transform_edt(~np.isfinite(top), return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     top = np.where(mask, top[tuple(at)], -np.inf)
     rim = mask & ~np.asarray(binary_erosion(mask), dtype=bool)
-    slope = np.stack(np.gradient(gaussian_filter(mask.astype(float), 2.0)), -1)[rim]
+    slope = np.stack([*np.gradient(gaussian_filter(mask.astype(float), 2.0))], -1)[rim]
     outward = np.pad(-slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9), ((0, 0), (0, 1)))
     height = maximum_filter(top, 3)[rim]
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError
 from graspd_core.geometry.embree import closest_points, make_surface
 from graspd_core.geometry.evidence import SLACK, Evidence, empty_depth
 from graspd_core.geometry.fuse import Surfels
+from graspd_core.geometry.own_process import OwnProcess
 from graspd_core.types import TriangleMesh
 
 # Cells of the grid along the object's longest side, and the least width of one [m].
@@ -28,19 +29,35 @@ COARSEST = 0.0022
 BAND = 2
 
 
+_elsewhere: OwnProcess | None = None
+
+
+def fit_elsewhere() -> None:
+    """From now on fit surfaces in a process of their own: Open3D holds Python's lock through a fit, half a second."""
+    global _elsewhere
+    _elsewhere = _elsewhere or OwnProcess(_fit)
+
+
 def fit_poisson(surfels: Surfels) -> TriangleMesh:
     """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size."""
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surfels.points))
-    cloud.normals = o3d.utility.Vector3dVector(surfels.normals)
     size = float(np.ptp(surfels.points, axis=0).max())
     depth = int(np.clip(np.ceil(np.log2(1.2 * size / COARSEST)), 5, 7))
+    vertices, faces = (_elsewhere or _fit)(surfels.points, surfels.normals, depth)
+    if len(faces) == 0:
+        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
+    return TriangleMesh(vertices, faces)
+
+
+def _fit(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: int
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth, scale=1.2, n_threads=1)
-    if len(surface.triangles) == 0:
-        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
-    return TriangleMesh(np.asarray(surface.vertices), np.asarray(surface.triangles, dtype=np.int64))
+    return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
 
 
 def grid_cell(surfels: Surfels) -> float:

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError
+from graspd_core.geometry.allround import is_all_round, orient_all_round
 from graspd_core.geometry.cloud import PointCloud, clean_cloud
 from graspd_core.geometry.complete import OPEN, complete
+from graspd_core.geometry.embree import make_surface, surface_distance
 from graspd_core.geometry.evidence import Evidence, make_sight
 from graspd_core.geometry.extrude import LOW, stand
 from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step
@@ -29,8 +31,8 @@ TRUSTED, GUESSED = 0.004, 0.02
 MOST_FACES = 16_000
 # Share of the seen points that must lie within this [m] of the result.
 FITTED, FIT = 0.85, 0.004
-# Points of one view that are looked at.
-MOST_POINTS = 120_000
+# Points of all views together that are looked at.
+MOST_POINTS = 160_000
 
 
 @dataclass(frozen=True)
@@ -50,31 +52,34 @@ class Reconstruction:
     warnings: tuple[str, ...]
 
 
-def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) -> Reconstruction:
+def reconstruct(
+    views: Sequence[PointCloud], *, support: Plane | None = None, fused: Surfels | None = None
+) -> Reconstruction:
     """The closed surface of the object that the views show.
 
     Args:
         views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
             cloud that shows it from all round may stand for many views.
         support: what the object stands on, in the same frame.
+        fused: the seen surface, where it was fused before (`fuse_depth`); the views then only tell what is empty.
 
     Raises:
         CloudError: too few points, or no closed surface fits them.
     """
-    from scipy.spatial import KDTree
-
     views = _clean(views)
     rotation, origin = _frame(views, support)
     local = [PointCloud((v.points - origin) @ rotation, (v.viewpoint - origin) @ rotation) for v in views]
     step = point_step(local)
     standing = support is not None
-    warnings: tuple[str, ...] = ()
-    method = "poisson"
-    if all_round(local):
-        seen, evidence = _all_round(local, step), Evidence((), standing)
+    method, warnings = "poisson", ()
+    if fused is None and len(local) == 1 and is_all_round(local[0]):
+        seen, evidence = orient_all_round(local[0], step), Evidence((), standing)
         known = seen
     else:
-        seen = merge_views(local, step)
+        if fused is None:
+            seen = merge_views(local, step)
+        else:
+            seen = thin(Surfels((fused.points - origin) @ rotation, fused.normals @ rotation), step)
         lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
         evidence = Evidence(tuple(make_sight(v) for v in local), standing, lowest)
         guess = complete(seen, evidence, step)
@@ -84,45 +89,9 @@ def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) ->
         if guess.method or guess.openness > OPEN:
             warnings = (_sentence(len(views), guess.method),)
     known = part_walls(known)
-    mesh = close_surface(fit_poisson(known), known, evidence)
-    mesh = _finished(mesh, seen)
-    distance, _ = KDTree(seen.points).query(mesh.vertices)
-    trust = np.clip((GUESSED - distance) / (GUESSED - TRUSTED), 0.0, 1.0)
+    mesh = _finished(close_surface(fit_poisson(known), known, evidence), seen)
+    trust = _trust(mesh, np.concatenate([view.points for view in local]))
     return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), trust, method, warnings)
-
-
-def all_round(views: Sequence[PointCloud]) -> bool:
-    """Whether a single cloud shows surface behind surface, as no camera sees it."""
-    return len(views) == 1 and _layered_share(views[0]) > LAYERED_SHARE
-
-
-# A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
-# this share of exceptions, the cloud is taken to show the object from all round.
-STEEPEST = 4.0
-LAYERED_SHARE = 0.15
-
-
-def _layered_share(view: PointCloud) -> float:
-    """Share of lines of sight that meet points at depths too far apart for one surface, however steep."""
-    from scipy.spatial import KDTree
-
-    points = clean_cloud(view.points, view.viewpoint).points
-    sight = points.mean(0) - view.viewpoint
-    axis = sight / max(float(np.linalg.norm(sight)), 1e-9) if np.linalg.norm(sight) > 1e-6 else np.eye(3)[2]
-    right = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    right /= np.linalg.norm(right)
-    local = (points - view.viewpoint) @ np.column_stack([right, np.cross(axis, right), axis])
-    distance = float(local[:, 2].mean())
-    # From very near the object, lines of sight are not spread enough to sort points by: any direction will do.
-    if distance > np.ptp(points, axis=0).max() and local[:, 2].min() > 0:
-        local[:, :2] *= distance / local[:, 2:]
-    cell = 1.5 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
-    _, line = np.unique(np.round(local[:, :2] / cell).astype(int), axis=0, return_inverse=True)
-    line = line.reshape(-1)
-    near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
-    np.minimum.at(near, line, local[:, 2])
-    np.maximum.at(far, line, local[:, 2])
-    return float((far - near > STEEPEST * cell).mean())
 
 
 def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
@@ -131,7 +100,8 @@ def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
 
     if len(views) == 0:
         raise CloudError("cloud: no view at all; at least one is needed")
-    kept = [view.points[:: 1 + len(view.points) // MOST_POINTS].astype(float) for view in views]
+    most = MOST_POINTS // len(views)
+    kept = [view.points[:: 1 + len(view.points) // most].astype(float) for view in views]
     clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
     tree = KDTree(clean.points)
     near = 3 * float(np.median(tree.query(clean.points, k=2)[0][:, 1]))
@@ -165,30 +135,38 @@ def _frame(
     return np.column_stack([level, np.cross(up, level), up]), centre
 
 
-def _all_round(views: Sequence[PointCloud], step: float) -> Surfels:
-    """Points of an all-round cloud with normals that agree with their neighbours', outwards as a whole."""
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate([v.points for v in views])))
-    cloud = cloud.voxel_down_sample(step)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(24))
-    cloud.orient_normals_consistent_tangent_plane(16)
-    return Surfels(np.asarray(cloud.points), np.asarray(cloud.normals))
-
-
 def _finished(mesh: TriangleMesh, seen: Surfels) -> TriangleMesh:
     """Few faces, closed, and through the points that were seen."""
-    from graspd_core.geometry.embree import make_surface, surface_distance
-
-    mesh, _ = check_mesh(mesh, "reconstruction")
-    fewer, _ = check_mesh(simplify(mesh, MOST_FACES), "reconstruction")
-    mesh = fewer if is_closed(fewer) else mesh
+    mesh = _fewer(check_mesh(mesh, "reconstruction")[0])
     fitted = float((surface_distance(make_surface(mesh), seen.points) < FIT).mean())
     if not is_closed(mesh) or fitted < FITTED:
         raise CloudError(
             f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed"
         )
     return mesh
+
+
+def _fewer(mesh: TriangleMesh) -> TriangleMesh:
+    """At most `MOST_FACES`; the slower of two simplifiers where the quicker one tears the surface."""
+    import open3d as o3d
+
+    quick, _ = check_mesh(simplify(mesh, MOST_FACES), "reconstruction")
+    if is_closed(quick):
+        return quick
+    whole = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    ).simplify_quadric_decimation(MOST_FACES)
+    slow = TriangleMesh(np.asarray(whole.vertices), np.asarray(whole.triangles, dtype=np.int64))
+    slow, _ = check_mesh(slow, "reconstruction")
+    return slow if is_closed(slow) else mesh
+
+
+def _trust(mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "vertices"]:
+    """1 near seen points, less the farther from them."""
+    from scipy.spatial import KDTree
+
+    distance, _ = KDTree(seen).query(mesh.vertices)
+    return np.clip((GUESSED - distance) / (GUESSED - TRUSTED), 0.0, 1.0)
 
 
 def _sentence(views: int, method: str) -> str:

@@ -139,7 +139,10 @@ def _ends(profile: Rows, axis: Axis, right, up, evidence: Evidence, step: float)
             beyond = patch[-1:] + np.array([[0.008 * way, 0, 0, 0]])
             if (weigh(evidence, *_both(_ring(beyond, axis, right, up, np.full(1, TURNS))))[1] > 0.1).mean() < 0.2:
                 continue
-        if len(patch) and weigh(evidence, *_both(_ring(patch, axis, right, up, np.full(len(patch), TURNS))))[1].mean() < 0.1:
+        if (
+            len(patch)
+            and weigh(evidence, *_both(_ring(patch, axis, right, up, np.full(len(patch), TURNS))))[1].mean() < 0.1
+        ):
             found.append(patch)
     return found
 

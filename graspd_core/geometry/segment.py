@@ -165,7 +165,7 @@ def _doubts(
     """What the user should know of how the object was found."""
     doubts = []
     mine = scene.mean[chosen]
-    if scene.size > settings.voxel:
+    if scene.size > 0.5 * settings.gap:
         doubts.append(
             f"cloud: {len(scene.points)} points thinned by {1e3 * scene.size:.1f} mm; finer gaps are not seen"
         )

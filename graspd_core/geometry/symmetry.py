@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -164,7 +165,8 @@ def _sample(surfels: Surfels) -> _Sample:
     """A fixed choice of points, and of those that have neighbours to one side only."""
     from scipy.spatial import KDTree
 
-    distance, near = KDTree(surfels.points).query(surfels.points, k=17)
+    answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
+    distance, near = answer
     aside = np.linalg.norm(surfels.points[near[:, 1:]].mean(1) - surfels.points, axis=1)
     rim = surfels.points[aside > 0.45 * distance[:, 1:].mean(1)]
     spread = np.random.default_rng(1).permutation(len(rim))[: JUDGED // 3]

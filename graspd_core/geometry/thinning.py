@@ -15,8 +15,8 @@ from graspd_core.config import SegmentConfig
 from graspd_core.errors import CloudError
 from graspd_core.geometry.cloud import FEWEST_POINTS, PointCloud
 
-# Of more points than this, evenly many are left out: no object needs them.
-MOST_POINTS = 3_000_000
+# Of more points than this, every second, or third, ... is taken.
+MOST_POINTS = 5_000_000
 # More voxels than this are thinned again by larger ones: the time of all that follows is bounded.
 MOST_VOXELS = 150_000
 

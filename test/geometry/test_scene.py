@@ -1,5 +1,7 @@
 """Scenes from every kind of source, and the cache behind them."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -62,12 +64,12 @@ def fields_of(own_cache):
 def test_the_second_scene_comes_from_the_disk(own_cache):
     first = load_scene("shape:torus", resolution=16)
     (file,) = fields_of(own_cache)
-    stamp = file.stat().st_mtime_ns
+    place = file.stat().st_ino
     cache.forget()
     second = load_scene("shape:torus", resolution=16)
     assert torch.equal(first.sdf.field, second.sdf.field)
     assert torch.equal(first.sdf.origin, second.sdf.origin)
-    assert file.stat().st_mtime_ns == stamp
+    assert file.stat().st_ino == place
     assert not list(own_cache.glob("*.part"))
 
 
@@ -93,6 +95,17 @@ def test_an_alien_file_is_built_again(own_cache):
         np.savez(stream, other=np.zeros(3))
     cache.forget()
     assert torch.equal(first.sdf.field, load_scene("shape:torus", resolution=16).sdf.field)
+
+
+def test_the_disk_does_not_fill_up(own_cache, monkeypatch):
+    monkeypatch.setattr(cache, "MOST_BYTES", 3000)
+    monkeypatch.setattr(cache, "LOOK_EVERY", 1)
+    for number in range(6):
+        cache.remember(f"thing-{number}", lambda: {"numbers": np.zeros(100)}, lambda _: True)
+        os.utime(own_cache / f"thing-{number}-v{cache.VERSION}.npz", (number, number))
+    cache.remember("last", lambda: {"numbers": np.zeros(100)}, lambda _: True)
+    left = {file.name.split("-v")[0] for file in own_cache.glob("*.npz")}
+    assert left == {"thing-5", "last"}
 
 
 def test_the_disk_can_be_left_alone(own_cache, monkeypatch):

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 from std_msgs.msg import Header
 
+from graspd_core.bags.messages import camera_from_message
 from graspd_core.errors import CloudError
 from graspd_core.geometry.camera import distort
 from graspd_core.pipeline import cloud_from_depth
-from graspd_ros.depth import ImagePairs, camera_of, frame_of
+from graspd_ros.depth import ImagePairs, frame_of
 
 SECOND = 1_000_000_000
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -97,24 +98,24 @@ def test_a_malformed_image_is_refused_with_the_culprit(change: dict, culprit: st
 
 def test_an_uncalibrated_camera_is_refused():
     with pytest.raises(CloudError, match="fx=0"):
-        camera_of(calibration(p=[0.0] * 12, k=[0.0] * 9))
+        camera_from_message(calibration(p=[0.0] * 12, k=[0.0] * 9))
 
 
 def test_a_rectified_image_has_the_camera_of_p_and_no_distortion():
-    camera = camera_of(calibration())
+    camera = camera_from_message(calibration(), rectified=True)
     assert (camera.fx, camera.cx, camera.cy, camera.distortion) == (50.0, 30.0, 20.0, ())
-    raw = camera_of(calibration(), rectified=False)
+    raw = camera_from_message(calibration())
     assert (raw.fx, raw.cx, raw.cy) == (60.0, 31.5, 23.5)
     assert raw.distortion == (0.1, -0.05, 0.001, 0.002, 0.0)
     # Without P, which simple drivers leave empty, K stands in.
-    assert camera_of(calibration(p=[0.0] * 12)).fx == 60.0
+    assert camera_from_message(calibration(p=[0.0] * 12), rectified=True).fx == 60.0
 
 
 def test_binning_and_a_region_shift_and_scale_the_camera():
     info = calibration(
         64, 48, binning_x=2, binning_y=4, roi=RegionOfInterest(x_offset=10, y_offset=8, width=40, height=32)
     )
-    camera = camera_of(info)
+    camera = camera_from_message(info, rectified=True)
     assert (camera.width, camera.height) == (20, 8)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25.0, 12.5, 10.0, 3.0)
 
@@ -124,7 +125,7 @@ def test_a_sphere_seen_through_the_messages_lies_on_its_surface(rectified: bool)
     """Each pixel's depth is worked out from its ray by hand; through a lens, too."""
     centre, radius = np.array([0.02, -0.01, 0.5]), 0.08
     info = calibration()
-    camera = camera_of(info, rectified)
+    camera = camera_from_message(info, rectified=rectified)
     column, row = np.meshgrid(np.arange(64), np.arange(48))
     plane = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
     ideal = plane.copy()

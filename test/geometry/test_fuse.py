@@ -1,0 +1,102 @@
+"""Several views to one set of oriented points."""
+
+import numpy as np
+import pytest
+
+from graspd_core.errors import CloudError
+from graspd_core.geometry.camera import PinholeCamera
+from graspd_core.geometry.cloud import PointCloud
+from graspd_core.geometry.depth import cloud_from_depth
+from graspd_core.geometry.exact import make_distance_query, unsigned_distance
+from graspd_core.geometry.fuse import Surfels, fuse_depth, merge_views, point_step, thin
+from graspd_core.geometry.mesh import mass_properties
+from graspd_core.geometry.reconstruct import reconstruct
+from graspd_core.geometry.shapes import make_shape, shape_volume
+from graspd_core.geometry.tabletop import depth_views, ring_poses, tabletop
+from graspd_core.geometry.topology import is_closed
+
+CAMERA = PinholeCamera(240, 180, 260.0, 260.0, 119.5, 89.5)
+SCENE = tabletop("mug", yaw=0.3)
+POSES = ring_poses(6, elevation=0.8, distance=0.4)
+DEPTHS = [np.where(label == 0, depth, 0.0) for depth, label in depth_views(SCENE, CAMERA, POSES)]
+VIEWS = [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(DEPTHS, POSES, strict=True)]
+
+
+def test_merged_points_lie_on_the_surface_and_face_a_camera():
+    merged = merge_views(VIEWS)
+    assert unsigned_distance(make_distance_query(SCENE.truth), merged.points).mean() < 0.0006
+    assert np.linalg.norm(merged.normals, axis=1) == pytest.approx(np.ones(len(merged.points)))
+    eyes = np.array([view.viewpoint for view in VIEWS])
+    facing = ((eyes[None] - merged.points[:, None]) * merged.normals[:, None]).sum(-1)
+    assert (facing.max(1) > 0).all()
+    # A wall of 4 mm has two sides: points of either keep their own normal.
+    axis = merged.points[:, :2] - SCENE.T_world_object[:2, 3]
+    radius, outward = np.linalg.norm(axis, axis=1), (axis * merged.normals[:, :2]).sum(1)
+    wall = (np.abs(merged.normals[:, 2]) < 0.3) & (merged.points[:, 2] > 0.05) & (radius < 0.042)
+    assert (radius[wall & (outward > 0)] > 0.038).mean() > 0.95
+    assert (radius[wall & (outward < 0)] < 0.038).mean() > 0.95
+
+
+def test_noise_along_the_line_of_sight_is_smoothed():
+    rng = np.random.default_rng(0)
+    noisy = []
+    for view in VIEWS:
+        sight = view.points - view.viewpoint
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        noisy.append(PointCloud(view.points + rng.normal(0, 0.0015, (len(sight), 1)) * sight, view.viewpoint))
+    query = make_distance_query(SCENE.truth)
+    before = unsigned_distance(query, np.concatenate([view.points for view in noisy])).mean()
+    assert unsigned_distance(query, merge_views(noisy).points).mean() < 0.6 * before
+
+
+def test_flying_pixels_are_dropped():
+    rng = np.random.default_rng(0)
+    view = VIEWS[0]
+    sight = view.points - view.viewpoint
+    few = rng.choice(len(sight), 60, replace=False)
+    flying = view.viewpoint + sight[few] * rng.uniform(0.7, 0.93, (60, 1))
+    merged = merge_views([PointCloud(np.vstack([view.points, flying]), view.viewpoint)], point_step([view]))
+    assert unsigned_distance(make_distance_query(SCENE.truth), merged.points).max() < 0.008
+
+
+def test_thinning_is_even_and_keeps_both_sides():
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(0, 0.05, (4000, 2)), np.zeros(4000)])
+    up = np.tile([0.0, 0.0, 1.0], (4000, 1))
+    both = thin(Surfels(np.vstack([flat, flat]), np.vstack([up, -up])), 0.005)
+    assert len(both.points) == 200
+    assert (both.normals[:, 2] > 0).sum() == 100
+    assert len(thin(Surfels(np.zeros((0, 3)), np.zeros((0, 3))), 0.005).points) == 0
+
+
+def test_points_that_are_no_surface_are_named():
+    dust = np.random.default_rng(0).normal(0, 0.05, (60, 3))
+    with pytest.raises(CloudError, match="lie on a surface; at least 50"):
+        merge_views([PointCloud(dust, np.array([0.0, 0.0, 1.0]))])
+
+
+def test_fused_depth_images_give_the_same_body():
+    fused = fuse_depth(DEPTHS, CAMERA, POSES)
+    query = make_distance_query(SCENE.truth)
+    assert unsigned_distance(query, fused.points).mean() < 0.001
+    whole = reconstruct(VIEWS, support=SCENE.support, fused=fused)
+    assert is_closed(whole.mesh)
+    assert unsigned_distance(query, whole.mesh.vertices).mean() < 0.003
+    assert mass_properties(whole.mesh)[0] < 3 * shape_volume("mug"), "filled, it would be five times"
+
+
+@pytest.mark.parametrize(
+    ("depths", "camera", "complaint"),
+    [
+        (DEPTHS[:5], CAMERA, "5 depth images but 6 poses"),
+        (DEPTHS, PinholeCamera(240, 180, 260.0, 260.0, 119.5, 89.5, (0.1, 0.0, 0.0, 0.0)), "lens distortion"),
+        ([np.zeros((180, 240))] * 6, CAMERA, "give 0 points"),
+    ],
+)
+def test_depth_that_cannot_be_fused_is_named(depths, camera, complaint):
+    with pytest.raises(CloudError, match=complaint):
+        fuse_depth(depths, camera, POSES)
+
+
+def test_the_shape_that_is_rendered_is_the_one_meant():
+    assert len(make_shape("mug").faces) == len(SCENE.truth.faces)
