@@ -1,8 +1,8 @@
 """Arrays remembered by key: in this process always, and on disk between processes.
 
 Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`); `GRASPD_CACHE=off` keeps everything in memory. A file
-that cannot be read back whole is built again, and a disk that cannot be written is done without. Clouds are never the same
-twice, so that a node that sees them would fill the disk: the files not used for longest give way.
+that cannot be read back whole is built again, and a disk that cannot be written is done without. Clouds are never the
+same twice, so that a node that sees them would fill the disk: the files not used for longest give way.
 """
 
 from __future__ import annotations

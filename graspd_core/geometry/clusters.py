@@ -14,8 +14,8 @@ LEAST_WEIGHT = 0.04
 LINKED = 0.75
 # Points are dense if their fourth neighbours are so many times nearer than that.
 DENSE = 1.6
-# Where they are sparse they are linked over this many times the distance to a point's fourth neighbour: surfaces seen at a small
-# angle have their points far apart along the line of sight.
+# Sparse ones are linked over this many times the distance to the fourth neighbour: surfaces seen at a small angle have
+# their points far apart along the line of sight.
 SPARSE = 2.5
 SAMPLE = 2000
 
@@ -83,8 +83,6 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     answer = np.full(len(label), -1)
     known = label >= 0
     _, which = np.unique(label[known], return_inverse=True)
-    count = np.bincount(which)
-    rank = np.empty(len(count), dtype=int)
-    rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
-    answer[known] = rank[which]
+    order = np.argsort(-np.bincount(which), kind="stable")
+    answer[known] = np.argsort(order)[which]
     return answer

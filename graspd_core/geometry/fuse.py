@@ -142,13 +142,15 @@ def fuse_depth(
 
     if len(depths) != len(poses):
         raise CloudError(f"fusion: {len(depths)} depth images but {len(poses)} poses; one each is needed")
+    if not any(np.any(depth > 0) for depth in depths):
+        raise CloudError(f"fusion: none of the {len(depths)} depth images has any depth")
     if camera.distortion:
         raise CloudError("fusion: the camera has lens distortion; rectified depth images are needed")
     tensor = o3d.core.Tensor.from_numpy
     grid = o3d.t.geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight"),
         attr_dtypes=(o3d.core.float32, o3d.core.float32),
-        attr_channels=((1,), (1,)),
+        attr_channels=(o3d.core.SizeVector([1]), o3d.core.SizeVector([1])),
         voxel_size=voxel,
         block_resolution=8,
         block_count=4000,

@@ -44,11 +44,13 @@ class OwnProcess:
         self._process.join()
 
     def _start(self) -> None:
-        # spawn: a fork would copy locks that other threads of this process hold. Only the child's end of the pipe goes
-        # to the child, so that it reads an end of file when this process dies.
+        # spawn: a fork would copy locks that other threads hold. Only the child's end of the pipe goes to the child, so
+        # that it reads an end of file when this process dies.
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(self._work, theirs), daemon=True, name="graspd_own_process")
+        self._process = context.Process(
+            target=_serve, args=(self._work, theirs), daemon=True, name="graspd_own_process"
+        )
         self._process.start()
         theirs.close()
 

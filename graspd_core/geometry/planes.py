@@ -42,6 +42,7 @@ class FlatPart:
         sides: length and width of the seen part [m].
         hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`; rows n, c.
         area: inside the hull [m²].
+        filled: share of that area where it was seen.
     """
 
     plane: Plane
@@ -52,6 +53,7 @@ class FlatPart:
     sides: tuple[float, float]
     hull: Float[np.ndarray, "edges 3"]
     area: float
+    filled: float
 
     def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Above the plane, towards the cameras [m]."""
@@ -171,6 +173,8 @@ def _measure(
     kept[rows[largest]] = True
     _, turn = np.linalg.eigh(np.cov(flat.T))
     sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
+    area = float(hull.volume)
+    seen = len(np.unique(cell[largest], axis=0)) * CELL**2
     return FlatPart(
-        plane, axes, noise, least, kept, (float(sides.max()), float(sides.min())), hull.equations, float(hull.volume)
+        plane, axes, noise, least, kept, (float(sides.max()), float(sides.min())), hull.equations, area, seen / area
     )

@@ -19,7 +19,7 @@ from graspd_core.geometry.complete import OPEN, complete
 from graspd_core.geometry.embree import make_surface, surface_distance
 from graspd_core.geometry.evidence import Evidence, make_sight
 from graspd_core.geometry.extrude import LOW, stand
-from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step
+from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step, thin
 from graspd_core.geometry.mesh import check_mesh, simplify
 from graspd_core.geometry.poisson import close_surface, fit_poisson, part_walls
 from graspd_core.geometry.topology import is_closed

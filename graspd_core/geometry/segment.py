@@ -17,7 +17,6 @@ from graspd_core.geometry.pieces import join_pieces
 from graspd_core.geometry.planes import find_planes
 from graspd_core.geometry.support import Ground, find_ground, stands_on, voxels_of
 from graspd_core.geometry.thinning import ThinScene, thin_scene
-from graspd_core.geometry.touching import looks_double
 from graspd_core.types import Plane
 
 
@@ -72,7 +71,7 @@ def segment(
         raise CloudError(f"cloud: only {total} points show the object; at least {FEWEST_POINTS} are needed")
     support = None if ground.support is None else ground.support.plane
     neighbours = _neighbours(scene, label, chosen, ground, settings)
-    return Segmentation(found, support, neighbours, _doubts(scene, chosen, ground, eyes[0], bool(neighbours), settings))
+    return Segmentation(found, support, neighbours, _doubts(scene, chosen, ground, bool(neighbours), settings))
 
 
 def _things(
@@ -158,7 +157,6 @@ def _doubts(
     scene: ThinScene,
     chosen: Bool[np.ndarray, "voxels"],
     ground: Ground,
-    eye: Float[np.ndarray, "3"],
     crowded: bool,
     settings: SegmentConfig,
 ) -> tuple[str, ...]:
@@ -171,8 +169,6 @@ def _doubts(
         )
     if ground.support is None and crowded:
         doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken as part")
-    if ground.support is not None and looks_double(mine, ground.support.axes, eye, 1.3 * scene.size):
-        doubts.append("cloud: the object has a narrow neck; it may be two things that touch: a box or mask tells them")
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
     return tuple(doubts)

@@ -22,6 +22,8 @@ from graspd_core.geometry.thinning import ThinScene
 ROOMIER = 2.0
 # Share of its width by which the lowest seen point of a thing may be above its support.
 HIDDEN = 0.5
+# Less of a plane's hull seen than this share, it is a slice through several things.
+FILLED = 0.3
 # Points down to so many tolerances below a part, as many as this share of its own, are a body's other faces.
 BAND, FALLING = 4.0, 0.25
 # A part goes on so far beyond what was seen of it [m].
@@ -49,10 +51,11 @@ def find_ground(
     scene: ThinScene, parts: list[FlatPart], viewpoints: Float[np.ndarray, "views 3"], settings: SegmentConfig
 ) -> Ground:
     """Sort the flat parts."""
+    parts = [part for part in parts if part.filled > FILLED and not _falls_off(scene, part)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
     best, most = None, (0, 0)
     for part in parts:
-        if (viewpoints @ part.plane.normal <= part.plane.offset).any() or _falls_off(scene, part):
+        if (viewpoints @ part.plane.normal <= part.plane.offset).any():
             continue
         standing = _standing(scene, part, _left(scene, part, [x for x in large if x is not part]), settings)
         if standing > most:

@@ -21,7 +21,7 @@ JUDGED, ROUGHLY = 240, 90
 # What a contradiction weighs against a confirmation.
 WEIGHT = 3.0
 # Directions of mirror planes that are tried of an object that stands, and of one that does not; places of each.
-UPRIGHT, ALL_ROUND, PLACES = 30, 70, 37
+UPRIGHT, ALL_ROUND, PLACES = 30, 70, 29
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -96,8 +96,8 @@ def find_centre(surfels: Surfels, evidence: Evidence) -> Symmetry:
     sample = _sample(surfels)
     low, high = surfels.points.min(0), surfels.points.max(0)
     middle, size = 0.5 * (low + high), float((high - low).max())
-    across = np.linspace(-0.5, 0.5, 17) * size
-    depths = np.zeros(1) if evidence.standing else np.linspace(-0.7, 0.2, 15) * size
+    across = np.linspace(-0.5, 0.5, 15 if evidence.standing else 11) * size
+    depths = np.zeros(1) if evidence.standing else np.linspace(-0.7, 0.2, 10) * size
     linear = np.diag([-1.0, -1.0, 1.0]) if evidence.standing else -np.eye(3)
     best = Symmetry(linear, np.zeros(3), 0.0, 1.0, 0.0)
     for finer in (1, 5, 25):

@@ -14,7 +14,6 @@ from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.revolve import find_revolution, fit_axis
 from graspd_core.geometry.shapes import BOX_HALF, CYLINDER_HALF, CYLINDER_RADIUS, SPHERE_RADIUS, make_shape
 from graspd_core.geometry.symmetry import find_centre, find_mirrors, image
-from graspd_core.types import TriangleMesh
 
 EYE = np.array([0.3, 0.15, 0.35])
 
@@ -23,7 +22,7 @@ def front(name: str, height: float, eye: np.ndarray = EYE) -> PointCloud:
     """The points of a convex shape, its centre at `height` [m], that an eye sees."""
     mesh = make_shape(name)
     points, normals = surface_samples(mesh, 24_000, 0)
-    points = points + [0, 0, height]
+    points = points + np.array([0.0, 0.0, height])
     return PointCloud(points[((eye - points) * normals).sum(1) > 0], eye)
 
 
@@ -70,7 +69,9 @@ def test_a_revolution_is_found_and_lies_on_the_body(view):
     else:
         across = np.linalg.norm(points[:, :2], axis=1)
         off = np.abs(np.maximum(across - CYLINDER_RADIUS, np.abs(points[:, 2]) - CYLINDER_HALF))
-    assert np.percentile(off, 90) < 0.0015
+    # Points are 1.6 mm apart, and smoothing rounds edges over some 4 mm.
+    assert np.median(off) < 0.001
+    assert np.percentile(off, 95) < 0.004
 
 
 def test_a_box_is_no_body_of_revolution():
@@ -144,7 +145,7 @@ def test_guesses_in_empty_space_or_on_what_is_seen_are_dropped():
     before = Surfels(seen.points + 0.1 * towards, seen.normals)
     assert len(plausible(before, seen, evidence, step).points) == 0
     assert len(plausible(seen, seen, evidence, step).points) == 0
-    whole, normals = surface_samples(TriangleMesh(make_shape("box").vertices + [0, 0, BOX_HALF[2]],
-                                                  make_shape("box").faces), 5000, 0)  # fmt: skip
+    whole, normals = surface_samples(make_shape("box"), 5000, 0)
+    whole = whole + np.array([0.0, 0.0, BOX_HALF[2]])
     hidden = (normals @ np.array([-1.0, 0.0, 0.0])) > 0.9
     assert len(plausible(Surfels(whole[hidden], normals[hidden]), seen, evidence, step).points) > 100
