@@ -82,7 +82,7 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """Number clusters from the largest, without gaps; strays (-1) stay."""
     answer = np.full(len(label), -1)
     known = label >= 0
-    _, which = np.unique(label[known], return_inverse=True)
-    order = np.argsort(-np.bincount(which), kind="stable")
-    answer[known] = np.argsort(order)[which]
+    count = np.bincount(label[known])
+    rank = np.argsort(np.argsort(-count, kind="stable"))
+    answer[known] = rank[label[known]]
     return answer

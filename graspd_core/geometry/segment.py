@@ -162,7 +162,6 @@ def _doubts(
 ) -> tuple[str, ...]:
     """What the user should know of how the object was found."""
     doubts = []
-    mine = scene.mean[chosen]
     if scene.size > 0.5 * settings.gap:
         doubts.append(
             f"cloud: {len(scene.points)} points thinned by {1e3 * scene.size:.1f} mm; finer gaps are not seen"
