@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench-foundation bench-rgbd clean
+.PHONY: help setup test check format demo bench-foundation bench-rgbd soak clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -14,7 +14,7 @@ help:  ## list the targets
 setup: $(STAMP)  ## build .venv (Python 3.11 or 3.12; PYTHON=... names one)
 
 # The directories too: adding or removing a message makes the environment stale.
-INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*))
+INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*) scripts/tf2_msgs/msg/*)
 
 $(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh $(INTERFACES)
 	@scripts/setup.sh $(VENV) $(PYTHON)
@@ -41,6 +41,9 @@ bench-foundation: setup  ## make the README's results table anew
 bench-rgbd: setup  ## make the table of docs/clouds.md anew: shapes on a table, rendered with sensor noise (an hour)
 	$(RUN)/python benchmarks/rgbd.py --readme docs/clouds.md
 	$(if $(FRAMES),$(RUN)/python benchmarks/rgbd.py --frames $(FRAMES))
+
+soak: setup  ## ten minutes of mixed load on the node: memory, latencies, answers
+	$(RUN)/python benchmarks/soak.py --minutes 10
 
 clean:  ## remove what was made, the environment excepted
 	rm -rf demo results build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

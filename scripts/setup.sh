@@ -68,7 +68,8 @@ ensure_venv_module() {
 }
 
 log=$(mktemp)
-trap 'rm -f "$log"' EXIT
+build=$(mktemp -d)
+trap 'rm -rf "$log" "$build"' EXIT
 python=$(choose_python)
 install_packages "$python"
 # Kept when it works; a half-built, moved or other-versioned one is made anew.
@@ -87,9 +88,7 @@ echo "setup: compiling the messages of graspd_msgs (20 seconds)"
 "${pip[@]}" --no-build-isolation --no-deps ./msg_defs
 # /tf has a type that comes with ROS and is not on PyPI.
 if ! "$venv/bin/python" -c 'import tf2_msgs.msg' 2>/dev/null; then
-    build=$(mktemp -d)
     cp -r scripts/tf2_msgs/. msg_defs/setup.py msg_defs/pyproject.toml "$build"
     "${pip[@]}" --no-build-isolation --no-deps "$build"
-    rm -r "$build"
 fi
 echo "setup: done"

@@ -81,7 +81,7 @@ def choose(
     if target.point is not None:
         return label == _nearest(scene, label, many, target.point, reach)
     if target.box is not None:
-        low, high = np.minimum(*target.box), np.maximum(*target.box)
+        low, high = np.minimum(*target.box) - scene.size, np.maximum(*target.box) + scene.size
         meant = np.asarray(((scene.mean >= low) & (scene.mean <= high)).all(1))
         inside = np.bincount(label[(label >= 0) & meant], minlength=many)
         if not inside.any():

@@ -83,6 +83,8 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     answer = np.full(len(label), -1)
     known = label >= 0
     count = np.bincount(label[known])
-    rank = np.argsort(np.argsort(-count, kind="stable"))
+    order = np.argsort(-count, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
     answer[known] = rank[label[known]]
     return answer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -13,7 +13,7 @@ from typing import Any
 class OwnProcess:
     """Calls a function in a child process, which starts at once and ends with this one, however that ends.
 
-    Calls come one at a time. Where the child has died the function is called here; the next call starts another.
+    Calls come one at a time. A child that has died is replaced.
 
     Args:
         work: a function that can be pickled, as its arguments, its result and its errors can.
@@ -25,15 +25,20 @@ class OwnProcess:
         self._start()
 
     def __call__(self, *arguments: Any) -> Any:
+        """What the work gives or raises; MemoryError where two children died over it, as when memory is short."""
         with self._lock:
-            if not self._process.is_alive():
-                self._start()
-            try:
-                self._pipe.send(arguments)
-                failed, answer = self._pipe.recv()
-            except (EOFError, OSError):
-                self._process.join()
-                return self._work(*arguments)
+            for _ in range(2):
+                if not self._process.is_alive():
+                    self._start()
+                try:
+                    self._pipe.send(arguments)
+                    failed, answer = self._pipe.recv()
+                    break
+                except (EOFError, OSError):
+                    self._process.join()
+            else:
+                # Not called here instead: what killed them would kill this process.
+                raise MemoryError(f"{self._work.__name__}: the process that it is done in died twice")
         if failed:
             raise answer
         return answer
@@ -48,16 +53,20 @@ class OwnProcess:
         # that it reads an end of file when this process dies.
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_serve, args=(self._work, theirs), daemon=True, name="graspd_own_process"
-        )
-        self._process.start()
+        work = (self._work, theirs)
+        self._process = context.Process(target=_serve, args=work, daemon=True, name="graspd_own_process")
+        # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
+        # blocked, since it needs a second for its imports before it could ignore it.
+        resource_tracker.ensure_running()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
 
 def _serve(work: Callable[..., Any], pipe: Connection) -> None:
-    # Ctrl-C reaches every process of the terminal; this one ends when its parent does.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
             arguments = pipe.recv()
@@ -67,4 +76,7 @@ def _serve(work: Callable[..., Any], pipe: Connection) -> None:
             answer = False, work(*arguments)
         except Exception as error:
             answer = True, error
-        pipe.send(answer)
+        try:
+            pipe.send(answer)
+        except OSError:
+            return

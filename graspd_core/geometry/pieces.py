@@ -16,6 +16,8 @@ from graspd_core.geometry.planes import FlatPart
 
 # Beyond so many pieces the rest is noise.
 MOST_PIECES = 40
+# What ends so many link lengths above the support has its foot hidden.
+FLOATING = 0.5
 # A piece whose foot is hidden is one with what hides it, if it is this near [m].
 HIDDEN_FOOT = 0.03
 # Without a support nothing tells one thing behind another from one thing's two sides: this near, they are one [m].
@@ -28,24 +30,24 @@ WITHIN = 0.6
 
 def join_pieces(
     points: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
     label: Int[np.ndarray, "n"],
     viewpoints: Float[np.ndarray, "views 3"],
     *,
     link: float,
     largest: float,
     support: FlatPart | None,
-    foot: float,
 ) -> Int[np.ndarray, "n"]:
     """The clusters with such pieces joined, numbered from the largest; -1: a stray.
 
     Args:
         points: evenly dense [m].
+        distance: of each from its camera [m].
         label: their clusters, numbered from the largest; -1: a stray.
         viewpoints: where the cameras stood [m].
         link: distance at which points were linked [m].
         largest: pieces that would be longer than this together are not one thing [m].
-        support: what the things stand on.
-        foot: a piece whose lowest point is higher than this above the support has its foot hidden [m].
+        support: what the things stand on; a piece that ends well above it has its foot hidden.
     """
     from scipy.spatial import KDTree
 
@@ -53,7 +55,10 @@ def join_pieces(
     pieces = [points[label == k] for k in range(many)]
     trees = [KDTree(piece) for piece in pieces]
     small = [k for k in range(many) if extent(pieces[k]) <= largest]
-    hidden = [support is not None and float(support.height(piece).min()) > foot for piece in pieces]
+    hidden = [False] * many
+    if support is not None:
+        clear = support.height(points) - support.tolerance(distance)
+        hidden = [bool(clear[label == k].min() > FLOATING * link) for k in range(many)]
     owner = list(range(many))
     for a, b in combinations(small, 2):
         reach = UNSUPPORTED if support is None else HIDDEN_FOOT if hidden[a] or hidden[b] else link

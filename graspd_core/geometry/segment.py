@@ -83,12 +83,12 @@ def _things(
     label = link_points(points, scene.weight[ground.left], link)
     label = join_pieces(
         points,
+        scene.mean_distance[ground.left],
         label,
         eyes,
         link=link,
         largest=settings.largest_object,
         support=ground.support,
-        foot=settings.contact + settings.plane_tolerance,
     )
     label = voxels_of(label, ground.left)
     many = int(label.max(initial=-1)) + 1

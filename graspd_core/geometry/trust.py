@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from graspd_core.geometry.sdf import GridSDF
 
+# Cells from the surface within which a node looks for its vertex; every surface has nodes this near.
+_NEAR = 2.0
+
 
 def trust_grid(
     vertices: Float[np.ndarray, "vertices 3"], trust: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """The trust of the vertex nearest to each node of the distance grid."""
-    axes = [float(first) + float(sdf.spacing) * np.arange(sdf.field.shape[1]) for first in sdf.origin]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    nearest = KDTree(vertices).query(nodes.reshape(-1, 3))[1]
-    return torch.as_tensor(trust[nearest].reshape(nodes.shape[:3])).to(sdf.field)
+    """The trust of the vertex nearest to each node by the surface; elsewhere, that of the nearest such node."""
+    spacing = float(sdf.spacing)
+    near = sdf.field[0].abs().cpu().numpy() < _NEAR * spacing
+    nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
+    grid = np.zeros(near.shape)
+    grid[near] = trust[KDTree(vertices).query(nodes)[1]]
+    # Far from the vertices a search among them costs a second; a step on the grid costs nothing.
+    source: Any = distance_transform_edt(~near, return_distances=False, return_indices=True)
+    return torch.as_tensor(grid[tuple(source)]).to(sdf.field)
 
 
 def sample_trust(

@@ -39,9 +39,20 @@ def test_values_and_errors_come_back_and_the_child_lives_on():
 def test_when_the_child_is_killed_nothing_is_lost(who: OwnProcess):
     child = who()
     os.kill(child, signal.SIGKILL)
-    # The call that meets the dead child is answered here or by the next one.
-    assert who() != child
     assert who() not in (child, os.getpid())
+
+
+def test_work_that_kills_its_process_does_not_kill_this_one():
+    deadly = OwnProcess(os._exit)
+    with pytest.raises(MemoryError, match="_exit: the process that it is done in died twice"):
+        deadly(1)
+    deadly.close()
+
+
+def test_ctrl_c_in_the_terminal_leaves_the_child_alone(who: OwnProcess):
+    child = who()
+    os.kill(child, signal.SIGINT)
+    assert who() == child
 
 
 def test_the_child_ends_with_its_parent():

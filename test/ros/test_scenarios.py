@@ -1,0 +1,269 @@
+"""Whole stories between processes: a recording played in, its answer recorded, simulated time, a client that dies."""
+
+from __future__ import annotations
+
+import array
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Pose, TransformStamped
+from graspd_msgs.action import SynthesizeGrasps
+from graspd_msgs.msg import Grasp, GraspArray, GraspRequest
+from rclpy.action.client import ActionClient
+from rclpy.serialization import deserialize_message
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosgraph_msgs.msg import Clock
+from scipy.spatial.transform import Rotation
+from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
+
+from graspd_core.bags.writer import Record, camera_info_message, depth_message, transforms_message, write_bag
+from graspd_core.geometry.camera import PinholeCamera
+from graspd_core.geometry.noise import DEFAULT
+from graspd_core.geometry.tabletop import TabletopScene, depth_views, ring_poses, tabletop
+from graspd_core.io import grasps_of, load_document
+from graspd_core.transforms import SECOND
+
+RESULT_TIMEOUT = 60.0
+SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
+ONE = {"num_grasps": 1, "preset": "fast"}
+REACH = 0.2  # metres from the hand's base to what it holds
+START = 1_700_000_000 * SECOND  # of the recording; long before now
+SEEN = START + SECOND + SECOND // 100  # when the image was taken: between two samples of /tf
+CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
+
+# An action client whose end nobody but the system decides on.
+DOOMED = """
+import rclpy
+from graspd_msgs.action import SynthesizeGrasps
+from graspd_msgs.msg import GraspRequest
+from rclpy.action import ActionClient
+
+rclpy.init()
+node = rclpy.create_node("doomed")
+client = ActionClient(node, SynthesizeGrasps, "/graspd/synthesize")
+client.wait_for_server()
+request = GraspRequest(id="orphan", source=GraspRequest.MESH, mesh_uri="sphere.obj", num_grasps=64)
+request.preset, request.time_budget = "accurate", 5.0
+tell = lambda told: print(told.feedback.progress.stage, flush=True)
+goal = client.send_goal_async(SynthesizeGrasps.Goal(request=request), feedback_callback=tell)
+rclpy.spin_until_future_complete(node, goal)
+answer = goal.result().get_result_async()
+print("asked for the result", flush=True)
+rclpy.spin_until_future_complete(node, answer)
+"""
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def matrix(pose: Pose) -> np.ndarray:
+    p, q = pose.position, pose.orientation
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    T[:3, 3] = p.x, p.y, p.z
+    return T
+
+
+def rigid(rotation: Rotation, place: list[float]) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), place
+    return T
+
+
+@pytest.fixture
+def start_process(client, tmp_path: Path) -> Iterator[Callable[..., tuple[subprocess.Popen, Path]]]:
+    """Starts Python with arguments in the tests' DDS domain; gives the process and the file that it writes to."""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(client.context.get_domain_id()), "ROS_LOG_DIR": str(tmp_path)}
+    started: list[subprocess.Popen] = []
+
+    def start(*arguments: str | Path) -> tuple[subprocess.Popen, Path]:
+        told = tmp_path / f"process-{len(started)}.log"
+        with told.open("w") as file:
+            command = [sys.executable, *arguments]
+            started.append(subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT))
+        return started[-1], told
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def publish(client) -> Iterator[Callable[[Any, str], None]]:
+    """Publishes a message on a topic that the node listens to."""
+    publishers: dict[str, Any] = {}
+
+    def publish(message: Any, topic: str) -> None:
+        if topic not in publishers:
+            publishers[topic] = client.node.create_publisher(type(message), topic, 10)
+            client.spin_until(publishers[topic].get_subscription_count, 10.0, f"subscriber of {topic}")
+            client.spin_for(0.3)
+        publishers[topic].publish(message)
+
+    yield publish
+    for publisher in publishers.values():
+        client.node.destroy_publisher(publisher)
+
+
+def record_scene(path: Path, scene: TabletopScene) -> np.ndarray:
+    """A recording of 1.5 s: one noisy depth image by a camera on a mount that moves. `T_world_camera` at the image."""
+    (T_world_camera,) = ring_poses(1, elevation=0.8, azimuth=0.5)
+    T_mount_camera = rigid(Rotation.from_euler("xyz", [0.3, -0.2, 1.0]), [0.05, 0.0, 0.1])
+    T_world_mount = T_world_camera @ np.linalg.inv(T_mount_camera)
+    records = [Record("/tf_static", START, transforms_message([("mount", "optical", T_mount_camera)], START))]
+    for stamp in range(START, START + 3 * SECOND // 2, SECOND // 50):
+        seconds = (stamp - SEEN) / SECOND
+        pose = T_world_mount @ rigid(Rotation.from_rotvec([0, 0, seconds]), [0.0, 0.0, 0.0])
+        pose[:3, 3] += [0.5 * seconds, 0.0, 0.0]
+        records.append(Record("/tf", stamp, transforms_message([("world", "mount", pose)], stamp)))
+    ((depth, _),) = depth_views(scene, CAMERA, (T_world_camera,), DEFAULT)
+    records.append(Record("/camera/camera_info", SEEN, camera_info_message(CAMERA, "optical", SEEN)))
+    records.append(Record("/camera/image_rect", SEEN, depth_message(depth, "optical", SEEN)))
+    write_bag(path, records, storage="mcap")
+    return T_world_camera
+
+
+def record_answer(path: Path, data: bytes) -> None:
+    """One GraspArray as `ros2 bag record` writes it: the bytes of DDS, and the definitions of the types."""
+    store, types = get_typestore(Stores.ROS2_JAZZY), {}
+    for file in (Path(__file__).parents[2] / "msg_defs" / "msg").glob("*.msg"):
+        types |= get_types_from_msg(file.read_text(), f"graspd_msgs/msg/{file.stem}")
+    store.register(types)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/recorded/grasps", "graspd_msgs/msg/GraspArray", typestore=store)
+        writer.write(topic, START, data)
+
+
+def agree(theirs: Any, ours: Any) -> bool:
+    """Whether a message of rosbags', which shares no code with rosidl, carries what one of rclpy's does."""
+    if hasattr(ours, "get_fields_and_field_types"):
+        return all(agree(getattr(theirs, name), getattr(ours, name)) for name in ours.get_fields_and_field_types())
+    if isinstance(ours, list | array.array | np.ndarray):
+        return len(theirs) == len(ours) and all(map(agree, theirs, ours))
+    return theirs == ours
+
+
+def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_reads_back(
+    client, node, start_process, tmp_path
+):
+    scene = tabletop("cylinder", yaw=0.3)
+    T_world_camera = record_scene(tmp_path / "scene", scene)
+    play = partial(start_process, "-m", "graspd_ros.player", "--wait", "20")
+    raw: list[bytes] = []
+    recorder = client.node.create_subscription(GraspArray, "/graspd/grasps", raw.append, 10, raw=True)
+    client.set_parameters(output_frame="world", **ONE)
+    remaps = ("-r", "/camera/image_rect:=/depth/image_rect", "-r", "/camera/camera_info:=/depth/camera_info")
+    player, told = play(tmp_path / "scene", "--now", "--ros-args", *remaps)
+    result = client.event(RESULT_TIMEOUT, event="result")
+    answer = client.answer(result["request"], 5.0)
+    assert player.wait(10.0) == 0, told.read_text()
+
+    assert (answer.status, answer.header.frame_id) == (GraspArray.SUCCEEDED, "world"), answer.message
+    best = answer.grasps[0]
+    assert (best.verdict, best.header.frame_id) == (Grasp.VERIFIED, "world")
+    T_world_base = matrix(best.grasp_pose)
+    low, high = scene.truth.vertices.min(0), scene.truth.vertices.max(0)
+    assert np.linalg.norm(T_world_base[:3, 3] - (low + high) / 2) < REACH
+    contacts = np.array([[c.position.x, c.position.y, c.position.z] for c in best.contacts])
+    assert (contacts > low - 0.015).all()
+    assert (contacts < high + 0.015).all()
+    # The file holds the same grasp as the camera saw it; the camera's true pose then, not the newest, leads here.
+    seen = grasps_of(load_document(node.directory / result["file"]))[0].grasp
+    T_camera_base = rigid(Rotation.from_quat(seen.quaternion_wxyz, scalar_first=True), list(seen.position))
+    np.testing.assert_allclose(T_world_base, T_world_camera @ T_camera_base, atol=1e-6)
+
+    client.spin_until(lambda: raw, 5.0, "the answer as bytes")
+    client.node.destroy_subscription(recorder)
+    record_answer(tmp_path / "answer", raw[0])
+    with AnyReader([tmp_path / "answer"]) as reader:
+        ((connection, _, data),) = reader.messages()
+        assert agree(reader.deserialize(data, connection.msgtype), answer)
+    assert deserialize_message(bytes(data), GraspArray) == answer
+    replayed: list[GraspArray] = []
+    subscription = client.node.create_subscription(GraspArray, "/recorded/grasps", replayed.append, 10)
+    play(tmp_path / "answer")
+    client.spin_until(lambda: replayed, 20.0, "the answer once more")
+    client.node.destroy_subscription(subscription)
+    assert replayed == [answer]
+
+
+def test_a_cloud_that_tf_does_not_lead_from_is_refused_and_the_node_lives(client, node, publish, make_cloud):
+    client.set_parameters(output_frame="robot", **ONE)
+    now = client.node.get_clock().now().to_msg()
+    rig = TransformStamped(child_frame_id="rig")
+    rig.header.frame_id, rig.header.stamp = "robot", now
+    publish(TFMessage(transforms=[rig]), "/tf")
+    cloud = make_cloud(np.random.default_rng(0).normal(size=(1000, 3)), frame="nowhere")
+    cloud.header.stamp = now
+    client.send_request(id="nowhere", source=GraspRequest.CLOUD, cloud=cloud)
+    cloud.header.frame_id = "rig"
+    cloud.header.stamp = Time(sec=now.sec - 3, nanosec=now.nanosec)
+    client.send_request(id="too-early", source=GraspRequest.CLOUD, cloud=cloud)
+    for request_id, culprit in (("nowhere", "'nowhere'"), ("too-early", "rig in robot is known from")):
+        answer = client.answer(request_id, 10.0)
+        assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_TRANSFORM")
+        assert culprit in answer.message
+        assert answer.grasps == []
+    client.set_parameters(output_frame="")
+    client.send_request(id="next", **SPHERE)
+    assert client.answer("next", RESULT_TIMEOUT).status == GraspArray.SUCCEEDED
+
+
+def test_a_client_killed_amid_its_goal_leaves_the_node_serving(client, node, start_process):
+    doomed, told = start_process("-c", DOOMED)
+    heard = lambda: {"asked for the result", "optimise"} <= set(told.read_text().splitlines())  # noqa: E731
+    client.spin_until(heard, 20.0, "feedback in the other process")
+    assert not client.answers
+    doomed.send_signal(signal.SIGKILL)
+    assert doomed.wait(10.0) == -signal.SIGKILL
+    # Nobody waits for it any more; it ends at its deadline, and a goal that waits behind it is served.
+    actions = ActionClient(client.node, SynthesizeGrasps, "/graspd/synthesize")
+    client.spin_until(actions.server_is_ready, 10.0, "action server")
+    sent = actions.send_goal_async(SynthesizeGrasps.Goal(request=GraspRequest(id="heir", **SPHERE, **ONE)))
+    handle = client.spin_until(lambda: sent.done() and sent.result(), 10.0, "answer to a goal")
+    asked = handle.get_result_async()
+    orphan = client.answer("orphan", 20.0)
+    assert orphan.error_code == "DEADLINE"
+    ended = client.spin_until(lambda: asked.done() and asked.result(), RESULT_TIMEOUT, "result")
+    assert ended.result.result.status == GraspArray.SUCCEEDED
+    assert node.alive()
+    actions.destroy()
+
+
+def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_node, publish, make_cloud):
+    process = start_node(use_sim_time=True, **ONE)
+    health: list[DiagnosticArray] = []
+    subscription = client.node.create_subscription(DiagnosticArray, "/diagnostics", health.append, 10)
+
+    def set_time(stamp: int) -> None:
+        publish(Clock(clock=Time(sec=stamp // SECOND)), "/clock")
+        client.spin_until(lambda: health and health[-1].header.stamp.sec == stamp // SECOND, 10.0, "the node's time")
+
+    directions = np.random.default_rng(0).normal(size=(8000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    cloud = make_cloud(np.array([0.0, 0.0, 0.5]) + 0.035 * directions[directions[:, 2] < 0])
+    cloud.header.stamp = Time(sec=START // SECOND)
+    set_time(START + SECOND)
+    client.send_cloud(cloud)
+    result = client.event(RESULT_TIMEOUT, event="result")  # though the clock stands still meanwhile
+    answer = client.answer(result["request"], 5.0)
+    assert (answer.status, answer.header) == (GraspArray.SUCCEEDED, cloud.header), answer.message
+    set_time(START + 10 * SECOND)
+    client.send_request(id="late", source=GraspRequest.LATEST_CLOUD)
+    late = client.answer("late", 10.0)
+    assert (late.status, late.error_code) == (GraspArray.REFUSED, "STALE_CLOUD")
+    assert "is 10.0 s old" in late.message
+    client.node.destroy_subscription(subscription)
+    assert process.alive()
