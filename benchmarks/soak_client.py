@@ -48,6 +48,7 @@ class Client:
         self.answers: dict[str, list[GraspArray]] = defaultdict(list)
         self.stages: dict[str, list[str]] = defaultdict(list)
         self.waits: dict[str, list[float]] = defaultdict(list)
+        self.timeouts = 0
         deep = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/graspd/status", self._on_status, 1000)
         self.node.create_subscription(GraspArray, "/graspd/grasps", self._on_answer, deep)
@@ -80,11 +81,12 @@ class Client:
             self._pinged, self._ping = now, self._parameters.call_async(GetParameters.Request(names=["seed"]))
 
     def wait(self, condition: Callable[[], Any], what: str) -> float:
-        """Spin until the condition holds; how long that took."""
+        """Spin until the condition holds; how long that took. What does not come counts among the timeouts."""
         begun = time.monotonic()
         while not condition():
             if time.monotonic() > begun + TIMEOUT:
                 print(f"soak: waited {TIMEOUT:.0f} s for {what}", file=sys.stderr)
+                self.timeouts += 1
                 break
             self.spin()
         return time.monotonic() - begun
@@ -111,6 +113,7 @@ class Client:
             "requests": len(self.sent),
             "lost": sum(not self.answers[name] for name in self.sent),
             "twice": sum(len(self.answers[name]) > 1 for name in self.sent),
+            "timeouts": self.timeouts,
             "statuses": dict(Counter(STATUSES[answer.status] for answer in answers)),
             "codes": dict(Counter(answer.error_code for answer in answers if answer.error_code)),
             "waits": dict(self.waits),
@@ -145,7 +148,9 @@ class Client:
         request = GraspRequest(id=name, source=GraspRequest.MESH, mesh_uri="box.obj", preset="fast", num_grasps=4)
         sent = self._goals.send_goal_async(SynthesizeGrasps.Goal(request=request))
         self.wait(sent.done, "a goal to be accepted")
-        handle: ClientGoalHandle = sent.result()  # pyright: ignore[reportAssignmentType]
+        handle: ClientGoalHandle | None = sent.result()
+        if handle is None:
+            return
         result = handle.get_result_async()
         self.wait(result.done, "a goal's result")
         self.answered(name)

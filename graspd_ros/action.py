@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
-from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
+from rclpy.action.server import ActionServer, CancelResponse, RCLError, ServerGoalHandle
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -49,9 +49,11 @@ class GoalServer:
         key = bytes(handle.goal_id.uuid)
         goal = Goal(self._node, handle, on_end=lambda: self._ids.pop(key, None))
         self._ids[key] = ""
-        request_id = self._submit(handle.request.request, goal)
-        if key in self._ids:  # a goal that was refused has ended already
-            self._ids[key] = request_id
+        self._ids[key] = self._submit(handle.request.request, goal)
+
+    def idle(self) -> bool:
+        """Whether every goal has got its end."""
+        return not self._ids
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         request_id = self._ids.get(bytes(handle.goal_id.uuid))
@@ -77,7 +79,6 @@ class Goal:
     def ended(self, message: GraspArray) -> None:
         """The goal's end, and its result."""
         self._begin()
-        self._on_end()
         self._answer.set_result(message)
         if self._node.executor is not None:
             self._node.executor.wake()  # it looks at the future only when something happens
@@ -85,16 +86,22 @@ class Goal:
     def _begin(self) -> None:
         if not self._begun:
             self._begun = True
-            self._handle.execute(self._conclude)
+            try:
+                self._handle.execute(self._conclude)
+            except RCLError:  # its client cancelled it after rclpy had looked for that: the second look finds it
+                self._handle.execute(self._conclude)
 
     async def _conclude(self, handle: ServerGoalHandle) -> SynthesizeGrasps.Result:
         message: GraspArray = await self._answer  # pyright: ignore[reportAssignmentType]
-        if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
-            handle.succeed()
-        elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
-            handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
-        else:
-            handle.abort()
+        try:
+            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+                handle.succeed()
+            elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
+                handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
+            else:
+                handle.abort()
+        finally:
+            self._on_end()
         return SynthesizeGrasps.Result(result=message)
 
 

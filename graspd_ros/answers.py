@@ -51,7 +51,7 @@ class Answers:
         self._superseded_told = self._complained = -float("inf")
 
     def forget(self) -> None:
-        """As after a start: no counts, and late joiners get nothing from before now."""
+        """As after a start: no counts, and late joiners get nothing from before now but the last answer."""
         self.outlets.publish(result_markers((), self._hand, "", self._now()))
         self.outlets.forget()
         self.tally.clear()
@@ -64,7 +64,7 @@ class Answers:
             code, message = _REFUSALS[admission.refusal], admission.reason
             self.outlets.tell("refused", request.id, request.source, code=code, message=message)
             self._log().warning(f"{request.id}: refused: {message}")
-            self._answer(request, messages.Ending(GraspArray.REFUSED, code, message))
+            self._publish(self._answer(request, messages.Ending(GraspArray.REFUSED, code, message)), request.listener)
         elif not request.only_newest:
             self._accepted(request, admission.ahead)
 
@@ -119,13 +119,16 @@ class Answers:
         try:
             self._finished(request, report)
         except Exception as error:  # whatever is wrong with a result, its client is not left waiting
-            self._finished(request, Report(Ending.FAILED, error=error))
+            try:
+                self._finished(request, Report(Ending.FAILED, error=error))
+            except Exception as again:  # and the worker's thread goes on
+                self._log().error(f"{request.id}: not answered:\n{''.join(traceback.format_exception(again))}")
 
     def _finished(self, request: Request, report: Report[Planned]) -> None:
         if report.error is not None:
             self.tell_error(request.id, request.source, report.error)
             code, message = code_of(report.error), sentence_of(report.error)
-            self._answer(request, messages.Ending(GraspArray.FAILED, code, message))
+            self._publish(self._answer(request, messages.Ending(GraspArray.FAILED, code, message)), request.listener)
         elif report.ending is Ending.DONE and report.value is not None:
             self._result(request, report.value)
         elif report.ending is Ending.SUPERSEDED and request.only_newest and report.value is None:
@@ -134,37 +137,44 @@ class Answers:
             if time.monotonic() - self._superseded_told >= COUNT_PERIOD:
                 self._tell_superseded(request.id)
         else:
-            self.outlets.tell(report.ending.value, request.id, request.source)
             found = report.value.result if report.value else None
-            self._answer(request, dataclasses.replace(_ENDINGS[report.ending], result=found))
+            answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], result=found))
+            self.outlets.tell(report.ending.value, request.id, request.source)
+            self._publish(answer, request.listener)
 
     def _result(self, request: Request, planned: Planned) -> None:
         result, hand = planned.result, self._hand
+        # Everything is made before anything is published: a result that cannot be told is an error as a whole.
+        answer = self._answer(request, messages.ending_of(result))
+        event = convert.result_event(result)
+        shown = []
         best = convert.presentable(result)
         if best is not None:
-            joints = convert.joint_message(best.grasp, hand.joint_names, hand.base_link, request.stamp)
-            self.outlets.publish(joints)
-            self.outlets.publish(convert.pose_message(best, request.frame_out, request.stamp))
-        if request.settings.publish_markers:
-            self.outlets.publish(result_markers(result.grasps, hand, request.frame_out, request.stamp))
-        event = convert.result_event(result)
+            shown.append(convert.joint_message(best.grasp, hand.joint_names, hand.base_link, request.stamp))
+            shown.append(convert.pose_message(best, request.frame_out, request.stamp))
+        if request.settings.publish_markers and planned.worked_on:
+            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp))
+        for message in shown:
+            self.outlets.publish(message)
         self.outlets.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
         self._log().info(f"{request.id}: {event['verified']} of {event['grasps']} verified: {event['message']}")
         self.tally.planned(result, request.elapsed())
-        self._answer(request, messages.ending_of(result))
+        self._publish(answer, request.listener)
 
-    def _answer(self, request: Request, ending: messages.Ending) -> None:
+    def _answer(self, request: Request, ending: messages.Ending) -> GraspArray:
         settings = request.settings
         pace = Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
-        message = messages.array_message(ending, request.id, header, request.elapsed(), self._hand, pace)
-        self._publish(message, request.listener)
+        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, pace)
 
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
         self.tally.answered(message)
         self.outlets.publish(message)
         if listener is not None:
-            listener.ended(message)
+            try:
+                listener.ended(message)
+            except Exception as error:  # the answer is out: it must not be followed by another
+                self._log().error(f"{message.request_id}: {''.join(traceback.format_exception(error))}")
 
     # Events.
 

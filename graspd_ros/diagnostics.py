@@ -66,7 +66,7 @@ def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
     Args:
         health: what the node knows.
         stamp: now.
-        memory: resident memory of the process [bytes].
+        memory: resident memory of the process and its children [bytes].
     """
     level, message = _verdict(health)
     status = DiagnosticStatus(
@@ -79,13 +79,26 @@ def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
     return DiagnosticArray(header=Header(stamp=stamp), status=[status])
 
 
-def resident_memory() -> int:
-    """Memory of this process that is in RAM [bytes]; 0 where the system does not tell."""
+def resident_memory(pid: int | None = None) -> int:
+    """Memory of a process (this one) and its children that is in RAM [bytes]; 0 where the system does not tell.
+
+    What they share counts for each.
+    """
+    process = Path("/proc", str(pid or os.getpid()))
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        pages = int((process / "statm").read_text().split()[1])
+        tasks = list((process / "task").iterdir())
     except OSError:
         return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
+    children = [int(child) for task in tasks for child in _words(task / "children")]
+    return pages * os.sysconf("SC_PAGE_SIZE") + sum(map(resident_memory, children))
+
+
+def _words(file: Path) -> list[str]:
+    try:
+        return file.read_text().split()
+    except OSError:  # of a thread that has ended meanwhile
+        return []
 
 
 def _verdict(health: Health) -> tuple[bytes, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -43,10 +44,11 @@ class Intake:
         self._now = now
         self._lookup = lookup
         self._numbers = itertools.count(1)
+        self._started = time.strftime("%Y%m%dT%H%M%S")
 
     def new_id(self, kind: str) -> str:
-        """A name that no request of this node had before."""
-        return f"{kind}-{next(self._numbers)}"
+        """A name that no request had before, not before a restart either: files are called by it."""
+        return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
         """Drop the newest sighting and the views."""

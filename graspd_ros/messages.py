@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Vector3
 from graspd_msgs.msg import Contact as ContactMessage
@@ -64,7 +65,7 @@ def ending_of(result: GraspResult) -> Ending:
 def array_message(
     ending: Ending, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
-    """The one answer to a request; `elapsed` seconds after it came."""
+    """The one answer to a request; `elapsed` seconds after it came. Raises FloatingPointError: a grasp holds a NaN."""
     message = GraspArray(
         header=header,
         request_id=request_id,
@@ -86,7 +87,8 @@ def array_message(
 def grasp_message(
     grasp: Grasp, rank: int, request_id: str, header: Header, hand: HandModel, pace: Pace
 ) -> GraspMessage:
-    """One grasp, in the frame that the header names."""
+    """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN."""
+    _check_finite(grasp, rank)
     joints = [
         convert.joint_message(posture, hand.joint_names, hand.base_link, header.stamp)
         for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze)
@@ -153,6 +155,19 @@ def sentence(progress: Progress) -> str:
             return f"trying grasps: {steps}, {progress.verified} hold"
         case _:
             return f"done: {progress.verified} hold"
+
+
+def _check_finite(grasp: Grasp, rank: int) -> None:
+    postures = {"pregrasp": grasp.pregrasp, "grasp": grasp.grasp, "squeeze": grasp.squeeze}
+    parts = {
+        f"{name}'s {part}": getattr(posture, part)
+        for name, posture in postures.items()
+        for part in ("position", "quaternion_wxyz", "joint_positions")
+    }
+    parts |= {f"contact of {c.link}": [*c.position, *c.normal] for c in grasp.contacts}
+    wrong = [name for name, values in parts.items() if not np.isfinite(values).all()]
+    if wrong:
+        raise FloatingPointError(f"grasp {rank}: not finite: {', '.join(wrong)}")
 
 
 def _contact(contact: Contact) -> ContactMessage:

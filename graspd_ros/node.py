@@ -20,8 +20,9 @@ EXIT_BAD_INPUT = 2
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until a signal; 0 when stopped, 1 when it cannot go on, 2 for a bad parameter."""
-    _on_signal(lambda: os._exit(EXIT_STOPPED))  # nothing is open yet, and an import cannot be ended otherwise
+    """Run the node until a signal; 0 when stopped, 1 when it cannot go on, 2 for a bad argument or parameter."""
+    # Nothing has been promised to anybody yet, and neither an import nor reading a hand can be ended otherwise.
+    _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
     import rclpy
@@ -34,25 +35,33 @@ def main(args: list[str] | None = None) -> int:
     from graspd_ros.service import GraspNode
 
     wake, failed = threading.Event(), threading.Event()
-    _on_signal(wake.set)
 
     def fail() -> None:
         failed.set()
         wake.set()
 
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # what rcl says of arguments that it cannot read, over several lines
+        sys.stderr.write(f"graspd_node: {' '.join(str(error).split())}\n")
+        return EXIT_BAD_INPUT
     try:
         node = GraspNode(on_failure=fail)
     except (GraspdError, ParameterException) as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         try_shutdown()
         return EXIT_BAD_INPUT
+    _on_signal(wake.set)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
 
     def spin() -> None:
         try:
             executor.spin()
+        except Exception:
+            if not wake.is_set():
+                raise
+            # The context was shut down, under a callback perhaps, to end this.
         finally:
             if not wake.is_set():
                 fail()
@@ -61,10 +70,11 @@ def main(args: list[str] | None = None) -> int:
     spinner.start()
     wake.wait()
     ended = node.close(STOP_TIMEOUT)
-    executor.shutdown(timeout_sec=0.5)
-    spinner.join(0.5)
-    node.destroy_node()
+    # In this order: shutting the executor down takes what it waits with from under it.
     try_shutdown()
+    spinner.join(0.5)
+    executor.shutdown(timeout_sec=0.5)
+    node.destroy_node()
     status = EXIT_FAILED if failed.is_set() else EXIT_STOPPED
     if not ended:
         # A worker deep in a library call would abort the interpreter's teardown; there is nothing left to save.

@@ -16,13 +16,13 @@ from visualization_msgs.msg import MarkerArray
 
 from graspd_ros import convert
 
-# Late joiners get the last of these.
-LATCHED = {
+SHOWN = {
     JointState: "~/joint_states",
     PoseStamped: "~/grasp_pose",
-    GraspArray: "~/grasps",
     MarkerArray: "~/markers",
 }
+# Late joiners get the last of these.
+LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 
 class Outlets:
@@ -36,16 +36,15 @@ class Outlets:
             String: node.create_publisher(String, "~/status", 50),
             GraspProgress: node.create_publisher(GraspProgress, "~/progress", 50),
         }
-        self._create_latched()
+        self._publishers |= {kind: self._latched(kind) for kind in LATCHED}
 
-    def _create_latched(self) -> None:
-        for kind, topic in LATCHED.items():
-            self._publishers[kind] = self._node.create_publisher(
-                kind,
-                topic,
-                QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+    def _latched(self, kind: type) -> Any:
+        return self._node.create_publisher(
+            kind,
+            LATCHED[kind],
+            QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
     def publish(self, message: Any) -> None:
         """Publish on the topic of the message's type; nothing after `close`."""
@@ -60,11 +59,14 @@ class Outlets:
         self.publish(String(data=convert.status_line(line)))
 
     def forget(self) -> None:
-        """Late joiners get nothing from before now."""
+        """Late joiners get none of the poses, joint values and markers from before now.
+
+        Answers stay: a new publisher has to be found by its readers first, and those that follow at once were lost.
+        """
         with self._lock:
-            for kind in LATCHED:
+            for kind in SHOWN:
                 self._node.destroy_publisher(self._publishers[kind])
-            self._create_latched()
+                self._publishers[kind] = self._latched(kind)
 
     def close(self) -> None:
         """Publish no more."""

@@ -31,10 +31,11 @@ Lookup = Callable[[str, str, Time, StopHook], np.ndarray]
 
 @dataclass(frozen=True)
 class Planned:
-    """A run's result in the frame it is told in, and where it was written, if it was."""
+    """A result in the frame it is told in, where it was written, if it was, and whether there was a run at all."""
 
     result: GraspResult
     file: str = ""
+    worked_on: bool = True
 
 
 class Planner:
@@ -52,14 +53,15 @@ class Planner:
 
     def plan(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
         """Work off one request. Raises what reading, planning and /tf raise."""
-        left = threading.Event()
+        left, telling = threading.Event(), threading.Lock()
 
         def over() -> bool:
             return stop() or request.time_left() <= -PATIENCE
 
         def tell_if_wanted(progress: Progress) -> None:
-            if not left.is_set():
-                tell(progress)
+            with telling:  # nothing is told of a request once this has returned
+                if not left.is_set():
+                    tell(progress)
 
         tell(Progress(Stage.LOAD, 0, 1, 0.0, 0, 0.0))
         if self._behind and not self._behind.wait(over):
@@ -72,7 +74,8 @@ class Planner:
         while not work.wait(over):
             end = end or time.monotonic() + PATIENCE
             if time.monotonic() > end:
-                left.set()
+                with telling:
+                    left.set()
                 return _empty(request, stop)
         self._behind = None
         return work.result()
@@ -153,7 +156,7 @@ def _empty(request: Request, stop: StopHook) -> Planned:
 
 def overdue() -> Report[Planned]:
     """The end of a request whose deadline passed before its turn came."""
-    return Report(Ending.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, "")))
+    return Report(Ending.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, ""), worked_on=False))
 
 
 def limited(tell: ProgressHook, rate: float, since: float = -float("inf")) -> ProgressHook:

@@ -24,6 +24,7 @@ EXIT_BAD_INPUT = 2
 
 DEPTH = 10
 SETTLE = 0.3  # seconds after a match in which the first messages could still be lost
+DELIVERY = 5.0  # seconds that reliable subscribers get to confirm the last messages, which end with their publisher
 
 
 class _Parser(argparse.ArgumentParser):
@@ -110,6 +111,7 @@ def play(
             publisher.publish(_shifted(data, kind, shift) if now else data)
             published += 1
         if not loop or stop.is_set():
+            _wait_for_delivery(publishers)
             return published
 
 
@@ -171,6 +173,14 @@ def _wait_for_subscriber(publishers: dict[str, tuple[Any, type]], timeout: float
             stop.wait(SETTLE)
             return
         stop.wait(0.02)
+
+
+def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
+    from rclpy.duration import Duration
+
+    end = time.monotonic() + DELIVERY
+    for publisher, _ in publishers.values():
+        publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
 
 def _shifted(data: bytes, kind: type, shift: int) -> Any:

@@ -8,6 +8,7 @@ from both.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -31,7 +32,7 @@ from graspd_core.pipeline import hand_names, load_hand, warm_up
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action import GoalServer
 from graspd_ros.answers import Answers
-from graspd_ros.codes import sentence_of
+from graspd_ros.codes import RequestError, sentence_of
 from graspd_ros.depth import ImagePairs
 from graspd_ros.diagnostics import health_message, resident_memory
 from graspd_ros.frames import TransformListener, wait_for_transform
@@ -43,6 +44,8 @@ from graspd_ros.sources import Sighting, cloud_sighting, depth_sighting, nanosec
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
 TRANSFORM_PATIENCE = 1.0  # seconds that the worker waits for a transform
+GOAL_PATIENCE = 0.3  # seconds that the executor has at the end to tell clients how their goals ended
+RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
 OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline passed while they waited
 # A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
 REQUEST_DEPTH = 500
@@ -99,8 +102,16 @@ class GraspNode(Node):
         self.create_service(Trigger, "~/reset_views", self._on_reset_views)
 
     def close(self, timeout: float) -> bool:
-        """Cancel everything and publish no more; True when the worker ended within `timeout` seconds."""
+        """Cancel everything and publish no more; True when the worker ended within `timeout` seconds.
+
+        The executor must still spin: goals end there.
+        """
         ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
+        if not self._goals.idle():
+            end = time.monotonic() + GOAL_PATIENCE
+            while not self._goals.idle() and time.monotonic() < end:
+                time.sleep(0.01)
+        time.sleep(RESULT_PATIENCE)
         self._answers.outlets.close()
         return ended
 
@@ -118,7 +129,10 @@ class GraspNode(Node):
         return self._take_request(message, "goal", listener)
 
     def _on_points(self, message: PointCloud2) -> None:
-        self._see(cloud_sighting(message, nanoseconds(self._now())))
+        try:
+            self._see(cloud_sighting(message, nanoseconds(self._now())))
+        except RequestError as error:  # too large to keep
+            self._answers.cloud_not_taken(self._intake.new_id("cloud"), error)
 
     def _on_image(self, message: Image) -> None:
         if pair := self._pairs.add_image(message):
@@ -232,7 +246,7 @@ class GraspNode(Node):
         torch.set_num_threads(read_settings(self).torch_threads)
         try:
             warm_up(self._hand, stop=self._worker.stopping)
-        except Exception as error:  # without this the node would stand there deaf
+        except BaseException as error:  # without this the node would stand there deaf
             self._answers.tell_error("", "node", error)
             self._on_failure()
             return

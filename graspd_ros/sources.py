@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core.pipeline import PointCloud, Scene, Target, cloud_from_depth, scene_from_views, transform_cloud
@@ -15,6 +16,7 @@ from graspd_ros.codes import ErrorCode, RequestError
 from graspd_ros.depth import frame_of
 from graspd_ros.parameters import Settings
 from graspd_ros.pointcloud import points_from_message
+from graspd_ros.requests import MOST_CLOUD_BYTES
 
 MOST_VIEWS = 64
 MOST_VIEW_POINTS = 200_000  # kept of each view: 64 views take 300 MB at most
@@ -50,7 +52,14 @@ class Sighting:
 
 
 def cloud_sighting(message: PointCloud2, arrived: int) -> Sighting:
-    """A cloud message; it is read only when it is used. The camera is taken to stand at the origin of its frame."""
+    """A cloud message; it is read only when it is used. The camera is taken to stand at the origin of its frame.
+
+    Raises:
+        RequestError: it is too large to keep.
+    """
+    if len(message.data) > MOST_CLOUD_BYTES:
+        told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
+        raise RequestError(ErrorCode.BAD_CLOUD, told)
     header = message.header
     return Sighting("cloud", header.frame_id, header.stamp, arrived, lambda: _origin_view(points_from_message(message)))
 
@@ -123,8 +132,15 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
         )
     if settings.voxel_size > 0:
         cells = np.floor(points / settings.voxel_size).astype(np.int64)
-        points = points[np.unique(cells, axis=0, return_index=True)[1]]
+        points = points[np.unique(_packed(cells), axis=0, return_index=True)[1]]
     return PointCloud(points, cloud.viewpoint, cloud.forward)
+
+
+def _packed(cells: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n ..."]:
+    """Cells in the same order as one number each, which sort seven times as fast; as they are where it has no room."""
+    cells = cells - cells.min(0)
+    sides = tuple(map(int, cells.max(0) + 1))
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), sides)) if math.prod(sides) < 2**62 else cells
 
 
 def nanoseconds(stamp: Time) -> int:

@@ -176,10 +176,10 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Id of the running request, and how many wait."""
+        """Id of the running request, and how many wait in the queue; an `only_newest` one takes no place there."""
         with self._condition:
             running = self._running.id if self._running else None
-            return running, len(self._waiting) + (self._newest is not None)
+            return running, len(self._waiting)
 
     def alive(self) -> bool:
         """Whether the thread still serves."""

@@ -17,8 +17,8 @@ from graspd_core.bags.writer import (
     transforms_message,
     write_bag,
 )
-from graspd_core.cli import main
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK, EXIT_TOO_FEW
+from graspd_core.cli import clouds, main
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.geometry.mesh import load_mesh
 from graspd_core.geometry.raycast import look_at, render_depth
@@ -69,16 +69,16 @@ def the_line(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def replayed(bags, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, list[str], Path]:
-    """Exit status, lines and results of the whole mcap recording in the world's frame."""
-    out, printed = tmp_path_factory.mktemp("replayed") / "grasps", io.StringIO()
-    with contextlib.redirect_stdout(printed):
+def replayed(bags, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, list[str], Path, str]:
+    """Exit status, lines, results and stderr of the whole mcap recording in the world's frame."""
+    out, printed, said = tmp_path_factory.mktemp("replayed") / "grasps", io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
         status = main(["replay", str(bags["mcap"]), "--frame", "world", *QUICK, "--out", str(out)])
-    return status, printed.getvalue().splitlines(), out
+    return status, printed.getvalue().splitlines(), out, said.getvalue()
 
 
 def test_every_cloud_of_a_recording_is_planned_on_in_the_frame_asked_for(replayed):
-    status, lines, out = replayed
+    status, lines, out, said = replayed
     # One of the three shows nothing: fewer than were asked for.
     assert status == EXIT_TOO_FEW
     assert len(lines) == 4
@@ -87,6 +87,8 @@ def test_every_cloud_of_a_recording_is_planned_on_in_the_frame_asked_for(replaye
     assert lines[1].startswith("cloud 1 at 1700000001.000000000 s: refused: depth image: none of its 160 x 120 pixels")
     assert lines[2].startswith("cloud 2 at 1700000002.000000000 s: ")
     assert lines[3].startswith("3 scenes: 2 with enough grasps, 0 with fewer, 1 refused; 2 grasps in ")
+    for cloud in ("cloud 0 at 1700000000.000000000 s", "cloud 2 at 1700000002.000000000 s"):
+        assert f"graspd: {cloud}: cloud: seen from one side only; the rest is guessed by " in said
     assert sorted(path.name for path in out.iterdir()) == ["cloud_000000.json", "cloud_000002.json"]
     for path in out.iterdir():
         # The box is at the world's origin, half a metre from the camera's; its unseen back is a guess.
@@ -104,13 +106,27 @@ def test_the_same_recording_gives_the_same_grasps_whatever_its_storage(replayed,
 
 def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys):
     out = tmp_path / "grasps.json"
-    fused = ["--fuse", "--every", "2", "--frame", "world"]
+    fused = ["--fuse", "--frame", "world"]
     assert main(["replay", str(bags["sqlite3"]), *fused, *QUICK, "--out", str(out)]) == EXIT_OK
-    assert capsys.readouterr().out.startswith("2 clouds fused: ")
+    printed, said = capsys.readouterr()
+    assert printed.startswith("2 clouds fused: ")
     assert np.abs(load_document(out)["object"]["center_of_mass"]).max() < 0.01
     # The empty image between the two is no view of anything.
-    assert main(["replay", str(bags["sqlite3"]), "--fuse", "--frame", "world", *QUICK]) == EXIT_BAD_INPUT
-    assert "cloud 1: depth image: none of its" in the_line(capsys)
+    assert "graspd: 1 of 3 clouds left out, the first cloud 1: depth image: none of its" in said
+    assert main(["replay", str(bags["hopeless"]), "--fuse", *QUICK]) == EXIT_BAD_INPUT
+    assert "cloud 0: the cloud has no finite point" in the_line(capsys)
+
+
+def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch):
+    monkeypatch.setattr(clouds, "MOST_VIEWS", 1)
+    assert main(["replay", str(bags["mcap"]), "--fuse", "--frame", "world", *QUICK]) == EXIT_BAD_INPUT
+    assert "more than 1 clouds to fuse; choose some with --every or --limit" in the_line(capsys)
+
+
+def test_ctrl_c_ends_a_recording_of_which_every_cloud_is_refused(bags, capsys, monkeypatch):
+    monkeypatch.setattr(Interrupt, "came", lambda self: True)
+    assert main(["replay", str(bags["hopeless"]), *QUICK]) == EXIT_INTERRUPTED
+    assert capsys.readouterr().out.startswith("0 scenes: ")
 
 
 def test_a_recording_without_any_usable_cloud_is_bad_input(bags, capsys):

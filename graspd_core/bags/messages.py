@@ -63,8 +63,9 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     shown[:2, 2] -= roi.x_offset, roi.y_offset
     shown[:2] /= bins[:, None]
     width, height = (roi.width or info.width) // bins[0], (roi.height or info.height) // bins[1]
-    distortion = [] if rectified else list(info.d)
-    return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, info.distortion_model)
+    # Once it is taken out, its model does not matter: that of a fisheye lens is not known here.
+    distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
+    return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, model)
 
 
 def depth_from_message(image: Any) -> Float[np.ndarray, "height width"]:

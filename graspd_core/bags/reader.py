@@ -5,6 +5,7 @@ The order is the recording's, so that the same bag gives the same clouds every t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.bags.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
-from graspd_core.errors import BagError
+from graspd_core.errors import BagError, TransformError
 from graspd_core.geometry.cloud import PointCloud, transform_cloud
 from graspd_core.geometry.depth import ENCODINGS
 from graspd_core.transforms import TransformBuffer
@@ -63,10 +64,12 @@ class BagFrame:
             cloud = cloud_from_message(self.message)
         else:
             # REP 118 and image_pipeline: rectified images say so in the last part of their name.
-            rectified = "rect" in self.topic.rsplit("/", 1)[-1]
+            rectified = re.search(r"(^|_)rect(_|$)", self.topic.rsplit("/", 1)[-1]) is not None
             cloud = cloud_from_depth_message(self.message, self.info, rectified=rectified)
-        if target is None or transforms is None or target.removeprefix("/") == self.frame.removeprefix("/"):
+        if target is None or target.removeprefix("/") == self.frame.removeprefix("/"):
             return cloud
+        if transforms is None:
+            raise TransformError(f"transform {self.frame} -> {target}: no transforms are given")
         # A driver that does not stamp its messages leaves zero: then the newest transform has to do.
         return transform_cloud(cloud, transforms.lookup(target, self.frame, self.stamp or None))
 
@@ -131,8 +134,7 @@ def read_frames(
             infos = [c for c in reader.connections if c.topic == info_name]
             connections += infos
             # The calibration may be recorded a moment after the first image.
-            first, _, raw = next(_messages(path, reader, infos))
-            info = _decode(path, reader, first, raw)
+            info = _first(path, reader, info_name)
         index = taken = 0
         for connection, _, raw in _messages(path, reader, connections):
             if connection.msgtype == INFO:
@@ -252,9 +254,15 @@ def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
 
 
 def _is_depth(path: str | Path, reader: Any, topic: BagTopic) -> bool:
-    connections = [c for c in reader.connections if c.topic == topic.name]
-    connection, _, raw = next(_messages(path, reader, connections))
-    return _decode(path, reader, connection, raw).encoding in ENCODINGS
+    return _first(path, reader, topic.name).encoding in ENCODINGS
+
+
+def _first(path: str | Path, reader: Any, topic: str) -> Any:
+    """The first message of a topic that the recording says has some."""
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection, _, raw in _messages(path, reader, connections):
+        return _decode(path, reader, connection, raw)
+    raise BagError(f"{path}: its metadata counts messages on {topic}, but its storage has none")
 
 
 def _info_topic(path: str | Path, reader: Any, image: str, name: str | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import numpy as np
 from graspd_core.bags.reader import BagFrame, is_bag, read_frames, read_transforms
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.geometry.cloud import PointCloud
+
+# Views that are fused unasked: all are held in memory at once.
+MOST_VIEWS = 100
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
@@ -70,17 +74,26 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
 
 
 def fused_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """The chosen clouds as views of one scene.
+    """The chosen clouds as views of one scene, less those that cannot be used, which stderr counts.
 
     Raises:
-        BagError: nothing can be read, one cannot be used, or they are not in one frame.
+        BagError: nothing can be read, none can be used, they are not in one frame, or they are too many and no limit
+            is set.
     """
-    views, names = [], set()
+    views, names, refusals = [], set(), []
     for frame, seen in bag_views(path, options):
         if isinstance(seen, str):
-            raise BagError(f"{path}: cloud {frame.index}: {seen}")
+            refusals.append(f"cloud {frame.index}: {seen}")
+            continue
+        if len(views) == MOST_VIEWS and options.limit is None:
+            raise BagError(f"{path}: more than {MOST_VIEWS} clouds to fuse; choose some with --every or --limit")
         views.append(seen)
         names.add(options.frame or frame.frame)
+    if refusals and not views:
+        raise BagError(f"{path}: {refusals[0]}")
+    if refusals:
+        count = len(views) + len(refusals)
+        print(f"graspd: {len(refusals)} of {count} clouds left out, the first {refusals[0]}", file=sys.stderr)
     if len(names) > 1:
         raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
     return tuple(views)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -59,9 +60,12 @@ def run(options: argparse.Namespace) -> int:
     if options.out:
         check_writable(options.out if single else options.out / "probe")
     hand = load_hand(options.hand, candidates=config.closed_form.fine_candidates)
-    began, statuses, grasps = time.perf_counter(), [], 0
+    began, statuses, grasps, interrupted = time.perf_counter(), [], 0, False
     with Interrupt() as interrupt:
         for job in _jobs(options):
+            # Here, so that it ends a recording of which every cloud is refused, too.
+            if interrupted := interrupt.came():
+                break
             try:
                 scene = _scene_of(job, options, config.resolution)
             except GraspdError as error:
@@ -69,6 +73,8 @@ def run(options: argparse.Namespace) -> int:
                 # An empty table is an answer; a cloud that cannot be used is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
+            for warning in scene.object.warnings:
+                print(f"graspd: {job.label}: {warning}", file=sys.stderr)
             with Reporter() as reporter:
                 result = plan_grasps(scene, hand, preset=config, progress=reporter, stop=interrupt.came, **request)
             if options.out:
@@ -85,15 +91,13 @@ def run(options: argparse.Namespace) -> int:
             )
             grasps += good
             statuses.append(exit_status(result))
-            if interrupt.came():
-                break
     refused = statuses.count(EXIT_BAD_INPUT)
     print(
         f"{len(statuses)} scenes: {statuses.count(EXIT_OK)} with enough grasps, "
         f"{len(statuses) - refused - statuses.count(EXIT_OK)} with fewer, {refused} refused; "
         f"{grasps} grasps in {time.perf_counter() - began:.1f} s"
     )
-    return _status(statuses)
+    return EXIT_INTERRUPTED if interrupted else _status(statuses)
 
 
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from contextlib import suppress
 
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import CloudError
 from graspd_core.geometry.cloud import PointCloud, clean_cloud
 from graspd_core.geometry.evidence import view_frame
 from graspd_core.geometry.fuse import Surfels
@@ -15,6 +19,8 @@ LAYERED_SHARE = 0.15
 
 # Neighbours for a normal, and for passing its sense on.
 FITTED, PASSED = 24, 16
+# Points that are too regular for that are moved by up to this many steps.
+JITTER = 0.02
 
 
 def is_all_round(view: PointCloud) -> bool:
@@ -37,10 +43,27 @@ def is_all_round(view: PointCloud) -> bool:
 
 
 def orient_all_round(view: PointCloud, step: float) -> Surfels:
-    """Points of an all-round cloud, `step` [m] apart, with normals that agree with their neighbours'."""
+    """Points of an all-round cloud, `step` [m] apart, with normals that agree with their neighbours'.
+
+    Raises:
+        CloudError: no surface passes through them.
+    """
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points)).voxel_down_sample(step)
+    points = np.asarray(cloud.points)
+    # The triangulation that passes the sense on fails on points exactly on a sphere, a plane or a line.
+    shaken = points + JITTER * step * np.random.default_rng(0).uniform(-1, 1, points.shape)
+    for tried in (points, shaken):
+        with suppress(RuntimeError):
+            return Surfels(points, _normals(tried))
+    raise CloudError(f"cloud: no surface passes through its {len(points)} points; views with their cameras are needed")
+
+
+def _normals(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FITTED))
     cloud.orient_normals_consistent_tangent_plane(PASSED)
-    return Surfels(np.asarray(cloud.points), np.asarray(cloud.normals))
+    return np.asarray(cloud.normals)

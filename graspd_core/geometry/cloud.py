@@ -11,6 +11,8 @@ from graspd_core.errors import CloudError
 
 FEWEST_POINTS = 50
 MOST_POINTS = 20_000
+# Points this many times the cloud's size away from its middle are no part of it.
+FARTHEST = 1e3
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,17 @@ def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "
     if len(finite) == 0:
         raise CloudError(f"cloud: all {len(points)} points are NaN or infinite")
     _refuse_few(len(finite), len(points), "finite")
-    spread = np.percentile(finite, 98, axis=0) - np.percentile(finite, 2, axis=0)
-    size = float(np.linalg.norm(spread))
+    # Numbers near the largest there are add up to infinity.
+    with np.errstate(over="ignore", invalid="ignore"):
+        spread = np.percentile(finite, 98, axis=0) - np.percentile(finite, 2, axis=0)
+        size = float(np.linalg.norm(spread))
+        near = np.abs(finite - np.median(finite, axis=0)).max(1) <= FARTHEST * size
     if size <= 0:
         raise CloudError(f"cloud: all {len(finite)} points are in one place")
+    if not np.isfinite(size):
+        raise CloudError(f"cloud: its {len(finite)} points lie too far apart to measure")
+    finite = finite[near] if not near.all() else finite
+    _refuse_few(len(finite), len(points), "plausible")
     # A hundredth of the object's diagonal: fine enough for the shape, and at most some 10⁴ points on its surface.
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(finite))
     thinned = cloud.voxel_down_sample(size / 100)

@@ -29,22 +29,11 @@ def is_cloud_file(path: str | Path) -> bool:
     return ending in CLOUD_ENDINGS
 
 
-def load_cloud(path: str | Path) -> PointCloud:
-    """Read a file that holds one view; see `load_views`.
-
-    Raises:
-        CloudError: as `load_views`, or the file holds several views.
-    """
-    view, *others = load_views(path)
-    if others:
-        raise CloudError(f"{path}: holds {1 + len(others)} views; one is needed here")
-    return view
-
-
 def load_views(path: str | Path) -> tuple[PointCloud, ...]:
     """Read what one or several cameras saw, in one frame.
 
-    * ply, pcd, xyz; npy (n×3 or h×w×3): points [m], seen from the origin.
+    * ply, xyz; npy (n×3 or h×w×3): points [m], seen from the origin.
+    * pcd: points [m], seen from where its `VIEWPOINT` stands; which way that looked, the format leaves open.
     * npz with `points`, and where known `viewpoint` [m] and `forward` (the direction of the optical axis).
     * npz with `depth` (h×w; integers are millimetres, floats metres) and the camera's matrix `K` (3×3), where known
       also `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
@@ -62,7 +51,7 @@ def load_views(path: str | Path) -> tuple[PointCloud, ...]:
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
     if ending not in ("npy", "npz"):
-        return (PointCloud(_read_open3d(path), np.zeros(3)),)
+        return (PointCloud(_read_open3d(path), _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)),)
     arrays = _read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
@@ -85,9 +74,11 @@ def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
         points = points.reshape(-1, 3)
     if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):
         raise CloudError(f"shape {points.shape}, viewpoint {viewpoint.shape}; points × 3 and 3 are needed")
+    if not np.isfinite(viewpoint).all():
+        raise CloudError("'viewpoint' is NaN or infinite")
     if forward is not None:
-        if forward.shape != (3,) or not np.linalg.norm(forward) > 0:
-            raise CloudError("'forward' is no direction; 3 numbers are needed, not all zero")
+        if forward.shape != (3,) or not 0 < np.linalg.norm(forward) < np.inf:
+            raise CloudError("'forward' is no direction; 3 finite numbers are needed, not all zero")
         forward = forward / np.linalg.norm(forward)
     return PointCloud(points, viewpoint, forward)
 
@@ -164,6 +155,20 @@ def _ply_has_faces(path: Path) -> bool:
         header = file.read(4096).split(b"end_header")[0]
     faces = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
     return any(len(words) > 2 and words[2] != b"0" for words in faces)
+
+
+def _pcd_viewpoint(path: Path) -> Float[np.ndarray, "3"]:
+    """Where the sensor stood, by the header; the origin where it does not say."""
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"\nDATA")[0]
+    line = next((line.split()[1:4] for line in header.splitlines() if line.startswith(b"VIEWPOINT")), [b"0"] * 3)
+    try:
+        place = np.array([float(word) for word in line])
+    except ValueError:
+        place = np.zeros(0)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise CloudError(f"{path}: its VIEWPOINT is not 3 finite numbers and a quaternion")
+    return place
 
 
 def _read_open3d(path: Path) -> np.ndarray:

@@ -83,8 +83,7 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     answer = np.full(len(label), -1)
     known = label >= 0
     count = np.bincount(label[known])
-    order = np.argsort(-count, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    answer[known] = rank[label[known]]
+    rank = np.zeros(len(count), dtype=int)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
+    answer[known] = np.take(rank, label[known])
     return answer

@@ -6,15 +6,19 @@ the outline, contradicts the camera; one behind it is hidden, and may be.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_core.geometry.cloud import PointCloud
+from graspd_core.geometry.directions import perpendicular
 
 # Depth images of more cells than this across the object tell no more.
 MOST_CELLS = 160
+# Points, itself among them, that a point's spacing is taken from.
+SPACED = 5
 
 # Outlines and surfaces are seen to within the first [m]; a point the second deeper in empty space is impossible.
 SLACK, CONTRADICTION = 0.003, 0.01
@@ -60,17 +64,29 @@ class Evidence:
     lowest: float = 0.0
 
 
-def make_sight(view: PointCloud) -> Sight:
-    """The depth image that a view's points make; holes of a few cells are missing pixels, not the object's."""
+def make_sights(views: Sequence[PointCloud]) -> tuple[Sight, ...]:
+    """The depth images that views' points make, of those that make any."""
+    return tuple(sight for view in views if (sight := _make_sight(view)) is not None)
+
+
+def _make_sight(view: PointCloud) -> Sight | None:
+    """The depth image that a view's points make; holes of a few cells are missing pixels, not the object's.
+
+    None where they make none: fewer than five before the camera, or all in one line of sight.
+    """
     from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
     from scipy.spatial import KDTree
 
     frame = view_frame(view)
     local = (view.points - view.viewpoint) @ frame
     local = local[local[:, 2] > 1e-3]
+    if len(local) < SPACED:
+        return None
     plane = local[:, :2] / local[:, 2:]
-    spacing = float(np.median(KDTree(plane).query(plane, k=5)[0][:, -1]))
+    spacing = float(np.median(KDTree(plane).query(plane, k=SPACED)[0][:, -1]))
     cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MOST_CELLS)
+    if cell < 1e-9:
+        return None
     margin = 6
     low = plane.min(0) - margin * cell
     index = tuple(np.floor((plane - low) / cell).astype(int).T)
@@ -156,6 +172,5 @@ def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:
     forward = view.points.mean(0) - view.viewpoint
     length = float(np.linalg.norm(forward))
     forward = forward / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    right /= np.linalg.norm(right)
+    right = perpendicular(forward)
     return np.column_stack([right, np.cross(forward, right), forward])

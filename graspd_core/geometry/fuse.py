@@ -1,7 +1,11 @@
-"""Several views become one set of oriented points, or, from depth images, one surface by truncated signed distances.
+"""Several views become one set of oriented points.
 
 Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours, and its
 normal turned to the camera that saw it. Both keep thin walls apart, which no orientation by neighbourhood does.
+
+Points and not truncated signed distances (Curless and Levoy 1996), because those wear thin walls and edges away: of 15
+rendered views, Open3D's on a grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of
+0.92, in 0.30 s instead of 0.53.
 """
 
 from __future__ import annotations
@@ -13,15 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError
-from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.geometry.cloud import FEWEST_POINTS, PointCloud
+from graspd_core.geometry.directions import perpendicular
 
 # Points that a local plane is fitted to.
 NEIGHBOURS = 28
 # Points farther than this from their neighbours' plane [m], or seen flatter than this cosine, flew off an edge.
 STRAY, GRAZING = 0.006, 0.1
-# Side of a voxel of fused depth images [m], and how many of them signed distances are kept to either side.
-VOXEL, TRUNCATED = 0.002, 4.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,10 @@ def merge_views(views: Sequence[PointCloud], step: float | None = None) -> Surfe
     step = point_step(views) if step is None else step
     together = join(*(orient_view(view, step) for view in views))
     if len(together.points) < FEWEST_POINTS:
-        raise CloudError(f"cloud: only {len(together.points)} of its points lie on a surface; at least {FEWEST_POINTS}")
+        raise CloudError(
+            f"cloud: only {len(together.points)} of its {sum(len(view.points) for view in views)} points lie on a "
+            f"surface; at least {FEWEST_POINTS} are needed: it is too sparse, or shows no surface"
+        )
     return thin(together, step) if len(views) > 1 else together
 
 
@@ -116,70 +121,13 @@ def thin(surfels: Surfels, step: float) -> Surfels:
     return Surfels(mean(surfels.points), normals)
 
 
-def fuse_depth(
-    depths: Sequence[Float[np.ndarray, "height width"]],
-    camera: PinholeCamera,
-    poses: Sequence[Float[np.ndarray, "4 4"]],
-    *,
-    voxel: float = VOXEL,
-) -> Surfels:
-    """The surface that depth images [m] agree on, by truncated signed distances (Curless and Levoy 1996; Open3D).
-
-    For streams of many frames: its cost per frame is small and its memory does not grow with them. Of 15 rendered views
-    it took half the time of `merge_views`, 0.3 s of 0.5, and gave a less exact surface, because it wears thin walls and
-    edges away: 0.8 mm mean distance to the truth instead of 0.5 after reconstruction.
-
-    Args:
-        depths: of the object alone; 0 elsewhere.
-        camera: without distortion.
-        poses: `T_world_camera` of each.
-        voxel: side of a cell [m].
-
-    Raises:
-        CloudError: a distorted camera, images and poses of different number, or too few points.
-    """
-    import open3d as o3d
-
-    if len(depths) != len(poses):
-        raise CloudError(f"fusion: {len(depths)} depth images but {len(poses)} poses; one each is needed")
-    if not any(np.any(depth > 0) for depth in depths):
-        raise CloudError(f"fusion: none of the {len(depths)} depth images has any depth")
-    if camera.distortion:
-        raise CloudError("fusion: the camera has lens distortion; rectified depth images are needed")
-    tensor = o3d.core.Tensor.from_numpy
-    grid = o3d.t.geometry.VoxelBlockGrid(
-        attr_names=("tsdf", "weight"),
-        attr_dtypes=(o3d.core.float32, o3d.core.float32),
-        attr_channels=(o3d.core.SizeVector([1]), o3d.core.SizeVector([1])),
-        voxel_size=voxel,
-        block_resolution=8,
-        block_count=4000,
-    )
-    intrinsics = tensor(np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]))
-    for depth, pose in zip(depths, poses, strict=True):
-        finite = np.where(np.isfinite(depth), depth, 0.0)
-        if not finite.any():
-            continue
-        image = o3d.t.geometry.Image(tensor(np.ascontiguousarray(finite[..., None], dtype=np.float32)))
-        into_camera, far = tensor(np.linalg.inv(pose)), float(finite.max()) + voxel
-        blocks = grid.compute_unique_block_coordinates(image, intrinsics, into_camera, 1.0, far, TRUNCATED)
-        grid.integrate(blocks, image, intrinsics, into_camera, 1.0, far, TRUNCATED)
-    # Cells that only one of several images touched are edges' flying pixels.
-    cloud = grid.extract_point_cloud(min(2.0, float(len(depths))))
-    points = cloud.point.positions.numpy().astype(float)
-    if len(points) < FEWEST_POINTS:
-        raise CloudError(f"fusion: {len(depths)} depth images give {len(points)} points; at least {FEWEST_POINTS}")
-    return Surfels(points, cloud.point.normals.numpy().astype(float))
-
-
 def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
     """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
     sight = view.points - view.viewpoint
     distance = np.linalg.norm(sight, axis=1)
     width = step / float(np.median(distance))
     axis = sight.mean(0) / np.linalg.norm(sight.mean(0))
-    right = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    right /= np.linalg.norm(right)
+    right = perpendicular(axis)
     depth = np.maximum(sight @ axis, 1e-6)
     cells = np.floor(np.column_stack([sight @ right, sight @ np.cross(axis, right)]) / depth[:, None] / width)
     _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)

@@ -67,9 +67,10 @@ def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
     _check_sizes(layout)
+    # Before the array is made: a message's numbers can ask for any amount of memory, its bytes cannot.
+    places = [_place_of(layout, name) for name in "xyz"]
     points = np.empty((height, width, 3))
-    for axis, name in enumerate("xyz"):
-        dtype, offset = _place_of(layout, name)
+    for axis, (dtype, offset) in enumerate(places):
         strides = (layout.row_step, layout.point_step)
         points[..., axis] = np.ndarray((height, width), dtype, layout.data, offset, strides)
     return points

@@ -3,6 +3,7 @@
 The back of a neighbour is not seen. Each is taken for the convex hull of its points and of their shadow on the table
 (what is seen is carried straight down), so that what lies beneath overhangs counts as full, and what hides behind the
 seen face counts only as far as the hull spans it: thin, on purpose, because a guess that bulges would block free space.
+A thing that goes round the object, whose hull would hold it, is taken in parts.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
+from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.scene import Neighbour
-from graspd_core.geometry.sdf import build_sdf
+from graspd_core.geometry.sdf import build_sdf, sample_sdf
 from graspd_core.types import Plane, TriangleMesh
 
 # Skin around what was seen [m]; it also gives a single flat face a thickness.
@@ -24,6 +27,8 @@ PADDING = 0.005
 RESOLUTION = 32
 # Fewer points than this are a stray speck, not a thing.
 FEWEST_POINTS = 10
+# Side of the parts that a thing is taken in whose hull would hold the object [m], and how many across it at most.
+PART, MOST_PARTS = 0.05, 8
 _TARGET_SAMPLES = 2000
 
 
@@ -44,9 +49,37 @@ def make_neighbours(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < FEWEST_POINTS or near.query(seen)[0].min() > reach:
             continue
-        mesh = padded_hull(seen, support)
-        found.append(Neighbour(mesh, build_sdf(mesh, resolution=RESOLUTION, padding=0.02)))
+        whole = _neighbour(seen, support)
+        if not _swallows(whole, target):
+            found.append(whole)
+            continue
+        # A tray, a box or a ring about the object: its hull is no obstacle but the object's own place.
+        parts = [part for part in _cells(seen, support) if near.query(part)[0].min() <= reach]
+        found += [_neighbour(part, support) for part in parts]
     return tuple(found)
+
+
+def _neighbour(points: Float[np.ndarray, "n 3"], support: Plane | None) -> Neighbour:
+    mesh = padded_hull(points, support)
+    return Neighbour(mesh, build_sdf(mesh, resolution=RESOLUTION, padding=0.02))
+
+
+def _swallows(neighbour: Neighbour, target: TriangleMesh) -> bool:
+    """Whether a neighbour's hull holds part of the object, more than where one leans on the other."""
+    at = torch.as_tensor(target.vertices).to(neighbour.sdf.field)
+    return bool((sample_sdf(neighbour.sdf, at)[0] < -2 * PADDING).any())
+
+
+def _cells(points: Float[np.ndarray, "n 3"], support: Plane | None) -> list[Float[np.ndarray, "_ 3"]]:
+    """The points, parted by a grid of cubes, or of columns that stand on the support."""
+    if support is None:
+        local = points
+    else:
+        right = perpendicular(support.normal)
+        local = points @ np.column_stack([right, np.cross(support.normal, right)])
+    side = max(PART, float(np.ptp(local, axis=0).max()) / MOST_PARTS)
+    _, which = np.unique(np.floor((local - local.min(0)) / side).astype(int), axis=0, return_inverse=True)
+    return [points[which.reshape(-1) == part] for part in range(which.max() + 1)]
 
 
 def padded_hull(points: Float[np.ndarray, "n 3"], support: Plane | None) -> TriangleMesh:

@@ -36,6 +36,11 @@ class OwnProcess:
                     break
                 except (EOFError, OSError):
                     self._process.join()
+                except BaseException:
+                    # Ctrl-C while waiting: the answer, left in the pipe, would be taken for the next call's.
+                    self._process.kill()
+                    self._process.join()
+                    raise
             else:
                 # Not called here instead: what killed them would kill this process.
                 raise MemoryError(f"{self._work.__name__}: the process that it is done in died twice")

@@ -16,10 +16,10 @@ from graspd_core.geometry.planes import FlatPart
 
 # Beyond so many pieces the rest is noise.
 MOST_PIECES = 40
-# What ends so many link lengths above the support has its foot hidden.
-FLOATING = 0.5
-# A piece whose foot is hidden is one with what hides it, if it is this near [m].
-HIDDEN_FOOT = 0.03
+# What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
+FLOATING, COVERED = 0.5, 0.5
+# A hanging piece, a cup's far wall or its handle, belongs to what is this near [m].
+HANGING = 0.03
 # Without a support nothing tells one thing behind another from one thing's two sides: this near, they are one [m].
 UNSUPPORTED = 0.15
 # Outlines this many link lengths apart touch in an image: pixels at edges are lost.
@@ -47,26 +47,22 @@ def join_pieces(
         viewpoints: where the cameras stood [m].
         link: distance at which points were linked [m].
         largest: pieces that would be longer than this together are not one thing [m].
-        support: what the things stand on; a piece that ends well above it has its foot hidden.
+        support: what the things stand on; pieces that end well above it hang on others.
     """
-    from scipy.spatial import KDTree
-
     many = min(int(label.max(initial=-1)) + 1, MOST_PIECES)
     pieces = [points[label == k] for k in range(many)]
-    trees = [KDTree(piece) for piece in pieces]
     small = [k for k in range(many) if extent(pieces[k]) <= largest]
-    hidden = [False] * many
-    if support is not None:
-        clear = support.height(points) - support.tolerance(distance)
-        hidden = [bool(clear[label == k].min() > FLOATING * link) for k in range(many)]
+    hangs = [
+        support is not None and _hangs(pieces[k], distance[label == k], support, viewpoints, link) for k in range(many)
+    ]
     owner = list(range(many))
     for a, b in combinations(small, 2):
-        reach = UNSUPPORTED if support is None else HIDDEN_FOOT if hidden[a] or hidden[b] else link
-        near = np.isfinite(trees[a].query(pieces[b], distance_upper_bound=reach)[0]).any()
-        if not near and (support is None or _share_within(pieces[b], pieces[a], support) < WITHIN):
-            continue
         if extent(np.vstack([pieces[a], pieces[b]])) > largest:
             continue
+        reach = UNSUPPORTED if support is None else HANGING if hangs[a] or hangs[b] else link
+        if _apart(pieces[a], pieces[b]) > reach:
+            if support is None or _share_within(pieces[b], pieces[a], support) < WITHIN:
+                continue
         if any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP * link) for eye in viewpoints):
             root, leaf = sorted((owner[a], owner[b]))
             owner = [root if k == leaf else k for k in owner]
@@ -76,16 +72,51 @@ def join_pieces(
     return renumber(joined)
 
 
+def _hangs(
+    piece: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    support: FlatPart,
+    viewpoints: Float[np.ndarray, "views 3"],
+    link: float,
+) -> bool:
+    """Whether a piece ends above the support and does not itself hide, from all cameras, what it might stand on."""
+    height = support.height(piece)
+    if (height - support.tolerance(distance)).min() <= FLOATING * link:
+        return False
+    below = piece - height[:, None] * support.plane.normal
+    for eye in viewpoints:
+        (seen, near), (foot, far) = _directions(piece, eye), _directions(below, eye)
+        apart, which = _tree(seen).query(foot)
+        if np.mean((apart * near[which] <= link) & (near[which] < far)) >= COVERED:
+            return False
+    return True
+
+
 def _touch_in_image(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"], eye: Float[np.ndarray, "3"], gap: float
 ) -> bool:
     """Whether a camera there sees less than `gap` between them, at the distance of the nearer one [m]."""
+    (one, near), (other, far) = _directions(a, eye), _directions(b, eye)
+    return _apart(one, other) <= gap / min(float(np.median(near)), float(np.median(far)))
+
+
+def _directions(
+    points: Float[np.ndarray, "n 3"], eye: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Unit vectors from a camera to points, and how far they are [m]."""
+    away = np.linalg.norm(points - eye, axis=1).clip(1e-6)
+    return (points - eye) / away[:, None], away
+
+
+def _apart(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"]) -> float:
+    """Least distance between two sets of points."""
+    return float(_tree(a).query(b)[0].min())
+
+
+def _tree(points: Float[np.ndarray, "n 3"]):
     from scipy.spatial import KDTree
 
-    ranges = [np.linalg.norm(cloud - eye, axis=1, keepdims=True).clip(1e-6) for cloud in (a, b)]
-    nearer = min(float(np.median(reach)) for reach in ranges)
-    apart, _ = KDTree((a - eye) / ranges[0]).query((b - eye) / ranges[1])
-    return float(apart.min()) <= gap / nearer
+    return KDTree(points)
 
 
 def _share_within(small: Float[np.ndarray, "n 3"], large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:

@@ -27,6 +27,8 @@ THINNEST = 2.2
 COARSEST = 0.0022
 # Beyond so many cells from the Poisson surface a node's side is its region's.
 BAND = 2
+# Distances that are kept at a time.
+MOST_DISTANCES = 2_000_000
 
 
 _elsewhere: OwnProcess | None = None
@@ -162,7 +164,10 @@ def _outside_hull(
         hull = ConvexHull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
     except QhullError:
         return np.zeros(len(nodes))
-    return np.maximum((nodes @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1), 0.0)
+    # In parts: all nodes by all facets would take half a gigabyte.
+    parts = np.array_split(nodes, 1 + len(nodes) * len(hull.equations) // MOST_DISTANCES)
+    beyond = [(part @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1) for part in parts]
+    return np.maximum(np.concatenate(beyond), 0.0)
 
 
 def _one_solid(value: Float[np.ndarray, "x y z"], cell: float) -> Float[np.ndarray, "x y z"]:

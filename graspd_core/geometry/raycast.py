@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from graspd_core.geometry.camera import PinholeCamera, camera_rays
+from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.embree import first_hits
 from graspd_core.types import TriangleMesh
 
@@ -38,7 +39,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, dtype=float))
     if np.linalg.norm(right) < 1e-9:
-        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+        right = perpendicular(forward)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])

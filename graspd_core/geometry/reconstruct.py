@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import CloudError
+from graspd_core.errors import CloudError, MeshError
 from graspd_core.geometry.allround import is_all_round, orient_all_round
 from graspd_core.geometry.cloud import PointCloud, clean_cloud
 from graspd_core.geometry.complete import OPEN, complete
+from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.embree import make_surface, surface_distance
-from graspd_core.geometry.evidence import Evidence, make_sight
+from graspd_core.geometry.evidence import Evidence, make_sights
 from graspd_core.geometry.extrude import LOW, stand
-from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step, thin
+from graspd_core.geometry.fuse import NEIGHBOURS, Surfels, join, merge_views, point_step
 from graspd_core.geometry.mesh import check_mesh, simplify
 from graspd_core.geometry.poisson import close_surface, fit_poisson, part_walls
 from graspd_core.geometry.topology import is_closed
@@ -52,19 +53,16 @@ class Reconstruction:
     warnings: tuple[str, ...]
 
 
-def reconstruct(
-    views: Sequence[PointCloud], *, support: Plane | None = None, fused: Surfels | None = None
-) -> Reconstruction:
+def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) -> Reconstruction:
     """The closed surface of the object that the views show.
 
     Args:
         views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
             cloud that shows it from all round may stand for many views.
         support: what the object stands on, in the same frame.
-        fused: the seen surface, where it was fused before (`fuse_depth`); the views then only tell what is empty.
 
     Raises:
-        CloudError: too few points, or no closed surface fits them.
+        CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
     """
     views = _clean(views)
     rotation, origin = _frame(views, support)
@@ -72,16 +70,13 @@ def reconstruct(
     step = point_step(local)
     standing = support is not None
     method, warnings = "poisson", ()
-    if fused is None and len(local) == 1 and is_all_round(local[0]):
+    if len(local) == 1 and is_all_round(local[0]):
         seen, evidence = orient_all_round(local[0], step), Evidence((), standing)
         known = seen
     else:
-        if fused is None:
-            seen = merge_views(local, step)
-        else:
-            seen = thin(Surfels((fused.points - origin) @ rotation, fused.normals @ rotation), step)
+        seen = merge_views(local, step)
         lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
-        evidence = Evidence(tuple(make_sight(v) for v in local), standing, lowest)
+        evidence = Evidence(make_sights(local), standing, lowest)
         guess = complete(seen, evidence, step)
         known = join(seen, guess.surfels)
         known = join(known, stand(known, evidence, step)) if standing else known
@@ -95,11 +90,14 @@ def reconstruct(
 
 
 def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
-    """Finite points, near where most are, of the views that have any."""
+    """Finite points, near where most are, of the views that have enough of them for a surface."""
     from scipy.spatial import KDTree
 
     if len(views) == 0:
         raise CloudError("cloud: no view at all; at least one is needed")
+    for view in views:
+        if not np.isfinite(view.viewpoint).all():
+            raise CloudError("cloud: the place of a view's camera (viewpoint) is not finite")
     most = MOST_POINTS // len(views)
     kept = [view.points[:: 1 + len(view.points) // most].astype(float) for view in views]
     clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
@@ -109,8 +107,11 @@ def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
     for points, view in zip(kept, views, strict=True):
         points = points[np.isfinite(points).all(1)]
         points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
-        if len(points):
+        # Among a thousand: one place sent often is no surface, and its sight would call all else empty.
+        if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > NEIGHBOURS:
             result.append(PointCloud(points, view.viewpoint.astype(float)))
+    if not result:
+        raise CloudError(f"cloud: none of its {len(views)} views shows more than {NEIGHBOURS} points of the object")
     return result
 
 
@@ -130,14 +131,17 @@ def _frame(
     up = up / np.linalg.norm(up)
     level = view - (view @ up) * up
     if np.linalg.norm(level) < 1e-3 * np.linalg.norm(view):
-        level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+        level = perpendicular(up)
     level = level / np.linalg.norm(level)
     return np.column_stack([level, np.cross(up, level), up]), centre
 
 
 def _finished(mesh: TriangleMesh, seen: Surfels) -> TriangleMesh:
     """Few faces, closed, and through the points that were seen."""
-    mesh = _fewer(check_mesh(mesh, "reconstruction")[0])
+    try:
+        mesh = _fewer(check_mesh(mesh, "reconstruction")[0])
+    except MeshError as error:
+        raise CloudError(f"cloud: no usable surface fits its {len(seen.points)} points ({error})") from None
     fitted = float((surface_distance(make_surface(mesh), seen.points) < FIT).mean())
     if not is_closed(mesh) or fitted < FITTED:
         raise CloudError(

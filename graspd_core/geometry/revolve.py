@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.evidence import Evidence, weigh
 from graspd_core.geometry.fuse import Surfels
 from graspd_core.geometry.symmetry import UP, WEIGHT
@@ -97,8 +98,7 @@ def revolve(surfels: Surfels, evidence: Evidence, axis: Axis, step: float) -> Re
     if fits.sum() < 30:
         return None
     profile = _profile(np.column_stack([height, radius, along, across])[fits], step)
-    right = np.cross(axis.direction, np.eye(3)[np.abs(axis.direction).argmin()])
-    right /= np.linalg.norm(right)
+    right = perpendicular(axis.direction)
     up = np.cross(axis.direction, right)
     judged = _ring(profile, axis, right, up, np.full(len(profile), TURNS))
     rows = np.repeat(np.arange(len(profile)), TURNS)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.evidence import Evidence, on_seen, weigh
 from graspd_core.geometry.fuse import Surfels
 
@@ -83,7 +84,7 @@ def find_mirrors(surfels: Surfels, evidence: Evidence) -> list[Symmetry]:
     if evidence.standing:
         square = np.cross(UP, normal)[None]
     else:
-        side = _across(normal)
+        side = perpendicular(normal)
         turn = np.linspace(0, np.pi, 12, endpoint=False)[:, None]
         square = np.cos(turn) * side + np.sin(turn) * np.cross(normal, side)
     second, _ = _best_plane(square, sample, evidence, truth)
@@ -197,14 +198,8 @@ def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
 def _around(normal: Float[np.ndarray, "3"], angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
     """Directions within an angle [rad]; of a level one, level ones."""
     steps = angle * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
-    side = np.cross(normal, UP) if standing else _across(normal)
+    side = np.cross(normal, UP) if standing else perpendicular(normal)
     turned = normal + steps * side
     if not standing:
         turned = np.concatenate([turned, normal + steps * np.cross(normal, side)])
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
-
-
-def _across(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """A unit vector square to another."""
-    side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
-    return side / np.linalg.norm(side)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.geometry.cloud import PointCloud
 from graspd_core.geometry.depth import cloud_from_depth
+from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.mesh import mass_properties
 from graspd_core.geometry.noise import NONE, DepthNoise, add_noise
 from graspd_core.geometry.raycast import look_at, render_scene
@@ -178,7 +179,7 @@ def _turn(source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Flo
     axis = np.cross(source, target)
     angle = np.arctan2(np.linalg.norm(axis), source @ target)
     if np.linalg.norm(axis) < 1e-12:
-        axis = np.cross(source, np.eye(3)[np.abs(source).argmin()])
+        axis = perpendicular(source)
     return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
 
 

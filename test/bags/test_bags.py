@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +126,33 @@ def test_a_rectified_image_is_not_undistorted_again(tmp_path):
     assert np.abs(seen["image_raw"][0, :2] - ideal).max() > 1e-3
 
 
+def test_a_name_with_rect_in_it_need_not_be_rectified(tmp_path):
+    info = camera_info_message(CAMERA, OPTICAL, START)
+    image = depth_message(np.full((120, 160), 0.5), OPTICAL, START)
+    for name in ("image_raw", "depth_direct"):
+        write_bag(tmp_path / name, [Record("/d/camera_info", START, info), Record(f"/d/{name}", START, image)])
+    raw, direct = (next(read_frames(tmp_path / name)).view().points for name in ("image_raw", "depth_direct"))
+    np.testing.assert_array_equal(direct, raw)
+
+
+def test_a_rectified_image_of_a_fisheye_camera_has_no_distortion_left():
+    info = camera_info_message(CAMERA, OPTICAL, START)
+    info.distortion_model = "equidistant"
+    assert camera_from_message(info, rectified=True).distortion == ()
+    with pytest.raises(CloudError, match="unknown distortion model 'equidistant'"):
+        camera_from_message(info)
+
+
+@pytest.mark.parametrize("lost", ["depth", "camera_info"])
+def test_messages_that_only_the_metadata_counts_are_named(tmp_path, lost):
+    path = bag_of(tmp_path / "bag", "/a/depth", "/a/camera_info")
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as storage:
+        storage.execute("delete from messages where topic_id = (select id from topics where name = ?)", (f"/a/{lost}",))
+        storage.commit()
+    with pytest.raises(BagError, match=f"counts messages on /a/{lost}, but its storage has none"):
+        list(read_frames(path))
+
+
 def test_binned_and_cropped_images_have_their_own_camera():
     info = camera_info_message(CAMERA, OPTICAL, START)
     info.binning_x = info.binning_y = 2
@@ -168,6 +197,8 @@ def test_times_and_frames_that_the_bag_does_not_know_are_named(tmp_path):
         frame.view(transforms, "world")
     with pytest.raises(TransformError, match="unknown frame 'wolrd'; known: camera_optical_frame, mount, world"):
         frame.view(transforms, "wolrd")
+    with pytest.raises(TransformError, match="camera_optical_frame -> world: no transforms are given"):
+        frame.view(None, "world")
     # Of its own frame it needs to know nothing.
     assert len(frame.view(transforms, "/" + OPTICAL).points) == 60
 

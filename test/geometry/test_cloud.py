@@ -44,6 +44,16 @@ def test_cleaning_drops_nan_and_strays_and_thins():
     assert 1000 < len(clean) < 15_000
 
 
+@pytest.mark.parametrize("far", [1e7, 1e300])
+def test_one_point_far_away_does_not_spoil_the_others(far):
+    points, _ = surface_samples(make_shape("box"), 3000, 0)
+    clean = clean_cloud(np.vstack([points, [[far, 0, 0]]]), ORIGIN).points
+    assert np.abs(clean).max() < 0.05
+    np.testing.assert_array_equal(clean, clean_cloud(points, ORIGIN).points)
+    with pytest.raises(CloudError, match="too far apart"):
+        clean_cloud(points * 1e300, ORIGIN)
+
+
 def test_a_cloud_moves_with_its_camera():
     pose = look_at((0.3, 0.2, 0.1), (0, 0, 0))
     points = np.array([[0.0, 0, np.linalg.norm((0.3, 0.2, 0.1))], [0.1, 0, 0]])

@@ -7,7 +7,7 @@ import pytest
 
 from graspd_core.errors import CloudError
 from graspd_core.geometry.camera import PinholeCamera
-from graspd_core.geometry.cloud_files import is_cloud_file, load_cloud, load_views
+from graspd_core.geometry.cloud_files import is_cloud_file, load_views
 from graspd_core.geometry.mesh import save_mesh, surface_samples
 from graspd_core.geometry.raycast import look_at, render_depth
 from graspd_core.geometry.shapes import SPHERE_RADIUS, make_shape
@@ -31,7 +31,7 @@ def test_cloud_files_come_back(tmp_path, ending):
     else:
         o3d.io.write_point_cloud(path, o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
     assert is_cloud_file(path)
-    cloud = load_cloud(path)
+    (cloud,) = load_views(path)
     assert cloud.points == pytest.approx(points, abs=1e-6)
     assert cloud.viewpoint == pytest.approx([1, 2, 3] if ending == "npz" else [0, 0, 0])
 
@@ -60,7 +60,7 @@ def test_a_ply_with_faces_is_a_mesh(tmp_path):
 def test_bad_cloud_files_are_named(tmp_path, name, write, complaint):
     write(tmp_path / name)
     with pytest.raises(CloudError, match=complaint):
-        load_cloud(tmp_path / name)
+        load_views(tmp_path / name)
 
 
 def spheres(lens=()) -> np.ndarray:
@@ -80,15 +80,13 @@ def test_depth_images_with_poses_are_views_of_one_scene(tmp_path, unit):
         assert len(distance) > 300
         assert view.viewpoint == pytest.approx(eye)
         assert view.forward == pytest.approx(-np.array(eye) / np.linalg.norm(eye))
-    with pytest.raises(CloudError, match=r"views.npz: holds 3 views; one is needed here"):
-        load_cloud(tmp_path / "views.npz")
 
 
 def test_one_depth_image_needs_no_pose(tmp_path):
     depth = spheres()[0]
     np.savez(tmp_path / "own.npz", depth=depth, K=MATRIX)
     np.savez(tmp_path / "world.npz", depth=depth, K=MATRIX, T_world_camera=POSES[0])
-    own, world = load_cloud(tmp_path / "own.npz"), load_cloud(tmp_path / "world.npz")
+    (own,), (world,) = load_views(tmp_path / "own.npz"), load_views(tmp_path / "world.npz")
     assert own.points[:, 2] == pytest.approx(depth[depth > 0])
     assert world.points == pytest.approx(own.points @ POSES[0, :3, :3].T + POSES[0, :3, 3])
 
@@ -96,11 +94,36 @@ def test_one_depth_image_needs_no_pose(tmp_path):
 def test_points_may_say_where_the_camera_stood_and_looked(tmp_path):
     points = np.random.default_rng(0).normal(size=(4, 5, 3))
     np.savez(tmp_path / "a.npz", points=points, viewpoint=[1, 2, 3], forward=[0, 0, -2])
-    cloud = load_cloud(tmp_path / "a.npz")
+    (cloud,) = load_views(tmp_path / "a.npz")
     np.testing.assert_array_equal(cloud.points, points.reshape(-1, 3))
     assert cloud.viewpoint.tolist() == [1, 2, 3]
     assert cloud.forward is not None
     assert cloud.forward.tolist() == [0, 0, -1]
+
+
+PCD = """VERSION .7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
+WIDTH 2
+HEIGHT 1
+VIEWPOINT %s 1 0 0 0
+POINTS 2
+DATA ascii
+1 2 3
+4 5 6
+"""
+
+
+def test_a_pcd_says_where_its_sensor_stood(tmp_path):
+    (tmp_path / "a.pcd").write_text(PCD % "0.5 -1 2e-1")
+    (cloud,) = load_views(tmp_path / "a.pcd")
+    assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert cloud.viewpoint.tolist() == [0.5, -1, 0.2]
+    (tmp_path / "a.pcd").write_text(PCD % "0.5 nan 2")
+    with pytest.raises(CloudError, match=r"a\.pcd: its VIEWPOINT is not 3 finite numbers"):
+        load_views(tmp_path / "a.pcd")
 
 
 GOOD = {"depths": np.ones((2, 6, 8)), "K": MATRIX, "poses": POSES[:2]}
@@ -121,6 +144,10 @@ FLIPPED = POSES[:2] * np.array([1, 1, -1, 1])
         ({"depth": np.ones((6, 8))}, "holds 'depth' but no 'K'; it has: depth"),
         ({"depth": np.ones((6, 8)), "K": MATRIX, "T_world_camera": np.eye(3)}, "shape (3, 3); 4 × 4 is needed"),
         ({"points": np.ones((5, 3)), "forward": np.zeros(3)}, "'forward' is no direction"),
+        ({"points": np.ones((5, 3)), "forward": np.array([0, 0, np.nan])}, "'forward' is no direction"),
+        ({"points": np.ones((5, 3)), "forward": np.array([0, 0, np.inf])}, "'forward' is no direction"),
+        ({"points": np.ones((5, 3)), "viewpoint": np.array([0, 0, np.nan])}, "'viewpoint' is NaN or infinite"),
+        ({"points": np.ones((5, 3)), "viewpoint": np.array([np.inf, 0, 0])}, "'viewpoint' is NaN or infinite"),
         ({"points": np.array(["a", "b"])}, "'points' not readable as numbers"),
     ],
 )

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from graspd_core.geometry.cloud import PointCloud
 from graspd_core.geometry.complete import complete, openness, plausible
-from graspd_core.geometry.evidence import Evidence, empty_depth, make_sight, weigh
+from graspd_core.geometry.evidence import Evidence, empty_depth, make_sights, weigh
 from graspd_core.geometry.extrude import extrude, stand
 from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step
 from graspd_core.geometry.mesh import surface_samples
@@ -27,7 +27,7 @@ def front(name: str, height: float, eye: np.ndarray = EYE) -> PointCloud:
 
 
 def looked_at(view: PointCloud, standing: bool = True) -> tuple[Surfels, Evidence, float]:
-    return merge_views([view]), Evidence((make_sight(view),), standing), point_step([view])
+    return merge_views([view]), Evidence(make_sights([view]), standing), point_step([view])
 
 
 BOX, CYLINDER, BALL = front("box", BOX_HALF[2]), front("cylinder", CYLINDER_HALF), front("sphere", SPHERE_RADIUS)
@@ -38,7 +38,7 @@ def test_before_the_surface_it_is_empty_and_behind_it_is_not(along, behind):
     """A wall at z = 0 seen from a metre above its middle."""
     ticks = np.linspace(-0.1, 0.1, 60)
     wall = np.stack(np.meshgrid(ticks, ticks, [0.0], indexing="ij"), -1).reshape(-1, 3)
-    evidence = Evidence((make_sight(PointCloud(wall, np.array([0.0, 0.0, 1.0]))),), standing=False)
+    evidence = Evidence(make_sights([PointCloud(wall, np.array([0.0, 0.0, 1.0]))]), standing=False)
     before = np.array([[0.01, 0.0, along]])
     assert empty_depth(evidence, before)[0] == pytest.approx(along, abs=1e-6)
     assert empty_depth(evidence, np.array([[0.01, 0.0, -behind]]))[0] == 0

@@ -70,6 +70,7 @@ def test_one_coordinate_that_is_not_finite_drops_the_point():
         ({"fields": {"x": (0, 99), "y": (4, 7), "z": (8, 7)}}, "field 'x' is 99; it must be FLOAT32 or FLOAT64"),
         ({"point_step": 8, "row_step": 24}, "beyond point_step=8"),
         ({"row_step": 71}, "row_step=71 is smaller than width*point_step=3*24=72"),
+        ({"width": 2**32 - 1, "height": 2**32 - 1, "point_step": 0, "row_step": 0}, "beyond point_step=0"),
         ({"height": 3}, "data holds 144 bytes, but height=3"),
     ],
 )

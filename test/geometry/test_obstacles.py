@@ -55,6 +55,18 @@ def test_things_out_of_reach_and_specks_are_left_out():
     assert make_neighbours([], None, TARGET, 1.0) == ()
 
 
+@pytest.mark.parametrize("support", [TABLE, None])
+def test_a_tray_about_the_object_leaves_it_room(support):
+    turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 120), (-0.04, -0.02, 0.0))
+    ring = np.column_stack([0.12 * np.cos(turn.ravel()), 0.12 * np.sin(turn.ravel()), height.ravel()])
+    found = make_neighbours([ring], support, TARGET, 0.3)
+    distance = np.stack([sample_sdf(n.sdf, torch.as_tensor(TARGET.vertices).float())[0].numpy() for n in found])
+    assert distance.min() > 0.02
+    # Each of its points is still in the way.
+    held = np.stack([sample_sdf(n.sdf, torch.as_tensor(ring).float())[0].numpy() for n in found])
+    assert held.min(0).max() < 0
+
+
 @settings(max_examples=15)
 @given(seed=st.integers(0, 2**31), flat=st.booleans())
 def test_every_seen_point_and_its_shadow_lie_within(seed: int, flat: bool):

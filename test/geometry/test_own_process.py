@@ -55,6 +55,23 @@ def test_ctrl_c_in_the_terminal_leaves_the_child_alone(who: OwnProcess):
     assert who() == child
 
 
+def test_an_answer_that_was_not_waited_for_is_not_the_next_ones():
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    shell = OwnProcess(subprocess.getoutput)
+    assert shell("echo ready") == "ready"
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            shell("sleep 0.5; echo late")
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert shell("echo next") == "next"
+    shell.close()
+
+
 def test_the_child_ends_with_its_parent():
     program = (
         "import os, signal, math\n"

@@ -11,7 +11,7 @@ from graspd_core.errors import CloudError
 from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.geometry.cloud import PointCloud
 from graspd_core.geometry.depth import cloud_from_depth
-from graspd_core.geometry.evidence import Evidence, empty_depth, make_sight
+from graspd_core.geometry.evidence import Evidence, empty_depth, make_sights
 from graspd_core.geometry.exact import inside, make_distance_query, unsigned_distance
 from graspd_core.geometry.mesh import mass_properties, surface_samples
 from graspd_core.geometry.reconstruct import MOST_FACES, Reconstruction, reconstruct
@@ -21,6 +21,9 @@ from graspd_core.geometry.topology import is_closed
 from graspd_core.types import Plane, TriangleMesh
 
 CAMERA = PinholeCamera(240, 180, 260.0, 260.0, 119.5, 89.5)
+
+BALL = np.random.default_rng(0).normal(size=(5000, 3))
+BALL *= 0.03 / np.linalg.norm(BALL, axis=1, keepdims=True)
 
 
 @functools.cache
@@ -94,7 +97,7 @@ def test_trust_is_full_where_seen_and_falls_where_guessed(name):
 @pytest.mark.parametrize("name", sorted(SHAPES))
 def test_what_the_camera_saw_to_be_empty_stays_empty(name):
     _, views = seen(name)
-    evidence = Evidence((make_sight(views[0]),), standing=True, lowest=0.006)
+    evidence = Evidence(make_sights(views), standing=True, lowest=0.006)
     points, _ = surface_samples(made(name).mesh, 4000, 0)
     deep = empty_depth(evidence, points)
     assert np.percentile(deep, 99) < 0.005
@@ -170,11 +173,41 @@ def test_an_all_round_cloud_needs_no_camera(name):
         ([PointCloud(np.full((90, 3), np.nan), np.zeros(3))], "all 90 points are NaN"),
         ([PointCloud(np.eye(3)[[0, 1, 2] * 3], np.zeros(3))], "only 9 finite points of 9; at least 50"),
         ([PointCloud(np.ones((500, 3)), np.zeros(3))], "in one place"),
+        ([PointCloud(np.eye(3)[[0, 1, 2] * 30], np.array([0, 0, np.nan]))], "viewpoint"),
+        ([PointCloud(part, np.array([0, 0, 1.0])) for part in np.split(BALL[:280], 14)], "none of its 14 views"),
     ],
 )
 def test_hopeless_views_are_named(views, complaint):
     with pytest.raises(CloudError, match=complaint):
         reconstruct(views)
+
+
+@pytest.mark.parametrize("few", [BALL[:1], BALL[:3], np.repeat(BALL[:1], 90, 0), np.repeat(BALL[:2], 45, 0)])
+def test_a_view_of_next_to_nothing_does_not_spoil_the_others(few):
+    front = BALL[BALL[:, 2] > 0]
+    views = [PointCloud(front, np.array([0, 0, 0.5])), PointCloud(few, np.array([0.5, 0, 0.2]))]
+    whole = reconstruct(views)
+    assert is_closed(whole.mesh)
+    assert mass_properties(whole.mesh)[0] == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.25)
+
+
+def test_a_line_of_sight_gives_no_depth_image():
+    along = np.outer(np.linspace(0.3, 0.5, 200), np.array([0, 0, 1.0]))
+    assert make_sights([PointCloud(along, np.zeros(3))]) == ()
+    assert make_sights([PointCloud(BALL[:4], np.array([0, 0, 0.5]))]) == ()
+    assert len(make_sights([PointCloud(BALL, np.array([0, 0, 0.5]))])) == 1
+
+
+def test_points_exactly_on_a_sphere_are_closed_too():
+    whole = reconstruct([PointCloud(BALL + np.array([0, 0, 0.5]), np.zeros(3))])
+    assert is_closed(whole.mesh)
+    assert mass_properties(whole.mesh)[0] == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.05)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_a_size_that_no_hand_grasps_is_the_clouds_fault(scale):
+    with pytest.raises(CloudError):
+        reconstruct([PointCloud(scale * BALL, np.array([0, 0, scale]))])
 
 
 @pytest.mark.parametrize("shape", ["dust", "line", "crumb"])

@@ -146,7 +146,8 @@ class Client:
 
     def end_all(self) -> None:
         """Cancel what is still going on and wait until it has ended."""
-        self.send_cancel("")
+        self.call(Trigger, "reset")
+        self.spin_for(0.2)  # a cloud that waited is told of only as it begins, which it may just have done
 
         def ended() -> bool:
             ends = {event["request"] for event in self.events if event["event"] in TERMINAL}

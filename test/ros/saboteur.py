@@ -1,4 +1,4 @@
-"""A node like any other, but for its planner: it raises what the seed says. Started by test_faults.py."""
+"""A node like any other, but for its planner: it raises what the seed says. Started by test_node_process.py."""
 
 from __future__ import annotations
 

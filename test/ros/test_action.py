@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 from action_msgs.msg import GoalStatus
 from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspRequest
 from rclpy.action.client import ActionClient
+from rclpy.action.server import RCLError
+
+from graspd_ros.action import Goal as OurGoal
 
 RESULT_TIMEOUT = 60.0
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
@@ -40,6 +46,24 @@ class Goal:
     def end(self, timeout: float = 10.0) -> tuple[int, GraspArray]:
         ended = self._client.spin_until(lambda: self._result.done() and self._result.result(), timeout, "result")
         return ended.status, ended.result.result
+
+
+def test_a_goal_that_is_cancelled_in_the_moment_that_it_begins_still_ends():
+    """rclpy looks for a cancel, then steps; where one comes in between, rcl refuses the step."""
+
+    class Handle:
+        tried = 0
+
+        def execute(self, callback) -> None:
+            self.tried += 1
+            if self.tried == 1:
+                raise RCLError("goal_handle attempted invalid transition from state CANCELING with event EXECUTE")
+
+    handle: Any = Handle()
+    node: Any = SimpleNamespace(executor=None)
+    goal = OurGoal(node, handle, on_end=lambda: None)
+    goal.ended(GraspArray())
+    assert handle.tried == 2
 
 
 @pytest.fixture

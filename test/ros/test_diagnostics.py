@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -82,6 +84,17 @@ WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS st
 def test_any_health_goes_through_the_middleware(health: Health):
     message = health_message(health, Time(), 1)
     assert deserialize_message(serialize_message(message), DiagnosticArray) == message
+
+
+def test_memory_counts_children_too():
+    before = resident_memory()
+    work = "import sys; ballast = b'x' * 60_000_000; print(flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", work], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        assert resident_memory() - before > 50_000_000
+        child.communicate()
+    assert resident_memory(child.pid) == 0
 
 
 def test_memory_is_that_of_this_process():

@@ -73,7 +73,7 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert {p.stage for p in client.progress} >= {"load", "optimise", "verify"}
     assert all(0 <= p.fraction <= 1 and p.message for p in client.progress)
     elapsed = [p.elapsed for p in client.progress]
-    assert np.diff(elapsed).min() > 0.09, "more than 10 progress reports a second"
+    assert len(elapsed) <= 10 * (elapsed[-1] - elapsed[0]) + 2, "more than 10 progress reports a second"
     client.spin_until(lambda: markers, 5.0, "markers")
     assert {marker.header.frame_id for marker in markers[-1].markers} == {"table"}
     client.spin_for(0.3)
@@ -199,20 +199,20 @@ def test_depth_images_become_views_and_views_a_grasp(client, node):
     assert client.answer("none", 10.0).error_code == "NO_CLOUD"
 
 
-def test_hands_are_listed_and_a_reset_leaves_nothing_to_late_joiners(client, node):
+def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_answer(client, node):
     hands = client.call(ListHands, "list_hands")
     assert hands.current in hands.names
     assert (hands.current, len(hands.joint_names), hands.base_link) == ("allegro_right", 16, "base_link")
 
-    def joiner() -> list[GraspArray]:
-        got: list[GraspArray] = []
+    def joiner(kind: type, topic: str) -> list:
+        got: list = []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        client.node.create_subscription(GraspArray, "/graspd/grasps", got.append, latched)
+        client.node.create_subscription(kind, topic, got.append, latched)
         return got
 
     client.send_request(id="refused", source=9)
     client.answer("refused", 10.0)
-    late = joiner()
+    late = joiner(GraspArray, "/graspd/grasps")
     client.spin_until(lambda: late, 5.0, "the last answer for a late joiner")
     assert late[0].request_id == "refused"
     client.forget()
@@ -220,10 +220,11 @@ def test_hands_are_listed_and_a_reset_leaves_nothing_to_late_joiners(client, nod
     client.event(10.0, event="progress", request="running")
     assert client.call(Trigger, "reset").message == "cancelled 1 requests, dropped 0 views"
     assert client.answer("running", 10.0).status == GraspArray.CANCELLED
-    client.call(Trigger, "reset")
-    later = joiner()
+    answers, markers = joiner(GraspArray, "/graspd/grasps"), joiner(MarkerArray, "/graspd/markers")
+    client.spin_until(lambda: answers, 5.0, "the last answer for a late joiner")
     client.spin_for(1.0)
-    assert later == []
+    assert [answer.request_id for answer in answers] == ["running"]
+    assert markers == []
 
 
 def test_an_output_frame_that_nothing_connects_is_named_before_any_work(client, node):

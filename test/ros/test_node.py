@@ -13,7 +13,8 @@ RESULT_TIMEOUT = 60.0
 FEW = {"num_grasps": 2, "preset": "fast", "deadline": 40.0, "busy_policy": "queue"}
 # Work that is still going on when the next request arrives.
 LONG = {"num_grasps": 64, "preset": "accurate", "deadline": 60.0, "busy_policy": "queue"}
-CALLBACK_P99 = 0.1  # seconds: what a client may count on while the optimiser runs
+# Seconds that a caller waits while the optimiser runs, on a crowded machine; benchmarks/soak.py has the figures.
+CALLBACK_MEDIAN, CALLBACK_P99 = 0.05, 0.25
 HAND_LENGTH = 0.25  # metres; the base of a hand that holds something is within this of it
 
 pytestmark = pytest.mark.timeout(180)
@@ -50,7 +51,7 @@ def test_a_mesh_becomes_progress_and_a_grasp(client, node):
     orientation = pose.pose.orientation
     assert [orientation.w, orientation.x, orientation.y, orientation.z] == pytest.approx([w, *xyz])
     stamps = [e["stamp"] for e in client.events if e["event"] == "progress"]
-    assert len(stamps) < 2 or np.diff(stamps).min() > 0.09, "more than 10 progress reports a second"
+    assert len(stamps) <= 10 * (stamps[-1] - stamps[0]) + 2, "more than 10 progress reports a second"
     order = [e["event"] for e in client.events]
     assert order == ["accepted", *["progress"] * len(stamps), "result"]
 
@@ -157,4 +158,5 @@ def test_callbacks_answer_through_a_whole_request(client, node):
         client.spin_for(0.02)
     assert len(waits) > 50, "the work ended before there was anything to measure"
     print(f"p50 {np.percentile(waits, 50) * 1e3:.1f} ms, p99 {np.percentile(waits, 99) * 1e3:.1f} ms, n {len(waits)}")
+    assert np.median(waits) < CALLBACK_MEDIAN
     assert np.percentile(waits, 99) < CALLBACK_P99

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import math
 
 import numpy as np
@@ -11,6 +12,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from graspd_core.config import preset_names
@@ -19,8 +21,8 @@ from graspd_core.pipeline import PointCloud
 from graspd_ros.codes import ErrorCode, RequestError, code_of, sentence_of
 from graspd_ros.intake import Intake
 from graspd_ros.parameters import MOST_GRASPS, Settings
-from graspd_ros.requests import check_request, pose_matrix, settings_of
-from graspd_ros.sources import MOST_VIEWS, Sighting, Views, trimmed
+from graspd_ros.requests import MOST_CLOUD_BYTES, check_request, pose_matrix, settings_of
+from graspd_ros.sources import MOST_VIEWS, Sighting, Views, cloud_sighting, trimmed
 
 NOW = Time(sec=1000)
 HAND = "allegro_right"
@@ -188,7 +190,7 @@ def test_the_number_of_views_and_their_size_are_bounded():
 
 @given(
     st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=50),
-    st.sampled_from([0.0, 0.1, 0.5]),
+    st.sampled_from([0.0, 1e-8, 0.1, 0.5]),
 )
 def test_trimming_keeps_points_of_the_workspace_at_most_one_a_voxel(rows, voxel):
     points = np.array(rows)
@@ -206,6 +208,21 @@ def test_trimming_keeps_points_of_the_workspace_at_most_one_a_voxel(rows, voxel)
         assert {tuple(np.floor(p / voxel)) for p in kept} == cells
     else:
         assert len(kept) == len(inside)
+
+
+def test_a_cloud_too_large_to_keep_is_refused_wherever_it_comes_from():
+    huge = PointCloud2(data=array.array("B", bytes(MOST_CLOUD_BYTES + 1)))
+    with pytest.raises(RequestError, match=f"{MOST_CLOUD_BYTES + 1} bytes; at most"):
+        cloud_sighting(huge, 0)
+
+
+def test_names_that_the_node_makes_up_differ_from_those_before_a_restart(monkeypatch):
+    names = []
+    for second in (1, 2):
+        monkeypatch.setattr("time.strftime", lambda _, second=second: f"then{second}")
+        taker = intake()
+        names += [taker.new_id("mesh"), taker.new_id("mesh")]
+    assert len(set(names)) == 4
 
 
 def test_a_target_point_comes_into_the_frame_of_the_cloud():
