@@ -42,6 +42,9 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
     given = [name for name in ("point", "box", "mask") if getattr(target, name) is not None]
     if len(given) > 1:
         raise CloudError(f"target: {' and '.join(given)} given; give one of point, box, mask")
+    for corner in (target.point, *(target.box or ())):
+        if corner is not None and np.shape(corner) != (3,):
+            raise CloudError(f"target: a place of shape {np.shape(corner)}; give x, y, z")
     if target.point is not None and not np.isfinite(target.point).all():
         raise CloudError(f"target: point {_place(target.point)} is not finite")
     if target.box is not None:

@@ -67,7 +67,7 @@ def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"]
     edge = ~core & seen
     near, nearest = KDTree(points[core]).query(points[edge], distance_upper_bound=link)
     joins = np.flatnonzero(edge)[np.isfinite(near)]
-    label[joins] = label[core][nearest[np.isfinite(near)]]
+    label[joins] = label[core][np.asarray(nearest)[np.isfinite(near)]]
     return renumber(label)
 
 

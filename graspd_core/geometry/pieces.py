@@ -60,10 +60,9 @@ def join_pieces(
         if extent(np.vstack([pieces[a], pieces[b]])) > largest:
             continue
         reach = UNSUPPORTED if support is None else HANGING if hangs[a] or hangs[b] else link
-        if _apart(pieces[a], pieces[b]) > reach:
-            if support is None or _share_within(pieces[b], pieces[a], support) < WITHIN:
-                continue
-        if any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP * link) for eye in viewpoints):
+        one = _apart(pieces[a], pieces[b]) <= reach
+        one = one or (support is not None and _share_within(pieces[b], pieces[a], support) >= WITHIN)
+        if one and any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP * link) for eye in viewpoints):
             root, leaf = sorted((owner[a], owner[b]))
             owner = [root if k == leaf else k for k in owner]
     joined = label.copy()
