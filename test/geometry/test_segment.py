@@ -195,6 +195,16 @@ def test_a_cup_is_one_thing_though_its_near_wall_hides_how_it_goes_on():
         assert not found.neighbours
 
 
+# From where the box's foot is seen; behind the bowl (3.0) nothing tells it from the bowl's own far side.
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.0])
+def test_a_bowl_that_overhangs_its_foot_does_not_join_what_is_beside_it(turn):
+    scene = tabletop("bowl", neighbours=[("box", 0.115, 0.0)])
+    view, _ = seen(scene.meshes, ring_poses(1, elevation=0.9, azimuth=turn)[0], LEVELS["default"])
+    found = segment([view], target=Target(point=np.array([0.0, 0.0, 0.01])))
+    assert share_near(found.views[0].points, scene.truth, 0.009) > 0.99
+    assert len(found.neighbours) == 1
+
+
 def test_flying_pixels_are_left_out():
     scene = tabletop("box")
     depth, label = render_scene(scene.meshes, CAMERA, POSE)
