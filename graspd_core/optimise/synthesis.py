@@ -25,7 +25,8 @@ from graspd_core.optimise.postures import (
     self_overlap,
     squeeze,
 )
-from graspd_core.optimise.problem import Problem, build_problem
+from graspd_core.optimise.problem import Problem
+from graspd_core.optimise.search import Found, Search, problem_of
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.types import Contact, Grasp, Posture
 
@@ -45,6 +46,31 @@ class Candidates:
     interrupted: str
 
 
+def search_closed_form(
+    scene: Scene,
+    hand: HandModel,
+    *,
+    count: int,
+    seed: int,
+    config: PlanConfig,
+    hooks: Hooks,
+    device: str,
+    dtype: torch.dtype,
+) -> Found:
+    """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
+    settings = config.closed_form
+    problem = problem_of(scene, hand, config, seed=seed, device=device, dtype=dtype)
+    factor = 1.0 if problem.obstacles is None else settings.obstacle_factor
+    drawn = max(_FEWEST_STARTS, round(count * settings.starts_per_grasp * factor))
+    starts = draw_starts(scene, hand, drawn, seed, device, dtype)
+    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp * factor)))
+    solution = minimise(solver, problem, starts, hooks)
+    return Found(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
+
+
+SEARCHES: dict[str, Search] = {"closed_form": search_closed_form}
+
+
 def synthesise(
     scene: Scene,
     hand: HandModel,
@@ -56,31 +82,12 @@ def synthesise(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Candidates:
-    """About `count` times `keep_per_grasp` ranked candidates; fewer where starts were hopeless."""
-    settings = config.closed_form
-    problem = build_problem(
-        scene,
-        hand,
-        candidates=settings.candidates,
-        features=settings.features,
-        directions=settings.directions,
-        friction=min(settings.friction, scene.object.friction),
-        seed=seed,
-        device=device,
-        dtype=dtype,
-        trust_floor=settings.trust_floor,
-    )
-    factor = 1.0 if problem.obstacles is None else settings.obstacle_factor
-    drawn = max(_FEWEST_STARTS, round(count * settings.starts_per_grasp * factor))
-    starts = draw_starts(scene, hand, drawn, seed, device, dtype)
-    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp * factor)))
-    solution = minimise(solver, problem, starts, hooks)
-    if solution.interrupted == "cancelled":
-        return Candidates((), solution.interrupted)
-    poses = solution.poses[torch.isfinite(solution.loss)]
-    if len(poses.translation) == 0:
-        return Candidates((), solution.interrupted)
-    return Candidates(assemble(problem, hand, poses, config, hooks.stop), solution.interrupted)
+    """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless."""
+    search = SEARCHES[config.method]
+    found = search(scene, hand, count=count, seed=seed, config=config, hooks=hooks, device=device, dtype=dtype)
+    if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
+        return Candidates((), found.interrupted)
+    return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)
 
 
 def assemble(

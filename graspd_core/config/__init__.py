@@ -1,0 +1,86 @@
+"""Settings: nested frozen dataclasses, one field list for YAML presets, the command line and ROS parameters."""
+
+from __future__ import annotations
+
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from graspd_core.config.baselines import AnnealingConfig, RandomClosureConfig
+from graspd_core.config.closed_form import ClosedFormConfig, LossWeights
+from graspd_core.config.graspd2022 import Graspd2022Config
+from graspd_core.config.mapping import from_mapping
+from graspd_core.config.postures import PostureConfig
+from graspd_core.config.segment import SegmentConfig
+from graspd_core.errors import ConfigError
+from graspd_core.paths import config_dir
+
+__all__ = [
+    "METHODS",
+    "VERIFICATIONS",
+    "AnnealingConfig",
+    "ClosedFormConfig",
+    "Graspd2022Config",
+    "LossWeights",
+    "PlanConfig",
+    "PostureConfig",
+    "RandomClosureConfig",
+    "SegmentConfig",
+    "from_mapping",
+    "load_preset",
+    "preset_names",
+]
+
+Method = Literal["closed_form", "graspd2022", "annealing", "random_closure"]
+Verify = Literal["standard", "hard", "none"]
+METHODS: tuple[str, ...] = typing.get_args(Method)
+VERIFICATIONS: tuple[str, ...] = typing.get_args(Verify)
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """Everything a run of `plan_grasps` is set by, apart from the scene, the hand and the seed.
+
+    Attributes:
+        resolution: cells of the signed distance grid along the object's longest side.
+        method: how poses are searched for; `graspd_core.optimise.synthesis.SEARCHES` has one search for each.
+        closed_form: settings of the closed-form relaxation.
+        graspd2022: settings of the published Grasp'D.
+        annealing: settings of the GraspIt!-style planner.
+        random_closure: settings of the floor.
+        postures: pregrasp and squeeze.
+    """
+
+    resolution: int = 48
+    method: Method = "closed_form"
+    closed_form: ClosedFormConfig = field(default_factory=ClosedFormConfig)
+    graspd2022: Graspd2022Config = field(default_factory=Graspd2022Config)
+    annealing: AnnealingConfig = field(default_factory=AnnealingConfig)
+    random_closure: RandomClosureConfig = field(default_factory=RandomClosureConfig)
+    postures: PostureConfig = field(default_factory=PostureConfig)
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the boxed presets."""
+    return tuple(sorted(path.stem for path in (config_dir() / "presets").glob("*.yaml")))
+
+
+def load_preset(name: str) -> PlanConfig:
+    """A boxed preset by name, or a preset file by path.
+
+    Raises:
+        ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
+    """
+    import yaml
+
+    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
+    try:
+        values = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    return from_mapping(PlanConfig, {} if values is None else values, where=path.name)
