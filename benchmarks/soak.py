@@ -3,7 +3,8 @@
     python benchmarks/soak.py --minutes 10 [--out results/soak.json]
 
 Three processes besides this one's client: the node (with a timer of its own to measure by), a camera of 640×480 at
-30 Hz, and nothing mocked. Prints a Markdown table, and what of the targets is met.
+30 Hz, and a control that only ticks: how late that comes is the machine's doing. Nothing is mocked. Prints a Markdown
+table, and what of the targets is met.
 """
 
 from __future__ import annotations
@@ -75,15 +76,16 @@ def soak(folder: Path, seconds: float) -> dict[str, Any]:
     log = (folder / "node.log").open("w")
     run_node = [sys.executable, str(PARTS), "node", str(notes), *parameters]
     node = subprocess.Popen(run_node, cwd=folder, stdout=log, stderr=log)
-    camera = None
+    camera = control = None
     try:
         client = Client()
         client.wait(lambda: client.ready or node.poll() is not None, "the node to be ready")
         if not client.ready:
             sys.exit(f"soak: the node did not start:\n{(folder / 'node.log').read_text()}")
-        camera = subprocess.Popen(
-            [sys.executable, str(PARTS), "camera", str(seconds)], stdout=subprocess.PIPE, text=True
-        )
+        camera, control = [
+            subprocess.Popen([sys.executable, str(PARTS), part, str(seconds)], stdout=subprocess.PIPE, text=True)
+            for part in ("camera", "control")
+        ]
         memory = Memory(node.pid)
         end = time.monotonic() + seconds
         script = random.Random(0)
@@ -92,12 +94,13 @@ def soak(folder: Path, seconds: float) -> dict[str, Any]:
         alive = node.poll() is None
         client.settle()
         sent = int(camera.communicate(timeout=60)[0] or 0)
+        ticks = json.loads(control.communicate(timeout=60)[0] or "[]")
         time.sleep(6.0)  # the node's last notes
         memory.stop()
         node.terminate()
         node.wait(10)
     finally:
-        for process in (node, camera):
+        for process in (node, camera, control):
             if process is not None and process.poll() is None:
                 process.kill()
     noted: dict[str, list[float]] = {"late": [], "ages": []}
@@ -110,7 +113,12 @@ def soak(folder: Path, seconds: float) -> dict[str, Any]:
     return figures | memory.figures() | {
         "seconds": seconds,
         "alive": alive,
-        "waits": {"timer lateness in the node": spread(noted["late"]), **waits, "cloud age": spread(noted["ages"])},
+        "waits": {
+            "timer lateness in the node": spread(noted["late"]),
+            "lateness of a process that only ticks": spread(ticks),
+            **waits,
+            "cloud age": spread(noted["ages"]),
+        },
         "clouds sent": sent,
         "clouds received": len(noted["ages"]),
         "cloud age, medians of the first and last tenth [ms]": tenths(noted["ages"]),

@@ -1,4 +1,7 @@
-"""The other processes of soak.py: a node that measures itself, and a camera. `python soak_parts.py node|camera ...`."""
+"""The other processes of soak.py: a node that measures itself, a camera, and a control.
+
+`python soak_parts.py node|camera|control ...`
+"""
 
 from __future__ import annotations
 
@@ -80,6 +83,16 @@ def run_camera(seconds: float) -> None:
     rclpy.shutdown()
 
 
+def run_control(seconds: float) -> None:
+    """Sleep as long as the node's timer does, and print how late each waking came [s]."""
+    late: list[float] = []
+    end = time.monotonic() + seconds
+    while (now := time.monotonic()) < end:
+        time.sleep(TIMER_PERIOD)
+        late.append(max(time.monotonic() - now - TIMER_PERIOD, 0.0))
+    print(json.dumps(late))
+
+
 def ball_cloud(seed: int) -> array.array:
     """The bytes of one organised cloud; NaN where the ball is not."""
     u, v = np.meshgrid((np.arange(WIDTH) - WIDTH / 2) / FOCAL, (np.arange(HEIGHT) - HEIGHT / 2) / FOCAL)
@@ -96,4 +109,4 @@ def ball_cloud(seed: int) -> array.array:
 if __name__ == "__main__":
     if sys.argv[1] == "node":
         sys.exit(run_node(Path(sys.argv[2]), sys.argv[3:]))
-    run_camera(float(sys.argv[2]))
+    {"camera": run_camera, "control": run_control}[sys.argv[1]](float(sys.argv[2]))

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 PROBE_TIMEOUT = 60.0  # seconds; a cold disk takes several for torch or Open3D
-_SETUP = "run `make setup`, or pip install -c constraints.txt -e '.[ros,dev]'"
+_SETUP = "run `make setup`, or pip install -c constraints.txt -e '.[ros,bench,dev]'"
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
 # distribution: module
 _LIBRARIES = {
@@ -43,6 +43,16 @@ data = mujoco.MjData(model)
 mujoco.mj_step(model, data, 10)
 assert data.qpos[2] < 0, "a dropped ball did not fall"
 print(f"{mujoco.__version__}, steps a model")
+"""
+_BULLET = """
+import sys
+if sys.version_info >= (3, 12):
+    print("none for this Python; benchmarks leave the displacement trial out")
+else:
+    import pybullet
+    from importlib.metadata import version
+    pybullet.disconnect(pybullet.connect(pybullet.DIRECT))
+    print(version("pybullet"))
 """
 # What ROS is, only the ROS package knows.
 _ROS = "from graspd_ros.probe import probe; print(probe())"
@@ -80,6 +90,7 @@ def run_checks() -> list[Check]:
         ("mujoco", _MUJOCO, _SETUP, True),
         *((name, _import_probe(name, module), _SETUP, True) for name, module in _LIBRARIES.items()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
+        ("pybullet", _BULLET, "only benchmarks need it, on Python 3.11: pip install -e '.[bench]'", False),
         ("ROS 2 (rclpy)", _ROS, "only the node needs it: pip install -c constraints.txt -e '.[ros]'", False),
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:

@@ -35,3 +35,7 @@ class FormatError(GraspdError):
 
 class TransformError(GraspdError):
     """Where one frame stands in another is not known, not at that time, or makes no sense."""
+
+
+class SimulatorError(GraspdError):
+    """A trial needs a simulator that is not installed, or that cannot take the scene."""

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from graspd_core.config import PlanConfig
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.geometry.scene import ObjectModel
-from graspd_core.hands.model import HandModel
+from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.types import Contact, Grasp, GraspMetrics, GraspResult, HoldResult, LiftResult, Posture, Verdict
 
 FORMAT, VERSION = "graspd/grasps", 1
@@ -38,12 +39,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
         "version": VERSION,
         "units": "m, rad, N",
         "outcome": {"name": result.outcome.name, "message": result.outcome.value, "warnings": list(result.warnings)},
-        "hand": {
-            "name": hand.name,
-            "urdf": hand.urdf,
-            "base_link": hand.base_link,
-            "joint_names": list(hand.joint_names),
-        },
+        "hand": _hand(hand),
         "object": {
             "source": target.source,
             "sha256": target.sha256,
@@ -59,7 +55,22 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
         "method": result.method,
         "versions": _versions(),
         "timing": dataclasses.asdict(result.timing),
-        "grasps": [_grasp(rank, grasp) for rank, grasp in enumerate(result.grasps)],
+        "grasps": [_grasp(rank, grasp, hand) for rank, grasp in enumerate(result.grasps)],
+    }
+
+
+def _hand(hand: HandModel) -> dict[str, Any]:
+    """Whose joints these are, which of them follow others, and where the hand sits on an arm."""
+    return {
+        "name": hand.name,
+        "urdf": hand.urdf,
+        "base_link": hand.base_link,
+        "joint_names": list(all_joint_names(hand)),
+        "mimic": [
+            {"joint": m.name, "of": hand.joint_names[m.joint], "multiplier": m.multiplier, "offset": m.offset}
+            for m in hand.mimics
+        ],
+        "mount": hand.mount and dataclasses.asdict(hand.mount),
     }
 
 
@@ -124,22 +135,29 @@ def load_document(path: str | Path) -> dict[str, Any]:
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     """The grasps of a document that `load_document` read, in rank order; the squeeze has the grasp's base pose.
 
-    Metrics stay in the document: who wants to judge a grasp measures it anew.
+    Joint positions are those of the actuated joints, as everywhere in graspd: coupled ones follow from them. Metrics stay in the document: who wants to judge a grasp measures it anew.
 
     Raises:
         FormatError: a grasp lacks a key, or holds something of the wrong kind there.
     """
     try:
-        return tuple(_grasp_of(values) for values in document["grasps"])
+        hand = document["hand"]
+        # Files written before joints could be coupled have no such key.
+        coupled = {mimic["joint"] for mimic in hand.get("mimic", ())}
+        actuated = np.array([name not in coupled for name in hand["joint_names"]])
+        return tuple(_grasp_of(values, actuated) for values in document["grasps"])
     except KeyError as error:
         raise FormatError(f"grasps: a grasp lacks the key {error}") from None
     except (TypeError, ValueError) as error:
         raise FormatError(f"grasps: {error}") from None
 
 
-def _grasp_of(values: dict[str, Any]) -> Grasp:
-    def posture(position: str, quaternion: str, joints: str) -> Posture:
-        return Posture(*(np.array(values[key], dtype=float) for key in (position, quaternion, joints)))
+def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> Grasp:
+    def posture(*keys: str) -> Posture:
+        position, quaternion, joints = (np.array(values[key], dtype=float) for key in keys)
+        if joints.shape != actuated.shape:
+            raise ValueError(f"{keys[-1]} has {joints.size} values for {actuated.size} joints")
+        return Posture(position, quaternion, joints[actuated])
 
     # Files written before there was a lift trial have no such key.
     hold, lift = values["metrics"]["hold"], values["metrics"].get("lift")
@@ -165,7 +183,10 @@ def _moved_of(trial: dict[str, float | None]) -> tuple[float, float]:
     return displacement / 100, float(np.deg2rad(rotation))
 
 
-def _grasp(rank: int, grasp: Grasp) -> dict[str, Any]:
+def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
+    def joints(posture: Posture) -> list[float]:
+        return _list(all_joint_positions(hand, posture.joint_positions))
+
     return {
         "rank": rank,
         "verdict": str(grasp.verdict),
@@ -173,9 +194,9 @@ def _grasp(rank: int, grasp: Grasp) -> dict[str, Any]:
         "score": grasp.score,
         "position": _list(grasp.grasp.position),
         "quaternion_wxyz": _list(grasp.grasp.quaternion_wxyz),
-        "joint_positions": _list(grasp.grasp.joint_positions),
-        "pregrasp_joint_positions": _list(grasp.pregrasp.joint_positions),
-        "squeeze_joint_positions": _list(grasp.squeeze.joint_positions),
+        "joint_positions": joints(grasp.grasp),
+        "pregrasp_joint_positions": joints(grasp.pregrasp),
+        "squeeze_joint_positions": joints(grasp.squeeze),
         "pregrasp_position": _list(grasp.pregrasp.position),
         "pregrasp_quaternion_wxyz": _list(grasp.pregrasp.quaternion_wxyz),
         "contacts": [{"link": c.link, "position": list(c.position), "normal": list(c.normal)} for c in grasp.contacts],

@@ -18,9 +18,10 @@ from graspd_core.geometry.choice import Target
 from graspd_core.geometry.cloud import PointCloud, transform_cloud
 from graspd_core.geometry.depth import cloud_from_depth
 from graspd_core.geometry.load import load_scene
+from graspd_core.geometry.memory import give_memory_back
 from graspd_core.geometry.mesh import surface_samples
+from graspd_core.geometry.own_process import elsewhere, work_elsewhere
 from graspd_core.geometry.perceive import scene_from_views
-from graspd_core.geometry.poisson import fit_elsewhere
 from graspd_core.geometry.scene import Scene, object_parts
 from graspd_core.geometry.shapes import make_shape
 from graspd_core.hands.kinematics import link_poses
@@ -28,6 +29,7 @@ from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.metrics.judge import make_judge
 from graspd_core.metrics.quality import measure
+from graspd_core.optimise.effort import at_effort
 from graspd_core.optimise.solver import Hooks
 from graspd_core.optimise.synthesis import synthesise
 from graspd_core.types import (
@@ -44,7 +46,7 @@ from graspd_core.types import (
 )
 from graspd_core.verify.lift import lift_trial, retreat_posture
 from graspd_core.verify.trial import hold_trial, judge
-from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
 __all__ = [
     "HandModel",
@@ -54,6 +56,8 @@ __all__ = [
     "Target",
     "check_request",
     "cloud_from_depth",
+    "elsewhere",
+    "give_memory_back",
     "hand_names",
     "link_poses",
     "load_hand",
@@ -70,8 +74,8 @@ T, R = TypeVar("T"), TypeVar("R")
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
 
-# Rounds of optimiser and trial at most, and the distance of their seeds.
-_ROUNDS, _SEED_STEP = 3, 1_000_003
+# How far apart the seeds of two rounds are.
+_SEED_STEP = 1_000_003
 
 
 def plan_grasps(
@@ -121,17 +125,16 @@ def plan_grasps(
     grasps: tuple[Grasp, ...] = ()
     first, good, optimising = None, 0, 0.0
     # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
-    for attempt in range(_ROUNDS):
-        began = time.perf_counter()
-        found = synthesise(
-            scene, hand, count=count - good, seed=seed + _SEED_STEP * attempt, config=config, hooks=hooks, device=device
-        )
+    for attempt, settings in enumerate(_rounds(scene, config, verify)):
+        began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
+        found = synthesise(scene, hand, count=count - good, seed=seeded, config=settings, hooks=hooks, device=device)
         optimising += time.perf_counter() - began
         if parts is None:
             metrics_judge = make_judge(scene.object, hand)
             new = tuple(replace(g, metrics=measure(metrics_judge, g.grasp)) for g in found.grasps[: count - good])
         else:
-            new, passed_at = _verify(run, scene, hand, found.grasps, parts, PROTOCOLS[verify], count - good, good)
+            protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+            new, passed_at = _verify(run, scene, hand, found.grasps, parts, protocol, count - good, good)
             first = first or passed_at
         grasps = tuple(sorted((*grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
         good = sum(g.verdict is not Verdict.FAILED for g in grasps)
@@ -171,13 +174,27 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     """Do the first-use work of all libraries on a small sphere, so that the first request is as fast as others.
 
-    For a process that serves: from then on surfaces are fitted to clouds in a process of their own, since threads
-    beside would stand still meanwhile.
+    For a process that serves: from then on what goes through `elsewhere`, and cutting objects into convex parts, is
+    done in a child process, since threads beside would stand still meanwhile.
     """
-    fit_elsewhere()
+    work_elsewhere()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
-    scene = scene_from_views([PointCloud(ball, np.zeros(3))], alone=True)
+    scene = elsewhere(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
     plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)
+
+
+def _rounds(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
+    """Settings of every round, each with more effort than the last.
+
+    A cheap first round pays where its failures are found out at little cost: by a hold trial, on an object whose shape
+    is known and that has nothing about it.
+    """
+    rounds = config.rounds
+    cheap = verify != "none" and scene.support is None and not scene.neighbours and scene.trust is None
+    first = rounds.first_effort if cheap else 1.0
+    most = rounds.first_effort * rounds.growth ** (rounds.most - 1)
+    efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
+    return [at_effort(config, effort) for effort in efforts]
 
 
 def _in_background(work: Callable[[T], R], argument: T) -> Future[R]:

@@ -131,6 +131,8 @@ class GraspMetrics:
         epsilon: Ferrari-Canny radius, torque scaled by the object's largest radius.
         volume: volume of the grasp wrench hull.
         displacement: the papers' simulation displacement [m], None where it was not run.
+        contact_area_5mm: hand surface within 5 mm of the object [m²], None where nobody measured.
+        contact_area_10mm: hand surface within 10 mm of the object [m²], None where nobody measured.
     """
 
     contact_area: float
@@ -141,6 +143,8 @@ class GraspMetrics:
     epsilon: float
     volume: float
     displacement: float | None = None
+    contact_area_5mm: float | None = None
+    contact_area_10mm: float | None = None
 
 
 @dataclass(frozen=True)

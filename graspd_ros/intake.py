@@ -11,7 +11,7 @@ from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 from jaxtyping import Float
 
-from graspd_core.pipeline import PointCloud, Scene, load_scene
+from graspd_core.pipeline import PointCloud, Scene, elsewhere, load_scene
 from graspd_ros.codes import ErrorCode, RequestError
 from graspd_ros.mesh_path import resolve_mesh
 from graspd_ros.parameters import Settings
@@ -66,7 +66,7 @@ class Intake:
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
         """A mesh named by its path alone. Raises MeshError."""
         load = self._mesh_loader(uri, settings)
-        return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load)
+        return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True)
 
     def from_sighting(self, request_id: str, settings: Settings, sighting: Sighting) -> Request:
         """What a camera showed unasked. Raises RequestError: it is too old."""
@@ -100,9 +100,18 @@ class Intake:
                 sighting = self._sighting(message, settings)
                 frame, stamp = sighting.frame, sighting.stamp
                 load = _loader(lambda: (trimmed(sighting.read(), settings),), settings, self._target(message, frame))
-        stamp = stamp if nanoseconds(stamp) else self._now()
-        source = SOURCES[message.source]
-        return Request(request_id, source, frame, stamp, settings, load, T_frame_object=pose, listener=listener)
+        timeless = nanoseconds(stamp) == 0
+        return Request(
+            request_id,
+            SOURCES[message.source],
+            frame,
+            self._now() if timeless else stamp,
+            settings,
+            load,
+            T_frame_object=pose,
+            listener=listener,
+            timeless=timeless,
+        )
 
     def _sighting(self, message: GraspRequest, settings: Settings) -> Sighting:
         if message.source == GraspRequest.LATEST_CLOUD:
@@ -130,8 +139,8 @@ class Intake:
     def _mesh_loader(self, uri: str, settings: Settings) -> Callable[[int], Scene]:
         path = resolve_mesh(uri, settings.mesh_roots)
         mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
-        return lambda resolution: load_scene(
-            str(path), mass=mass, friction=friction, scale=scale, resolution=resolution
+        return lambda resolution: elsewhere(
+            load_scene, str(path), mass=mass, friction=friction, scale=scale, resolution=resolution
         )
 
 

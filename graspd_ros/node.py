@@ -13,6 +13,8 @@ import threading
 from collections.abc import Callable
 
 STOP_TIMEOUT = 2.0  # seconds that a busy worker has to notice that it must stop
+# Seconds that a thread may keep Python from others (5 ms by itself): the executor asks for it several times a message.
+SWITCH_INTERVAL = 0.001
 
 EXIT_STOPPED = 0
 EXIT_FAILED = 1
@@ -34,6 +36,7 @@ def main(args: list[str] | None = None) -> int:
     from graspd_core.errors import GraspdError
     from graspd_ros.service import GraspNode
 
+    sys.setswitchinterval(SWITCH_INTERVAL)
     wake, failed = threading.Event(), threading.Event()
 
     def fail() -> None:

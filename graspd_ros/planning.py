@@ -25,7 +25,8 @@ PATIENCE = 0.15  # seconds that work gets to end by itself when its request is o
 _POLL = 0.02  # seconds between two looks at stop and deadline
 
 T = TypeVar("T")
-# `T_target_source` of two frames at a time; waits a little, unless the hook says stop; may raise a TransformError.
+# `T_target_source` of two frames at a time (0: the newest there is); waits a little, unless the hook says stop; may
+# raise a TransformError.
 Lookup = Callable[[str, str, Time, StopHook], np.ndarray]
 
 
@@ -90,7 +91,8 @@ class Planner:
         config = load_preset(settings.preset)
         # Looked up before the work, which would be lost where there is no transform.
         elsewhere = request.frame_out != request.frame
-        T_out_frame = self._lookup(request.frame_out, request.frame, request.stamp, stop) if elsewhere else None
+        stamp = Time() if request.timeless else request.stamp
+        T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if elsewhere else None
         scene = request.load(config.resolution)
         result = plan_grasps(
             scene,

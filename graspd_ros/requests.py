@@ -47,6 +47,7 @@ class Request:
         T_frame_object: pose of the object's own frame in `frame`; None where they are one.
         only_newest: whether a newer request of this kind takes its place while it waits.
         listener: who is told of it beside the topics; None where nobody is.
+        timeless: whether it came without a time of its own: then the newest transforms are meant.
         accepted: when the request came, by the monotonic clock [s].
     """
 
@@ -59,6 +60,7 @@ class Request:
     T_frame_object: Float[np.ndarray, "4 4"] | None = None
     only_newest: bool = False
     listener: Listener | None = None
+    timeless: bool = False
     accepted: float = field(default_factory=time.monotonic)
 
     @property

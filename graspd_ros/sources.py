@@ -11,11 +11,19 @@ from builtin_interfaces.msg import Time
 from jaxtyping import Float, Int
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from graspd_core.pipeline import PointCloud, Scene, Target, cloud_from_depth, scene_from_views, transform_cloud
+from graspd_core.bags.messages import points_from_message
+from graspd_core.pipeline import (
+    PointCloud,
+    Scene,
+    Target,
+    cloud_from_depth,
+    elsewhere,
+    scene_from_views,
+    transform_cloud,
+)
 from graspd_ros.codes import ErrorCode, RequestError
 from graspd_ros.depth import frame_of
 from graspd_ros.parameters import Settings
-from graspd_ros.pointcloud import points_from_message
 from graspd_ros.requests import MOST_CLOUD_BYTES
 
 MOST_VIEWS = 64
@@ -110,7 +118,8 @@ def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None, resolution: int
 ) -> Scene:
     """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m]."""
-    return scene_from_views(
+    return elsewhere(
+        scene_from_views,
         views,
         target=None if target is None else Target(point=target),
         alone=not settings.segment,

@@ -42,10 +42,12 @@ NODE_SEES = {"pipeline", "config", "types", "errors", "paths", "io", "transforms
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {
     "mujoco": ("graspd_core/verify/",),
+    "pybullet": ("graspd_core/verify/",),
     "open3d": ("graspd_core/geometry/",),
     "matplotlib": ("graspd_core/bench/charts",),
 }
 HEAVY = {"open3d", "trimesh", "igl", "vhacdx", "pytorch_kinematics", "mujoco", "matplotlib", "fast_simplification"}
+HEAVY |= {"pybullet"}
 ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
 
 

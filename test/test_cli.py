@@ -16,6 +16,7 @@ import pytest
 from graspd_core import pipeline
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
+from graspd_core.config import preset_names
 from graspd_core.geometry.mesh import save_mesh, surface_samples
 from graspd_core.geometry.shapes import make_shape
 from graspd_core.io import load_document
@@ -50,7 +51,7 @@ BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
 BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--hand", "claw"], "unknown hand 'claw'; known: allegro_right"),
     (["--hand", "missing.yaml"], "missing.yaml: no such file"),
-    (["--preset", "best"], "unknown preset 'best'; valid presets: accurate, balanced, fast"),
+    (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
     (["-n", "0"], "count: 0 grasps; valid: 1 to 1024"),
     (["-n", "many"], "invalid int value: 'many'"),
     (["--seed", "-1"], "seed: -1; valid: 0 to"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.config import LossWeights, PlanConfig, from_mapping, load_preset, preset_names
+from graspd_core.config import LossWeights, PlanConfig, SegmentConfig, from_mapping, load_preset, preset_names
 from graspd_core.errors import ConfigError
 
 
@@ -84,6 +84,25 @@ def test_an_unknown_preset_lists_the_known(name: str):
     with pytest.raises(ConfigError) as caught:
         load_preset(name)
     assert all(known in str(caught.value) for known in (name, "fast", "balanced", "accurate"))
+
+
+def test_places_are_read_with_their_signs():
+    read = from_mapping(SegmentConfig, {"roi_low": [-0.5, -1, 0.0], "roi_high": None})
+    assert read == SegmentConfig(roi_low=(-0.5, -1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("value", "complaint"),
+    [
+        ([0.0, 1.0], r"config.roi_low: expected 3 values, got \[0.0, 1.0\]"),
+        (0.5, "config.roi_low: expected 3 values, got 0.5"),
+        ([0.0, "left", 1.0], r"config.roi_low\[1\]: expected float, got 'left'"),
+        ([0.0, 1.0, float("-inf")], r"config.roi_low\[2\]: -inf must be a finite number$"),
+    ],
+)
+def test_a_place_that_is_none_is_named(value: object, complaint: str):
+    with pytest.raises(ConfigError, match=complaint):
+        from_mapping(SegmentConfig, {"roi_low": value})
 
 
 def test_every_setting_is_explained():

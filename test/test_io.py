@@ -44,7 +44,7 @@ TOP = {
     "timing",
     "grasps",
 }
-HAND = {"name", "urdf", "base_link", "joint_names"}
+HAND = {"name", "urdf", "base_link", "joint_names", "mimic", "mount"}
 OBJECT = {"source", "sha256", "center_of_mass", "mass", "friction", "scale", "support"}
 TIMING = {"load", "sdf", "compile", "optimise", "verify", "first_verified", "total"}
 GRASP = {

@@ -1,6 +1,6 @@
 """The command line, one file a command; heavy imports wait for who needs them.
 
-graspd synthesize | replay | reconstruct | hands | doctor
+graspd synthesize | replay | reconstruct | bench | hands | doctor
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from graspd_core.cli import reconstruct, replay, synthesize
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
+from graspd_core.cli import bench, hands, reconstruct, replay, synthesize
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from graspd_core.errors import ConfigError, GraspdError
 
 
@@ -42,23 +42,11 @@ def build_parser() -> argparse.ArgumentParser:
     synthesize.add_command(commands)
     replay.add_command(commands)
     reconstruct.add_command(commands)
-    hands = commands.add_parser("hands", help="list the hands in the box")
-    hands.set_defaults(run=_hands)
+    bench.add_command(commands)
+    hands.add_command(commands)
     doctor = commands.add_parser("doctor", help="check the installation")
     doctor.set_defaults(run=_doctor)
     return parser
-
-
-def _hands(options: argparse.Namespace) -> int:
-    import torch
-
-    from graspd_core.pipeline import hand_names, load_hand
-
-    torch.set_num_threads(1)
-    for name in hand_names():
-        hand = load_hand(name)
-        print(f"{name}: {hand.num_joints} joints, {len(hand.candidate_points)} contact candidates, {hand.urdf}")
-    return EXIT_OK
 
 
 def _doctor(options: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from graspd_core.config.closed_form import ClosedFormConfig, LossWeights
 from graspd_core.config.graspd2022 import Graspd2022Config
 from graspd_core.config.mapping import from_mapping
 from graspd_core.config.postures import PostureConfig
+from graspd_core.config.rounds import RoundsConfig
 from graspd_core.config.segment import SegmentConfig
 from graspd_core.errors import ConfigError
 from graspd_core.paths import config_dir
@@ -26,6 +27,7 @@ __all__ = [
     "PlanConfig",
     "PostureConfig",
     "RandomClosureConfig",
+    "RoundsConfig",
     "SegmentConfig",
     "from_mapping",
     "load_preset",
@@ -50,6 +52,7 @@ class PlanConfig:
         annealing: settings of the GraspIt!-style planner.
         random_closure: settings of the floor.
         postures: pregrasp and squeeze.
+        rounds: of optimiser and trial.
     """
 
     resolution: int = 48
@@ -59,6 +62,7 @@ class PlanConfig:
     annealing: AnnealingConfig = field(default_factory=AnnealingConfig)
     random_closure: RandomClosureConfig = field(default_factory=RandomClosureConfig)
     postures: PostureConfig = field(default_factory=PostureConfig)
+    rounds: RoundsConfig = field(default_factory=RoundsConfig)
 
 
 def preset_names() -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,13 @@ class ClosedFormConfig:
         features: sharp points of the object looked at while polishing.
         directions: disturbance wrenches.
         friction: coefficient planned with; below the object's own, so that contacts keep a margin.
+        activation: whether contact fades over its width or, for the ablation, ends at `delta_end`.
         delta_start: width of the soft contact at the start [m].
         delta_end: width of the soft contact at the end [m].
         radius_start: greatest padding of the object at the start [m].
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
-        joint_rate: step size of the joints [rad].
+        joint_rate: step size of the joints [rad]; sliding ones take 0.05 m for a radian.
         weights: of the loss terms while exploring and refining.
         polish_weights: of the loss terms while polishing.
         obstacle_factor: times as many starts are tried and kept where there is a support or a neighbour, which rule
@@ -64,6 +66,7 @@ class ClosedFormConfig:
     features: int = 128
     directions: int = 24
     friction: float = 0.4
+    activation: Literal["soft", "hard"] = "soft"
     delta_start: float = 0.02
     delta_end: float = 0.004
     radius_start: float = 0.03

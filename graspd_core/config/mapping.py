@@ -28,7 +28,7 @@ def from_mapping(cls: type[T], values: Any, where: str = "config") -> T:
     return cls(**{key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()})
 
 
-def _coerce(hint: Any, value: Any, where: str) -> Any:
+def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_mapping(typing.cast(type, hint), value, where)
     origin = typing.get_origin(hint)
@@ -40,10 +40,20 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
         if value is None and type(None) in typing.get_args(hint):
             return None
         hint = next(h for h in typing.get_args(hint) if h is not type(None))
+    if typing.get_origin(hint) is tuple:
+        return _tuple(typing.get_args(hint), value, where)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
-    if isinstance(value, int | float) and not 0 <= value < float("inf"):
-        raise ConfigError(f"{where}: {value!r} must be a finite number, zero or more")
+    if isinstance(value, int | float) and not (-float("inf") if signed else 0) <= value < float("inf"):
+        raise ConfigError(f"{where}: {value!r} must be a finite number{'' if signed else ', zero or more'}")
     return value
+
+
+def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    """Places and the like: one value for each hint, of either sign."""
+    if not isinstance(value, list | tuple) or len(value) != len(hints):
+        raise ConfigError(f"{where}: expected {len(hints)} values, got {value!r}")
+    pairs = enumerate(zip(hints, value, strict=True))
+    return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)

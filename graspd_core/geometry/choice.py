@@ -64,7 +64,7 @@ def choose(
     label: Int[np.ndarray, "voxels"],
     free: Sequence[int],
     target: Target,
-    first: PointCloud,
+    views: Sequence[PointCloud],
     *,
     reach: float,
 ) -> Bool[np.ndarray, "voxels"]:
@@ -74,7 +74,7 @@ def choose(
         label: the thing each voxel is part of, -1 for none.
         free: the things to choose from if no target says which.
         target: checked.
-        first: the first view as given.
+        views: as given.
         reach: a target point is at most this far from its thing [m].
 
     Raises:
@@ -94,7 +94,7 @@ def choose(
         return _covered(label, meant, [int(inside.argmax())], inside / np.bincount(label[label >= 0], minlength=many))
     if target.mask is not None:
         return _masked(scene, label, many, target.mask)
-    return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, first))
+    return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
 
 
 def seen(scene: ThinScene, label: Int[np.ndarray, "voxels"]) -> str:
@@ -144,10 +144,13 @@ def _covered(
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 
 
-def _off_axis(thing: Float[np.ndarray, "n 3"], scene: ThinScene, first: PointCloud) -> float:
-    """Angle between the view axis and the thing, to a twentieth of its points [rad]."""
-    axis = first.forward if first.forward is not None else scene.points[scene.of_view(0)].mean(0) - first.viewpoint
-    ray = thing - first.viewpoint
+def _off_axis(thing: Float[np.ndarray, "n 3"], scene: ThinScene, views: Sequence[PointCloud]) -> float:
+    """Angle between the axis of the first view that shows anything and a thing, to a twentieth of its points [rad]."""
+    first = next(k for k, rows in enumerate(scene.rows) if len(rows))
+    axis, viewpoint = views[first].forward, views[first].viewpoint
+    if axis is None:
+        axis = scene.points[scene.of_view(first)].mean(0) - viewpoint
+    ray = thing - viewpoint
     along = ray @ axis
     across = np.linalg.norm(np.cross(ray, axis), axis=1)
     return float(np.percentile(np.arctan2(across, along), 5))

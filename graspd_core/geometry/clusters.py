@@ -17,6 +17,8 @@ DENSE = 1.6
 # Sparse ones are linked over this many times the distance to the fourth neighbour: surfaces seen at a small angle have
 # their points far apart along the line of sight.
 SPARSE = 2.5
+# But never over more than this [m]: a few points scattered over a room are no thing.
+LONGEST = 0.05
 SAMPLE = 2000
 
 
@@ -28,7 +30,7 @@ def link_length(points: Float[np.ndarray, "n 3"], gap: float) -> float:
         return gap
     some = points[:: max(1, len(points) // SAMPLE)]
     spacing = float(np.median(KDTree(points).query(some, k=5)[0][:, -1]))
-    return LINKED * gap if DENSE * spacing <= LINKED * gap else SPARSE * spacing
+    return LINKED * gap if DENSE * spacing <= LINKED * gap else min(SPARSE * spacing, LONGEST)
 
 
 def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float) -> Int[np.ndarray, "n"]:

@@ -64,7 +64,7 @@ def convex_parts(mesh: TriangleMesh, *, tolerance: float = 0.002, max_parts: int
     sdf = build_sdf(mesh, resolution=56, padding=0.005)
     clusters = _join(sdf, _cut_up(sdf, points, tolerance, round(SURPLUS * max_parts)), tolerance, max_parts)
     corners = int(np.clip(ALL_VERTICES // len(clusters), FEWEST_VERTICES, MOST_VERTICES))
-    return tuple(_part(cluster, corners) for cluster in clusters)
+    return tuple(limited_hull(cluster, corners) for cluster in clusters)
 
 
 def _cut_up(sdf: GridSDF, points: Points, tolerance: float, most: int) -> list[Points]:
@@ -191,7 +191,7 @@ def _thin(points: Points, most: int) -> Points:
     return points[np.linspace(0, len(points) - 1, most).astype(int)]
 
 
-def _part(points: Points, most: int) -> TriangleMesh:
+def limited_hull(points: Points, most: int) -> TriangleMesh:
     """The hull of at most `most` of the points: extremes along even directions, then whichever is farthest out."""
     hull = _hull(points)
     if hull is None:

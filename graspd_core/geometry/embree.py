@@ -13,8 +13,8 @@ from jaxtyping import Float, Integer
 
 from graspd_core.types import TriangleMesh
 
-# Questions per call: Open3D holds Python's lock during one, so this bounds how long other threads wait (some 10 ms).
-_CHUNK = 4096
+# Questions per call: Open3D holds Python's lock during one, so this bounds how long other threads wait (some 2 ms).
+_CHUNK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def first_hits(
 
 
 def _slices(points: Float[np.ndarray, "n 3"]):
-    """Tensors of the points, a few thousand each; one at least."""
+    """Tensors of the points, a few hundred each; one at least."""
     return [_tensor(points[i : i + _CHUNK], np.float32) for i in range(0, max(len(points), 1), _CHUNK)]
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from graspd_core.geometry.exact import make_distance_query, signed_distance
 from graspd_core.geometry.mesh import surface_samples
+from graspd_core.geometry.rows import packed_rows
 from graspd_core.types import TriangleMesh
 
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
@@ -57,8 +58,8 @@ def _pool(mesh: TriangleMesh, seed: int) -> tuple[Float[np.ndarray, "n 3"], Floa
         np.add.at(vertex_normals, mesh.faces[:, corner], scaled)
     vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=-1, keepdims=True), 1e-20)
     rng = np.random.default_rng(seed)
-    pairs = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    edges = np.unique(np.sort(pairs), axis=0)
+    pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]))
+    edges = pairs[np.unique(packed_rows(pairs), return_index=True)[1]]
     lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=-1)
     along = rng.choice(len(edges), size=_POOL, p=lengths / lengths.sum())
     a = rng.random((_POOL, 1))

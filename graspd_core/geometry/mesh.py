@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch.quasirandom import SobolEngine
 
 from graspd_core.errors import MeshError
+from graspd_core.geometry.dae import read_dae
 from graspd_core.geometry.topology import (
     drop_degenerate,
     drop_repeated,
@@ -157,8 +158,10 @@ def _read(path: Path):
     import trimesh
 
     try:
-        scene = trimesh.load_scene(path, process=False)
-        mesh = scene.to_mesh()
+        if path.suffix.lower() == ".dae":
+            mesh = read_dae(path)
+        else:
+            mesh = trimesh.load_scene(path, process=False).to_mesh()
     except (MemoryError, KeyboardInterrupt):
         raise
     # The readers behind trimesh raise whatever their format's parser does, from KeyError to struct.error.

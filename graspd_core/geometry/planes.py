@@ -26,6 +26,8 @@ FITTED = 3.0
 WIDEST = 0.02
 # Side of the cells by which a plane's visible part is measured; occlusion and holes of a few cells are bridged [m].
 CELL = 0.01
+# Cells of that raster along a side at most; of larger parts the cells are wider.
+MOST_CELLS = 2000
 BRIDGED = 3
 
 
@@ -158,7 +160,8 @@ def _measure(
     rows = np.flatnonzero(inliers)
     flat = points[rows] @ axes
     low = flat.min(0)
-    cell = np.round((flat - low) / CELL).astype(int) + BRIDGED
+    width = max(CELL, float(np.ptp(flat, axis=0).max()) / MOST_CELLS)
+    cell = np.round((flat - low) / width).astype(int) + BRIDGED
     raster = np.zeros(cell.max(0) + 2 * BRIDGED, dtype=bool)
     raster[tuple(cell.T)] = True
     names, _ = label(binary_dilation(raster, iterations=BRIDGED))  # pyright: ignore[reportGeneralTypeIssues]
@@ -174,7 +177,7 @@ def _measure(
     _, turn = np.linalg.eigh(np.cov(flat.T))
     sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
     area = float(hull.volume)
-    seen = len(np.unique(cell[largest], axis=0)) * CELL**2
+    seen = len(np.unique(cell[largest], axis=0)) * width**2
     return FlatPart(
         plane, axes, noise, least, kept, (float(sides.max()), float(sides.min())), hull.equations, area, seen / area
     )

@@ -16,7 +16,6 @@ from graspd_core.errors import CloudError
 from graspd_core.geometry.embree import closest_points, make_surface
 from graspd_core.geometry.evidence import SLACK, Evidence, empty_depth
 from graspd_core.geometry.fuse import Surfels
-from graspd_core.geometry.own_process import OwnProcess
 from graspd_core.types import TriangleMesh
 
 # Cells of the grid along the object's longest side, and the least width of one [m].
@@ -31,20 +30,11 @@ BAND = 2
 MOST_DISTANCES = 2_000_000
 
 
-_elsewhere: OwnProcess | None = None
-
-
-def fit_elsewhere() -> None:
-    """From now on fit surfaces in a process of their own: Open3D holds Python's lock through a fit, half a second."""
-    global _elsewhere
-    _elsewhere = _elsewhere or OwnProcess(_fit)
-
-
 def fit_poisson(surfels: Surfels) -> TriangleMesh:
     """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size."""
     size = float(np.ptp(surfels.points, axis=0).max())
     depth = int(np.clip(np.ceil(np.log2(1.2 * size / COARSEST)), 5, 7))
-    vertices, faces = (_elsewhere or _fit)(surfels.points, surfels.normals, depth)
+    vertices, faces = _fit(surfels.points, surfels.normals, depth)
     if len(faces) == 0:
         raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
     return TriangleMesh(vertices, faces)

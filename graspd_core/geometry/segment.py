@@ -63,8 +63,8 @@ def segment(
     label = _things(scene, ground, eyes, settings)
     free = _candidates(scene, label, ground, settings)
     if not free:
-        raise NoObjectError(_nothing(scene, ground))
-    chosen = choose(scene, label, free, target, views[0], reach=settings.target_reach)
+        raise NoObjectError(_nothing(scene, label, ground, settings))
+    chosen = choose(scene, label, free, target, views, reach=settings.target_reach)
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found)
     if total < FEWEST_POINTS:
@@ -183,11 +183,13 @@ def _cut_off(scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], settings: Seg
     return cut
 
 
-def _nothing(scene: ThinScene, ground: Ground) -> str:
+def _nothing(scene: ThinScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentConfig) -> str:
     """What was seen instead of an object."""
+    if label.max(initial=-1) >= 0:
+        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        return f"{told}, and each is larger than largest_object={settings.largest_object:g} m"
     flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
     if not flat:
-        label = np.full(len(scene.mean), -1)
         return f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
     part = flat[0]
     away = float(np.median(scene.mean_distance[part.inliers]))

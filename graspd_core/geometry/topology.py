@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from graspd_core.geometry.rows import packed_rows
 from graspd_core.types import TriangleMesh
 
 Vertices = Float[np.ndarray, "vertices 3"]
@@ -18,8 +19,8 @@ def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
     """Vertices of one lattice cell of 1 µm become one."""
     low = mesh.vertices.min(0)
     cells = np.round((mesh.vertices - low) / MERGE_DISTANCE).astype(np.int64)
-    _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    return np.asarray(mesh.vertices, dtype=float)[first], inverse.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
+    _, first, inverse = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
+    return np.asarray(mesh.vertices, dtype=float)[first], inverse[np.asarray(mesh.faces, dtype=np.int64)]
 
 
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
@@ -32,7 +33,7 @@ def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3
 
 def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:
     """The first face on each set of three vertices, whatever its winding."""
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    _, first = np.unique(packed_rows(np.sort(faces, axis=1)), return_index=True)
     return faces[np.sort(first)]
 
 

@@ -1,4 +1,4 @@
-"""Collision elements of a URDF as primitives: boxes, spheres, cylinders as they are, meshes as convex hulls."""
+"""Shapes of a URDF as primitives: boxes, spheres, cylinders and capsules as they are, meshes as convex hulls."""
 
 from __future__ import annotations
 
@@ -6,79 +6,64 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from graspd_core.errors import HandError
 from graspd_core.hands.elements import read_numbers, read_origin
-from graspd_core.hands.model import Primitive
+from graspd_core.hands.markup import wrong
+from graspd_core.hands.meshfiles import LARGEST_SIZE, mesh_hull
+from graspd_core.hands.model import Primitive, PrimitiveKind
+
+_ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
+_SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
 
 
-def read_primitives(path: Path, link: int, element: ET.Element) -> list[Primitive]:
-    """The primitives of one `<link>`.
+def read_primitives(path: Path, link: ET.Element) -> tuple[list[Primitive], bool]:
+    """The primitives of one `<link>`, link number zero, and whether they are those of its visuals.
+
+    A link without `<collision>` collides with what it shows.
 
     Raises:
         HandError: a shape is unknown, has no positive size, or its mesh cannot be found or read.
     """
-    return [_read_primitive(path, link, collision) for collision in element.findall("collision")]
+    collisions, visuals = link.findall("collision"), link.findall("visual")
+    shown = not collisions and bool(visuals)
+    return [_read_primitive(path, element) for element in (visuals if shown else collisions)], shown
 
 
-def _read_primitive(path: Path, link: int, collision: ET.Element) -> Primitive:
-    rotation, translation = read_origin(path, collision)
-    geometry = collision.find("geometry")
+def _read_primitive(path: Path, element: ET.Element) -> Primitive:
+    rotation, translation = read_origin(path, element)
+    geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
     if not shapes:
-        raise HandError(f"{path}: a <collision> element has no geometry")
+        raise wrong(path, element, f"a <{element.tag}> element has no geometry")
     shape = shapes[0]
     if shape.tag == "box":
         half = 0.5 * _positive(path, shape, "size", 3)
-        return Primitive(link, "box", rotation, translation, tuple(half.tolist()))
+        return Primitive(0, "box", rotation, translation, tuple(half.tolist()))
     if shape.tag == "sphere":
-        return Primitive(link, "sphere", rotation, translation, (float(_positive(path, shape, "radius", 1)[0]),))
-    if shape.tag in ("cylinder", "capsule"):
+        return Primitive(0, "sphere", rotation, translation, (float(_positive(path, shape, "radius", 1)[0]),))
+    if shape.tag in _ROUND:
         radius, length = (float(_positive(path, shape, key, 1)[0]) for key in ("radius", "length"))
-        kind = "cylinder" if shape.tag == "cylinder" else "capsule"
-        return Primitive(link, kind, rotation, translation, (radius, 0.5 * length))
+        return Primitive(0, _ROUND[shape.tag], rotation, translation, (radius, 0.5 * length))
     if shape.tag == "mesh":
-        scale = read_numbers(path, shape, "scale", 3, "1 1 1")
-        vertices, faces = _hull(resolve_mesh(path, shape.get("filename") or ""), scale)
-        return Primitive(link, "hull", rotation, translation, (), vertices, faces)
-    raise HandError(f"{path}: unknown collision shape <{shape.tag}>; known: box, sphere, cylinder, capsule, mesh")
+        hull = mesh_hull(path, shape, shape.get("filename") or "", _scale(path, shape))
+        return Primitive(0, "hull", rotation, translation, (), hull.vertices, hull.faces)
+    raise wrong(path, shape, f"unknown {element.tag} shape <{shape.tag}>; known: {', '.join(_SHAPES)}")
 
 
-def resolve_mesh(urdf: Path, filename: str) -> Path:
-    """Where a mesh named by a URDF lies: `package://` and relative paths are looked for upwards from the URDF.
-
-    Raises:
-        HandError: no such file.
-    """
-    plain = filename.removeprefix("file://")
-    if plain.startswith("package://"):
-        inside = Path(plain.removeprefix("package://"))
-        tails = [inside, Path(*inside.parts[1:])]
-    else:
-        tails = [Path(plain)]
-    for folder in urdf.resolve().parents:
-        for tail in tails:
-            if (folder / tail).is_file():
-                return folder / tail
-    raise HandError(f"{urdf}: mesh {filename!r} was not found beside the file or above it")
+def _scale(path: Path, shape: ET.Element) -> Float[np.ndarray, "3"]:
+    one = len((shape.get("scale") or "").split()) == 1
+    scale = np.resize(read_numbers(path, shape, "scale", 1 if one else 3, "1 1 1"), 3)
+    if (scale == 0).any():
+        raise wrong(path, shape, f"<mesh scale={shape.get('scale')!r}>: a factor cannot be zero")
+    return scale
 
 
 def _positive(path: Path, shape: ET.Element, key: str, count: int) -> Float[np.ndarray, "n"]:
     values = read_numbers(path, shape, key, count, "")
     if (values <= 0).any():
-        raise HandError(f"{path}: <{shape.tag} {key}={shape.get(key)!r}>: sizes must be positive")
+        raise wrong(path, shape, f"<{shape.tag} {key}={shape.get(key)!r}>: sizes must be positive")
+    if (values > LARGEST_SIZE).any():
+        text = f"<{shape.tag} {key}={shape.get(key)!r}>"
+        raise wrong(path, shape, f"{text}: larger than {LARGEST_SIZE:g} m; lengths are in metres")
     return values
-
-
-def _hull(mesh: Path, scale: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Convex hull of a mesh file, coincident corners merged [m]."""
-    import trimesh
-
-    try:
-        loaded = trimesh.load(mesh, force="mesh")
-        hull = trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces).convex_hull  # type: ignore[union-attr]
-    # trimesh and its readers raise many unrelated types for a bad file; whichever it is, the file is the culprit.
-    except Exception as error:
-        raise HandError(f"{mesh}: cannot be read as a collision mesh: {error}".splitlines()[0]) from error
-    return np.asarray(hull.vertices, dtype=np.float64), np.asarray(hull.faces, dtype=np.int64)

@@ -12,11 +12,13 @@ import yaml
 from jaxtyping import Float
 
 from graspd_core.errors import HandError
+from graspd_core.hands.guess import guess_palm, guess_postures
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.model import HandModel
+from graspd_core.hands.model import HandModel, Mount
+from graspd_core.hands.mount import read_mount
 
-_KEYS = ("name", "urdf", "palm", "approach", "effort", "open", "closed")
-_REQUIRED = ("urdf", "palm", "open", "closed")
+_KEYS = ("name", "urdf", "palm", "approach", "effort", "open", "closed", "mount")
+_REQUIRED = ("urdf",)
 _PALM_KEYS = ("link", "center", "normal")
 
 
@@ -27,27 +29,29 @@ class HandDescription:
     Attributes:
         path: the file.
         name: the hand's name, the file's stem unless given.
-        urdf: the URDF's path.
+        urdf: path of the URDF or MJCF file.
         palm_link: the link that palm_center and palm_normal are given in; None for the base link.
-        palm_center: the point of the palm that grasps centre on [m].
-        palm_normal: direction out of the palm, unit.
+        palm_center: the point of the palm that grasps centre on [m]; None where the palm is to be guessed.
+        palm_normal: direction out of the palm, unit; None likewise.
         approach: direction of approach in the base frame, unit; None for the palm's normal.
         effort: one greatest torque for all joints, some by name, or None for the URDF's [N·m].
-        open, closed: joint values by joint name [rad].
+        open, closed: joint values by joint name [rad] or [m]; None where they are to be guessed.
         lines: line of each key in the file, `palm.center` for a nested one.
+        mount: where the base link sits on an arm; None where the file does not say.
     """
 
     path: Path
     name: str
     urdf: Path
     palm_link: str | None
-    palm_center: Float[np.ndarray, "3"]
-    palm_normal: Float[np.ndarray, "3"]
+    palm_center: Float[np.ndarray, "3"] | None
+    palm_normal: Float[np.ndarray, "3"] | None
     approach: Float[np.ndarray, "3"] | None
     effort: float | dict[str, float] | None
-    open: dict[str, float]
-    closed: dict[str, float]
+    open: dict[str, float] | None
+    closed: dict[str, float] | None
     lines: dict[str, int]
+    mount: Mount | None = None
 
     def error(self, key: str, message: str) -> HandError:
         """The error to raise about a key: names file, line and key."""
@@ -73,8 +77,8 @@ def read_description(path: Path) -> HandDescription:
     data = yaml.safe_load(path.read_text(encoding="utf-8"))
     root = _mapping(path, 1, "the file", data)
     _check_keys(path, lines, root, "", _KEYS, _REQUIRED)
-    palm = _mapping(path, lines["palm"], "palm", root["palm"])
-    _check_keys(path, lines, palm, "palm.", _PALM_KEYS, ("center", "normal"))
+    palm = _mapping(path, lines["palm"], "palm", root["palm"]) if "palm" in root else {}
+    _check_keys(path, lines, palm, "palm.", _PALM_KEYS, ("center", "normal") if "palm" in root else ())
 
     def vector(key: str, value: Any, *, unit: bool) -> Float[np.ndarray, "3"]:
         if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value):
@@ -106,38 +110,49 @@ def read_description(path: Path) -> HandDescription:
         name=root.get("name", path.stem),
         urdf=path.parent / root["urdf"],
         palm_link=palm.get("link"),
-        palm_center=vector("palm.center", palm["center"], unit=False),
-        palm_normal=vector("palm.normal", palm["normal"], unit=True),
+        palm_center=vector("palm.center", palm["center"], unit=False) if palm else None,
+        palm_normal=vector("palm.normal", palm["normal"], unit=True) if palm else None,
         approach=vector("approach", root["approach"], unit=True) if "approach" in root else None,
         effort=effort,
-        open=posture("open"),
-        closed=posture("closed"),
+        open=posture("open") if "open" in root else None,
+        closed=posture("closed") if "closed" in root else None,
         lines=lines,
+        mount=read_mount(path, lines, root["mount"]) if "mount" in root else None,
     )
 
 
 def apply_description(hand: HandModel, description: HandDescription) -> HandModel:
-    """The hand with the description's palm, postures and efforts.
+    """The hand with the description's palm, postures and efforts; what it leaves out is guessed, with a warning.
 
     Raises:
         HandError: an unknown joint or link, a joint without a value, or a value outside the joint's limits.
     """
+    known_at_once = {"name": description.name, "effort": _efforts(hand, description), "mount": description.mount}
+    hand = _with_palm(replace(hand, **known_at_once), description)
+    given = {"open": description.open, "closed": description.closed}
+    known = {key: _posture(hand, description, key, values) for key, values in given.items() if values is not None}
+    if len(known) < len(given):
+        hand = guess_postures(hand, tuple(key for key in given if key not in known))
+    return replace(hand, **{f"{key}_posture": values for key, values in known.items()})
+
+
+def _with_palm(hand: HandModel, description: HandDescription) -> HandModel:
+    center, normal = description.palm_center, description.palm_normal
+    if center is None or normal is None:
+        hand = guess_palm(hand)
+        return hand if description.approach is None else replace(hand, approach=description.approach)
     link = description.palm_link or hand.base_link
     fixed = [name for name, group in zip(hand.link_names, hand.link_group, strict=True) if group == 0]
     if link not in fixed:
         raise description.error("palm.link", f"{link!r} is not fixed to the base; choose from {', '.join(fixed)}")
     rotations, translations = link_poses(hand, hand.open_posture)
     number = hand.link_index[link]
-    normal = rotations[number] @ description.palm_normal
+    normal = rotations[number] @ normal
     return replace(
         hand,
-        name=description.name,
-        palm_center=rotations[number] @ description.palm_center + translations[number],
+        palm_center=rotations[number] @ center + translations[number],
         palm_normal=normal,
         approach=normal if description.approach is None else description.approach,
-        effort=_efforts(hand, description),
-        open_posture=_posture(hand, description, "open", description.open),
-        closed_posture=_posture(hand, description, "closed", description.closed),
     )
 
 

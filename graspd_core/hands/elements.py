@@ -8,7 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import HandError
+from graspd_core.hands.markup import wrong
+
+# Nothing in a hand is farther than this from the frame that it is given in [m].
+_FARTHEST = 10.0
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
@@ -17,7 +20,20 @@ def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3
     if origin is None:
         return np.eye(3), np.zeros(3)
     rpy = read_numbers(path, origin, "rpy", 3, "0 0 0")
-    return rotation_from_rpy(rpy), read_numbers(path, origin, "xyz", 3, "0 0 0")
+    return rotation_from_rpy(rpy), read_position(path, origin, "xyz")
+
+
+def read_position(path: Path, element: ET.Element, key: str) -> Float[np.ndarray, "3"]:
+    """Three coordinates [m], zero where absent.
+
+    Raises:
+        HandError: they are not numbers, or farther away than anything in a hand is.
+    """
+    position = read_numbers(path, element, key, 3, "0 0 0")
+    if np.abs(position).max() > _FARTHEST:
+        text = f"<{element.tag} {key}={element.get(key)!r}>"
+        raise wrong(path, element, f"{text}: more than {_FARTHEST:g} m away; lengths are in metres")
+    return position
 
 
 def read_numbers(path: Path, element: ET.Element, key: str, count: int, default: str) -> Float[np.ndarray, "n"]:
@@ -32,7 +48,7 @@ def read_numbers(path: Path, element: ET.Element, key: str, count: int, default:
     except ValueError:
         values = np.zeros(0)
     if len(values) != count or not np.isfinite(values).all():
-        raise HandError(f"{path}: <{element.tag} {key}={text!r}>: expected {count} finite number(s)")
+        raise wrong(path, element, f"<{element.tag} {key}={text!r}>: expected {count} finite number(s)")
     return values
 
 

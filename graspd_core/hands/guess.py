@@ -1,67 +1,316 @@
-"""A palm and two postures for a hand that comes as a bare URDF. Guesses: a hand description beats them."""
+"""A palm, an approach and two postures for a hand whose description names none. A hand description beats them.
+
+Fingers are the chains that end in links which move no others; the palm is the link that all of them hang from. Where
+most fingers bend the same way (a human-like hand), the palm faces where they bend to: the linearised sweep of the
+fingertips from straight to mid-range. Where fingers bend or slide against each other (a gripper), the palm faces along
+them. The postures come from a search: fingertips evenly around a small ball in front of the palm, and around a large
+one.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, place, placement, point_jacobian
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.overlap import link_overlaps
 from graspd_core.hands.sampling import surface_points
+from graspd_core.hands.surface import dense_samples
 
-# How far in front of the palm a held object's middle is taken to be [m].
-_HOLD_DISTANCE = 0.04
+# Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
+# the fourth leave a half, three around a circle or two against one leave a third or less.
+_ALIKE = 0.42
+# Directions within this cosine of each other are the same; a thumb's are not those of the fingers.
+_SAME_WAY = 0.7
+# Radii of the balls that fingertips close and open around, and the ball's distance from the palm, in finger lengths.
+_CLOSED, _OPEN, _AHEAD = 0.12, 0.55, 0.4
+_STARTS, _SPREAD, _STEPS, _RATE = 24, 0.4, 150, 0.06
+# How much the search minds one-sided fingertips, joints away from where they rest, a ball away from its place,
+# overlap [1/m].
+_BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 20.0
+# Breadth of the palm's surface that its middle is found on [m].
+_SPOT = 0.02
 
 
-def guess_palm_and_postures(hand: HandModel) -> HandModel:
-    """The hand with an open posture at mid-range, a palm facing where the fingertips sweep, and a closed posture.
+@dataclass(frozen=True, eq=False)
+class _Fingers:
+    """The fingers at straight joints.
 
-    The palm is the root link. Each joint closes by a quarter of its range, the way that brings the fingertips nearer to
-    a point in front of the palm.
+    Attributes:
+        points: fingertips in the frame of their links [m].
+        links: the link of each.
+        roots: where each finger joins the palm, base frame [m].
+        tips: the fingertips in the base frame [m].
+        palm: the group of links that all fingers hang from.
+        wrist: joints that move the palm itself.
+        mates: the fingers of a human-like hand that bend the same way, without its thumb; none in a gripper.
+        bend: the unit direction in which they do, base frame; zero in a gripper.
     """
-    middle = 0.5 * (hand.lower + hand.upper)
-    tips = _leaf_links(hand)
-    center = _center(hand)
-    straight = link_poses(hand, np.clip(0.0, hand.lower, hand.upper))[1][tips].mean(0)
-    bent = link_poses(hand, middle)[1][tips].mean(0)
-    along = _unit(straight - center, np.array([0.0, 0.0, 1.0]))
-    sweep = bent - straight
-    side = np.array([1.0, 0.0, 0.0]) if abs(along[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    normal = _unit(sweep - (sweep @ along) * along, _unit(side - (side @ along) * along, side))
-    target = center + _HOLD_DISTANCE * normal
-    closed = middle.copy()
-    for joint in range(hand.num_joints):
-        step = np.zeros(hand.num_joints)
-        step[joint] = 0.25 * (hand.upper - hand.lower)[joint]
-        gap = [np.linalg.norm(link_poses(hand, middle + s * step)[1][tips] - target, axis=1).mean() for s in (-1, 0, 1)]
-        closed += (int(np.argmin(gap)) - 1) * step
+
+    points: Float[np.ndarray, "tips 3"]
+    links: Int[np.ndarray, "tips"]
+    roots: Float[np.ndarray, "tips 3"]
+    tips: Float[np.ndarray, "tips 3"]
+    palm: int
+    wrist: Int[np.ndarray, "wrist"]
+    mates: Bool[np.ndarray, "tips"]
+    bend: Float[np.ndarray, "3"]
+
+    @property
+    def length(self) -> float:
+        """Mean length of a finger [m]."""
+        return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
+
+
+def guess_palm(hand: HandModel) -> HandModel:
+    """The hand with a palm centre, a palm normal and an approach, and a warning that they are guessed."""
+    fingers = _fingers(hand)
+    normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
     return replace(
         hand,
-        open_posture=middle,
-        closed_posture=closed,
-        palm_center=center,
+        palm_center=_center(hand, fingers, normal),
         palm_normal=normal,
         approach=normal,
-        warnings=(*hand.warnings, f"{hand.name}: palm and postures were guessed; write a hand description to set them"),
+        warnings=(*hand.warnings, "palm guessed; name it in a hand description if it is wrong"),
     )
 
 
-def _leaf_links(hand: HandModel) -> Int[np.ndarray, "leaves"]:
-    return np.setdiff1d(np.arange(1, hand.num_links), hand.link_parent)
+def guess_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed")) -> HandModel:
+    """The hand with those postures guessed that `which` names, to suit its palm, and a warning that they are."""
+    fingers = _fingers(hand)
+    ahead = hand.palm_center + _AHEAD * fingers.length * hand.palm_normal
+    height = float(((fingers.tips - hand.palm_center) @ hand.palm_normal).mean())
+    if height > _AHEAD * fingers.length:
+        ahead = hand.palm_center + height * hand.palm_normal
+    middle = 0.5 * (hand.lower + hand.upper)
+    closed, ball = _around_ball(hand, fingers, ahead, _CLOSED * fingers.length, middle)
+    away = _outward(hand, fingers, placed_tips(hand, fingers, closed) - _side_by_side(fingers) - ball)
+    opened, _ = _around_ball(hand, fingers, ball, _OPEN * fingers.length, closed, away)
+    guessed = {f"{name}_posture": posture for name, posture in (("open", opened), ("closed", closed)) if name in which}
+    text = f"{' and '.join(which)} posture guessed; name them in a hand description if they are wrong"
+    return replace(hand, **guessed, warnings=(*hand.warnings, text))
 
 
-def _center(hand: HandModel) -> Float[np.ndarray, "3"]:
-    """Middle of the root link's solids, or of the finger roots where it has none [m]."""
+def _straight(hand: HandModel) -> Float[np.ndarray, "joints"]:
+    """Joints at zero, or as near as they come."""
+    return np.clip(0.0, hand.lower, hand.upper)
+
+
+def _fingers(hand: HandModel) -> _Fingers:
+    groups = hand.link_group
+    heads = np.unique(groups)
+    above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}
+    solid = {int(groups[p.link]) for p in hand.primitives}
+    # A leaf without solids is a frame or a sensor: what carries it is the fingertip.
+    leaves = set()
+    for group in set(above) - set(above.values()):
+        while group > 0 and group not in solid:
+            group = above[group]
+        leaves.add(group)
+    leaves = {g for g in leaves if g > 0 and not any(_is_above(g, other, above) for other in leaves - {g})}
+    chains = [_chain(leaf, above) for leaf in sorted(leaves)] or [[int(heads[-1]), 0]]
+    palm = next(g for g in chains[0][1:] if all(g in chain for chain in chains))
+    wrist = sorted({int(hand.link_joint[g]) for g in _chain(palm, above)[:-1]})
+    rotations, translations = link_poses(hand, _straight(hand))
     rng = np.random.default_rng(0)
-    parts = [surface_points(p, 200, rng)[0] for p in hand.primitives_of[0]]
-    if not parts:
-        return hand.link_offset_translation[hand.link_parent == 0].mean(0)
-    points = np.concatenate(parts)
-    return 0.5 * (points.min(0) + points.max(0))
+    points, roots = [], []
+    for chain in chains:
+        root = translations[chain[chain.index(palm) - 1]]
+        tip = chain[0]
+        cloud = [np.zeros((0, 3))]
+        for primitive in hand.primitives:
+            if groups[primitive.link] == tip:
+                link = primitive.link
+                cloud.append(surface_points(primitive, 200, rng)[0] @ rotations[link].T + translations[link])
+        reached = np.concatenate(cloud) if len(cloud) > 1 else translations[[tip]]
+        distance = np.linalg.norm(reached - root, axis=1)
+        points.append(reached[distance >= np.quantile(distance, 0.85)].mean(0))
+        roots.append(root)
+    links, tips = np.array([chain[0] for chain in chains]), np.array(points)
+    local = np.einsum("tji,tj->ti", rotations[links], tips - translations[links])
+    mates, bend = _mates(hand, local, links, _units(tips - np.array(roots), 1e-6), wrist)
+    return _Fingers(local, links, np.array(roots), tips, palm, np.array(wrist, dtype=int), mates, bend)
 
 
-def _unit(vector: Float[np.ndarray, "3"], otherwise: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-6 else otherwise
+def _chain(group: int, above: dict[int, int]) -> list[int]:
+    """The group and all above it, the base's last."""
+    chain = [group]
+    while above[chain[-1]] >= 0:
+        chain.append(above[chain[-1]])
+    return chain
+
+
+def _is_above(group: int, other: int, above: dict[int, int]) -> bool:
+    return group in _chain(other, above)[1:]
+
+
+def _mates(
+    hand: HandModel,
+    points: Float[np.ndarray, "tips 3"],
+    links: Int[np.ndarray, "tips"],
+    straight: Float[np.ndarray, "tips 3"],
+    wrist: list[int],
+) -> tuple[Bool[np.ndarray, "tips"], Float[np.ndarray, "3"]]:
+    """Which fingers point and bend the same way, and which way they bend; none and zero for a gripper."""
+    q = _straight(hand)
+    travel = 0.5 * (hand.lower + hand.upper) - q
+    travel[wrist] = 0.0
+    # Half a millimetre is the noise of limits that are meant to be symmetric.
+    sweep = _units(point_jacobian(hand, q, points, links) @ travel, 5e-4)
+    alike = (sweep @ sweep.T > _SAME_WAY) & (straight @ straight.T > _SAME_WAY)
+    mates = alike[alike.sum(1).argmax()]
+    if np.linalg.norm(sweep.mean(0)) <= _ALIKE or (len(points) > 1 and mates.sum() <= max(1, len(points) / 2)):
+        return np.zeros(len(points), dtype=bool), np.zeros(3)
+    return mates, _units(sweep[mates].mean(0), 0.0)
+
+
+def _along(hand: HandModel, fingers: _Fingers) -> Float[np.ndarray, "3"]:
+    """The direction in which a gripper's fingers point at mid-range, square to the line or plane that they stand on."""
+    half_way = placed_tips(hand, fingers, 0.5 * (hand.lower + hand.upper)) - fingers.roots
+    along = _units(half_way.mean(0), 1e-6)
+    if not along.any():
+        along = _units(fingers.tips.mean(0) - _palm_points(hand, fingers).mean(0), 1e-6)
+    _, sizes, rows = np.linalg.svd(fingers.roots - fingers.roots.mean(0))
+    ground = rows[: len(sizes)][sizes > max(0.3 * sizes[0], 1e-3)]
+    upright = along - ground.T @ (ground @ along)
+    if np.linalg.norm(upright) > 0.5:
+        return _units(upright, 0.0)
+    return along if along.any() else np.array([0.0, 0.0, 1.0])
+
+
+def _center(hand: HandModel, fingers: _Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The point of the palm's surface in front of which the fingers meet [m]."""
+    surface = _palm_points(hand, fingers)
+    middle = 0.5 * (surface.min(0) + surface.max(0))
+    roots = fingers.roots.mean(0)
+    aside = 0.5 * (middle + roots) if fingers.mates.any() else roots
+    offset = surface - aside
+    lateral = np.linalg.norm(offset - np.outer(offset @ normal, normal), axis=1)
+    near = lateral <= max(_SPOT, float(lateral.min()) + 0.005)
+    return aside + normal * float((offset @ normal)[near].max())
+
+
+def _palm_points(hand: HandModel, fingers: _Fingers) -> Float[np.ndarray, "points 3"]:
+    """Surface points of the palm, or where the fingers join it if it has no solids, base frame [m]."""
+    rotations, translations = link_poses(hand, _straight(hand))
+    rng = np.random.default_rng(0)
+    parts = [
+        surface_points(p, 400, rng)[0] @ rotations[p.link].T + translations[p.link]
+        for p in hand.primitives
+        if hand.link_group[p.link] == fingers.palm
+    ]
+    return np.concatenate(parts) if parts else fingers.roots
+
+
+def _around_ball(
+    hand: HandModel,
+    fingers: _Fingers,
+    ball: Float[np.ndarray, "3"],
+    radius: float,
+    rest: Float[np.ndarray, "joints"],
+    directions: Float[np.ndarray, "tips 3"] | None = None,
+) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "3"]]:
+    """The posture that puts the fingertips around a ball, evenly and without overlap, and where the ball came to be.
+
+    Joints stay near `rest` where they can, wrist joints stay put. The ball may move, unless the `directions` are given
+    in which each fingertip has to lie from it.
+    """
+    kinematics = make_kinematics(hand, dtype=torch.float64)
+    matrix = placement(hand.num_links, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
+    lower, half = torch.as_tensor(hand.lower), torch.as_tensor(0.5 * (hand.upper - hand.lower))
+    origin = torch.as_tensor(ball + _side_by_side(fingers))
+    mates = torch.as_tensor(fingers.mates)
+    sides = [side for side in (mates, ~mates) if side.any()]
+    home = torch.as_tensor(rest - hand.lower) / half - 1.0
+    still = torch.zeros(hand.num_joints, dtype=torch.bool)
+    still[fingers.wrist] = True
+    wrist = torch.as_tensor(_straight(hand))
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.rand(_STARTS, hand.num_joints, generator=generator, dtype=torch.float64) - 0.5
+    noise[0] = 0.0
+    share = (home + 2.0 * _SPREAD * noise).clamp(-1.0, 1.0)
+    shift = torch.zeros(_STARTS, 3, dtype=torch.float64)
+    variables = [share.requires_grad_(True), *([shift.requires_grad_(True)] if directions is None else [])]
+    optimiser = torch.optim.Adam(variables, lr=_RATE)
+
+    def posture() -> Float[Tensor, "starts joints"]:
+        return torch.where(still, wrist, lower + half * (share.clamp(-1.0, 1.0) + 1.0))
+
+    def cost() -> Float[Tensor, "starts"]:
+        away = place(matrix, *forward(kinematics, posture())) - (origin + fingers.length * shift[:, None])
+        outside = (share.abs() - 1.0).clamp_min(0.0).square().sum(-1)
+        bent = _REST * (share - home).square().mean(-1)
+        if directions is not None:
+            missed = (away - radius * torch.as_tensor(directions)) / fingers.length
+            return missed.square().sum(-1).mean(-1) + bent + outside
+        distance = away.norm(dim=-1).clamp_min(1e-9)
+        onto = ((distance - radius) / fingers.length).square().mean(-1)
+        outward = away / distance[..., None]
+        one_sided = torch.stack([outward[:, side].mean(1) for side in sides]).mean(0).square().sum(-1)
+        return onto + bent + outside + _BALANCE * one_sided + _PLACE * shift.square().sum(-1)
+
+    for _ in range(_STEPS):
+        optimiser.zero_grad()
+        cost().sum().backward()
+        optimiser.step()
+    with torch.no_grad():
+        final, values = cost(), posture().numpy()
+        best = int((final + _OVERLAP * torch.as_tensor(_worst_overlap(hand, values))).argmin())
+        return values[best].copy(), ball + fingers.length * shift[best].numpy()
+
+
+def placed_tips(hand: HandModel, fingers: _Fingers, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "tips 3"]:
+    """Fingertips at a posture, base frame [m]."""
+    rotations, translations = link_poses(hand, q)
+    return np.einsum("tij,tj->ti", rotations[fingers.links], fingers.points) + translations[fingers.links]
+
+
+def _outward(hand: HandModel, fingers: _Fingers, away: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips 3"]:
+    """Which way each finger opens in the palm's plane, given where its tip lies from the ball.
+
+    Fingers that bend together straighten together, square to the row of their knuckles, and the thumb goes the other
+    way; a gripper's fingers go apart.
+    """
+    plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
+    if not fingers.mates.any():
+        return _units(away @ plane, 1e-6)
+    straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
+    if fingers.mates.sum() > 1:
+        row = _row(fingers)
+        straight = straight - (straight @ row) * row
+    return np.where(fingers.mates[:, None], 1.0, -1.0) * _units(straight, 1e-6)
+
+
+def _row(fingers: _Fingers) -> Float[np.ndarray, "3"]:
+    """The direction in which the knuckles of two mates or more lie side by side."""
+    knuckles = fingers.roots[fingers.mates]
+    return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
+
+
+def _side_by_side(fingers: _Fingers) -> Float[np.ndarray, "tips 3"]:
+    """Where each fingertip's ball lies from the middle one [m]: fingers side by side close side by side."""
+    aside = np.zeros_like(fingers.roots)
+    if fingers.mates.sum() > 1:
+        knuckles, row = fingers.roots[fingers.mates], _row(fingers)
+        aside[fingers.mates] = np.outer((knuckles - knuckles.mean(0)) @ row, row)
+    return aside
+
+
+def _worst_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) -> Float[np.ndarray, "postures"]:
+    """Deepest overlap [m] of links that are neither welded nor joined."""
+    groups = hand.link_group
+    above = np.where(hand.link_parent >= 0, groups[np.maximum(hand.link_parent, 0)], -1)[groups]
+    joined = (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
+    points, links, _ = dense_samples(hand, count=600, seed=3)
+    return np.where(joined, 0.0, link_overlaps(hand, q, points, links)).max(axis=(1, 2))
+
+
+def _units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
+    """Unit vectors; zero where shorter than `least`."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)

@@ -24,7 +24,8 @@ class Kinematics:
     Attributes:
         constant, sine, cosine: `T_parent_link = constant + sin(q) sine + cos(q) cosine`, upper three rows.
         slide: what a prismatic joint adds to the translation per metre; None where no joint is prismatic.
-        joint: the joint of each regrouped link (0 where fixed: its coefficients are zero).
+        joint: the actuated joint of each regrouped link (0 where fixed: its coefficients are zero).
+        multiplier, shift: a coupled link's joint is at multiplier · q + shift; None where no joint is coupled.
         level_sizes: number of links at each depth, the base's level first.
         level_parents: per depth from 2 on, each link's parent within the level above; None where one to one.
         order: position of each link of the hand in the regrouped list; None where it is the same.
@@ -38,6 +39,8 @@ class Kinematics:
     level_sizes: tuple[int, ...]
     level_parents: tuple[Int[Tensor, "level"] | None, ...]
     order: Int[Tensor, "links"]
+    multiplier: Float[Tensor, "links"] | None = None
+    shift: Float[Tensor, "links"] | None = None
 
 
 def make_kinematics(
@@ -68,6 +71,8 @@ def make_kinematics(
         level_sizes=sizes,
         level_parents=tuple(parents),
         order=torch.as_tensor(position, device=device),
+        multiplier=tensor(hand.link_multiplier) if hand.mimics else None,
+        shift=tensor(hand.link_shift) if hand.mimics else None,
     )
 
 
@@ -77,6 +82,8 @@ def forward(
     """Rotations and translations `T_base_link` of every link at joint values q [rad] or [m], base frame [m]."""
     k = kinematics
     values = q[:, k.joint]
+    if k.multiplier is not None and k.shift is not None:
+        values = values * k.multiplier + k.shift
     local = k.constant + values.sin()[..., None, None] * k.sine + values.cos()[..., None, None] * k.cosine
     if k.slide is not None:
         local = local + values[..., None, None] * k.slide
@@ -136,18 +143,18 @@ def point_jacobian(
 ) -> Float[np.ndarray, "points 3 joints"]:
     """Geometric Jacobian of link-frame points, base frame, at one posture: `dx = J dq`, joint torques `τ = Σ Jᵀ f`.
 
-    A revolute joint with axis a through o moves a point x behind it by `a × (x − o)`, a prismatic one by `a`.
+    A revolute joint with axis a through o moves a point x behind it by `a × (x − o)`, a prismatic one by `a`, and an
+    actuated joint by the sum over all that follow it, each times its multiplier.
     """
     rotation, translation = link_poses(hand, q)
     x = np.einsum("pij,pj->pi", rotation[links], points) + translation[links]
     jacobian = np.zeros((len(points), 3, hand.num_joints))
-    behind = _moved_links(hand)
+    behind = _descendants(hand)
     for link in np.flatnonzero(hand.link_joint >= 0):
-        joint = hand.link_joint[link]
         axis = rotation[link] @ hand.joint_axis[link]
         revolute = hand.joint_kind[link] == "revolute"
         columns = np.cross(axis, x - translation[link]) if revolute else np.broadcast_to(axis, x.shape)
-        jacobian[:, :, joint] = columns * behind[joint, links, None]
+        jacobian[:, :, hand.link_joint[link]] += hand.link_multiplier[link] * columns * behind[link, links, None]
     return jacobian
 
 
@@ -159,14 +166,12 @@ def link_poses(
     return rotations[0].numpy(), translations[0].numpy()
 
 
-def _moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
-    """Which links each joint moves."""
-    moved = np.zeros((hand.num_joints, hand.num_links), dtype=bool)
+def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:
+    """Row i: link i and all links behind it."""
+    behind = np.eye(hand.num_links, dtype=bool)
     for link in range(1, hand.num_links):
-        moved[:, link] = moved[:, hand.link_parent[link]]
-        if hand.link_joint[link] >= 0:
-            moved[hand.link_joint[link], link] = True
-    return moved
+        behind[:, link] |= behind[:, hand.link_parent[link]]
+    return behind
 
 
 def _link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:

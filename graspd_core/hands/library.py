@@ -9,15 +9,18 @@ import numpy as np
 
 from graspd_core.errors import HandError
 from graspd_core.hands.description import apply_description, read_description
-from graspd_core.hands.guess import guess_palm_and_postures
+from graspd_core.hands.guess import guess_palm, guess_postures
+from graspd_core.hands.mano import load_mano
+from graspd_core.hands.markup import read_xml, wrong
+from graspd_core.hands.mjcf import read_mjcf
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.overlap import adjacent_links
 from graspd_core.hands.surface import candidates as surface_candidates
 from graspd_core.hands.urdf import read_urdf
 from graspd_core.paths import config_dir
 
-# A joint's greatest torque where neither URDF nor description gives one [N·m].
-DEFAULT_EFFORT = 0.7
+# A joint's greatest torque [N·m], or a sliding joint's greatest force [N], where neither URDF nor description gives one.
+DEFAULT_EFFORT, DEFAULT_FORCE = 0.7, 40.0
 _CANDIDATE_SEED = 0
 
 
@@ -36,16 +39,33 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600) -> HandModel:
     """
     if candidates < 1:
         raise HandError(f"candidates={candidates}: at least 1 is needed")
+    if Path(name_or_path).suffix == ".pkl":
+        return load_mano(name_or_path, candidates=candidates).model
     path = _find(name_or_path)
     if path.suffix in (".yaml", ".yml"):
         description = read_description(path)
-        hand = apply_description(_with_effort(read_urdf(description.urdf)), description)
+        hand = apply_description(_with_effort(read_hand_file(description.urdf)), description)
     else:
-        hand = guess_palm_and_postures(_with_effort(_with_primitives(read_urdf(path))))
-    hand = _with_primitives(hand)
+        hand = guess_postures(guess_palm(_with_effort(read_hand_file(path))))
     hand = replace(hand, adjacent=adjacent_links(hand))
     points, normals, links = surface_candidates(hand, candidates, _CANDIDATE_SEED)
     return replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)
+
+
+def read_hand_file(path: Path) -> HandModel:
+    """The hand of a URDF or an MJCF file, as `read_urdf` gives it; the root element decides which it is.
+
+    Raises:
+        HandError: it is neither, cannot be used, or has nothing that could touch an object.
+    """
+    root = read_xml(path)
+    readers = {"robot": read_urdf, "mujoco": read_mjcf}
+    if root.tag not in readers:
+        raise wrong(path, root, f"the root element is <{root.tag}>; a URDF has <robot>, an MJCF file <mujoco>")
+    hand = readers[root.tag](path, root)
+    if not hand.primitives:
+        raise HandError(f"{path}: no link has a collision or a visual shape, so that nothing could touch an object")
+    return hand
 
 
 def _find(name_or_path: str | Path) -> Path:
@@ -62,12 +82,7 @@ def _find(name_or_path: str | Path) -> Path:
     return config_dir() / "hands" / f"{text}.yaml"
 
 
-def _with_primitives(hand: HandModel) -> HandModel:
-    if not hand.primitives:
-        raise HandError(f"{hand.urdf}: no link has a <collision> element, so that nothing could touch an object")
-    return hand
-
-
 def _with_effort(hand: HandModel) -> HandModel:
     """Efforts that the URDF leaves open (absent or zero, a common placeholder) set to the default."""
-    return replace(hand, effort=np.where(np.isfinite(hand.effort), hand.effort, DEFAULT_EFFORT))
+    default = np.where(hand.slides, DEFAULT_FORCE, DEFAULT_EFFORT)
+    return replace(hand, effort=np.where(np.isfinite(hand.effort), hand.effort, default))

@@ -15,6 +15,9 @@ from jaxtyping import Bool, Float, Int
 PrimitiveKind = Literal["box", "sphere", "capsule", "cylinder", "hull"]
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
+# Travel of a sliding joint that counts as much as a turn of one radian [m]: what a finger of 50 mm makes of it.
+METRES_PER_RADIAN = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
@@ -39,9 +42,46 @@ class Primitive:
     faces: Int[np.ndarray, "faces 3"] = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
 
 
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that is coupled to an actuated one: its value is `multiplier · q[joint] + offset`.
+
+    Attributes:
+        name: of the coupled joint.
+        link: the link that it moves.
+        joint: the actuated joint that it follows; chains of coupled joints are resolved.
+        multiplier: its travel for one radian or metre of that joint.
+        offset: its value where that joint is at zero [rad] or [m].
+    """
+
+    name: str
+    link: int
+    joint: int
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a hand's base link sits on the arm that carries it: `T_parent_base`.
+
+    Attributes:
+        parent: the arm's link, its flange or tool frame.
+        position: of the base link in that frame [m].
+        quaternion_wxyz: of the base link in that frame, unit.
+    """
+
+    parent: str
+    position: tuple[float, float, float]
+    quaternion_wxyz: tuple[float, float, float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class HandModel:
     """A hand as loaded. Links are in depth-first order, link 0 is `base_link`; joints in depth-first order too.
+
+    Joints are the actuated ones throughout: coupled joints follow from them (`mimics`), and only what leaves graspd
+    lists them too (`all_joint_names`).
 
     Attributes:
         name: the hand's name.
@@ -56,7 +96,7 @@ class HandModel:
         palm_normal: unit direction out of the palm, base frame.
         approach: unit direction in which the hand moves towards an object, base frame.
         link_parent: each link's parent, -1 for the base.
-        link_joint: the actuated joint that moves the link against its parent, -1 where none does.
+        link_joint: the actuated joint that moves the link against its parent, directly or coupled; -1 where none does.
         link_offset_rotation, link_offset_translation: `T_parent_link` at joint value zero [m].
         joint_axis: unit axis of the link's own joint in the link frame, zero where fixed.
         joint_kind: kind of the joint between link and parent.
@@ -70,6 +110,8 @@ class HandModel:
         candidate_normals: outward unit normals there.
         candidate_link: the link of each candidate.
         warnings: what had to be guessed while loading.
+        mimics: the coupled joints, in the order of their links.
+        mount: where the base link sits on an arm, None where nobody said.
     """
 
     name: str
@@ -101,6 +143,8 @@ class HandModel:
     candidate_normals: Float[np.ndarray, "candidates 3"]
     candidate_link: Int[np.ndarray, "candidates"]
     warnings: tuple[str, ...] = ()
+    mimics: tuple[Mimic, ...] = ()
+    mount: Mount | None = None
 
     @property
     def base_link(self) -> str:
@@ -126,3 +170,56 @@ class HandModel:
     def primitives_of(self) -> tuple[tuple[Primitive, ...], ...]:
         """The primitives of each link, by link number."""
         return tuple(tuple(p for p in self.primitives if p.link == i) for i in range(self.num_links))
+
+    @cached_property
+    def link_multiplier(self) -> Float[np.ndarray, "links"]:
+        """Travel of each link's own joint for one radian or metre of `link_joint`: one where it is that joint."""
+        multiplier = np.ones(self.num_links)
+        for mimic in self.mimics:
+            multiplier[mimic.link] = mimic.multiplier
+        return multiplier
+
+    @cached_property
+    def link_shift(self) -> Float[np.ndarray, "links"]:
+        """Value of each link's own joint where `link_joint` is at zero [rad] or [m]."""
+        shift = np.zeros(self.num_links)
+        for mimic in self.mimics:
+            shift[mimic.link] = mimic.offset
+        return shift
+
+    @cached_property
+    def slides(self) -> Bool[np.ndarray, "joints"]:
+        """Which actuated joints are prismatic."""
+        slides = np.zeros(self.num_joints, dtype=bool)
+        coupled = {mimic.link for mimic in self.mimics}
+        for link, joint in enumerate(self.link_joint):
+            if joint >= 0 and link not in coupled:
+                slides[joint] = self.joint_kind[link] == "prismatic"
+        return slides
+
+    @cached_property
+    def joint_scale(self) -> Float[np.ndarray, "joints"]:
+        """The travel of each joint that counts as much as one radian [rad] or [m]."""
+        return np.where(self.slides, METRES_PER_RADIAN, 1.0)
+
+
+def all_joint_names(hand: HandModel) -> tuple[str, ...]:
+    """Names of all movable joints, coupled ones too, in depth-first order: what goes to files and messages."""
+    return tuple(name for name, _, _, _ in _movable(hand))
+
+
+def all_joint_positions(hand: HandModel, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "movable"]:
+    """Values of `all_joint_names` at actuated values q [rad] or [m]."""
+    return np.array([multiplier * q[joint] + offset for _, joint, multiplier, offset in _movable(hand)])
+
+
+def _movable(hand: HandModel) -> list[tuple[str, int, float, float]]:
+    """Name, actuated joint, multiplier and offset of every movable joint, in the order of their links."""
+    coupled = {mimic.link: mimic for mimic in hand.mimics}
+    rows: list[tuple[str, int, float, float]] = []
+    for link, joint in enumerate(hand.link_joint.tolist()):
+        if link in coupled:
+            rows.append((coupled[link].name, joint, coupled[link].multiplier, coupled[link].offset))
+        elif joint >= 0:
+            rows.append((hand.joint_names[joint], joint, 1.0, 0.0))
+    return rows

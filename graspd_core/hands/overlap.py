@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.hands.distance import hand_sdf
 from graspd_core.hands.kinematics import forward, make_kinematics, place, placement
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.surface import dense_samples
+from graspd_core.hands.surface import dense_samples, parent_groups
 
 # Overlap that counts as touching rather than colliding [m].
 _TOUCH = 1e-4
@@ -42,6 +42,12 @@ def link_overlaps(
     return np.maximum(depth, depth.transpose(0, 2, 1))
 
 
+def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) -> Float[np.ndarray, "postures"]:
+    """Greatest depth [m] of a contact candidate inside a link that is not adjacent to its own, hulls included."""
+    overlap = link_overlaps(hand, q, hand.candidate_points, hand.candidate_link)
+    return np.where(hand.adjacent, 0.0, overlap).max((1, 2))
+
+
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     """Pairs of links that are never checked against each other.
 
@@ -51,7 +57,7 @@ def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     """
     groups = hand.link_group
     same = groups[:, None] == groups[None, :]
-    above = np.where(hand.link_parent >= 0, groups[np.maximum(hand.link_parent, 0)], -1)[groups]
+    above = parent_groups(hand)[groups]
     one = above[:, None] == groups[None, :]
     two = np.where(above >= 0, above[np.maximum(above, 0)], -1)[:, None] == groups[None, :]
     points, links, _ = dense_samples(hand, count=_SAMPLES, seed=2)

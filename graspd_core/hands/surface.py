@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from graspd_core.errors import HandError
 from graspd_core.hands.distance import primitive_sdf
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Primitive
@@ -21,6 +22,8 @@ from graspd_core.hands.sampling import feature_points, primitive_area, surface_p
 _STEP = 1e-6
 # How far out of a face a point must come free of the other solids of its group: in a crease nothing can be touched [m].
 _CREASE = 1e-4
+# Random points drawn for each that lies on the outer surface, at most.
+_MOST_DRAWN = 200
 # Of the candidates, the most that may be corners chosen beforehand.
 _CORNER_SHARE = 0.3
 # Spacing of candidates is inversely proportional to these; a surface that faces the grasp has 1.
@@ -76,11 +79,16 @@ def dense_samples(
     """At least `count` random points of the outer surface for judging: points in link frames [m], links, areas [m²].
 
     Independent of the candidates. The areas sum to the area of the hand's outer surface.
+
+    Raises:
+        HandError: hardly any of its surface is outer surface.
     """
     rng = np.random.default_rng(seed)
     drawn, pool = count, _exposed(hand, _random_pool(hand, count, rng))
     while len(pool.points) < count:
         drawn = int(np.ceil(1.05 * drawn * count / max(len(pool.points), 1)))
+        if drawn > _MOST_DRAWN * count:
+            raise HandError(f"{hand.urdf}: almost all of the hand's solids lie inside others")
         pool = _exposed(hand, _random_pool(hand, drawn, rng))
     return pool.points, pool.links, pool.areas
 
@@ -115,7 +123,7 @@ def _feature_pool(hand: HandModel) -> _Pool:
 def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
     """The points of the pool that lie on the outer surface."""
     pool = pool.take(~_covered_in_group(hand, pool))
-    groups, parent_group = hand.link_group[pool.links], _parent_groups(hand)
+    groups, parent_group = hand.link_group[pool.links], parent_groups(hand)
     always = np.ones(len(pool.points), dtype=bool)
     # One joint lies between neighbouring groups, so that its range is covered by moving all joints together.
     for share in np.linspace(0.0, 1.0, 5):
@@ -166,10 +174,19 @@ def _distance(
     return primitive_sdf(primitive, torch.as_tensor(local)).numpy()
 
 
-def _parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
-    """By group number: the group that the group's first link hangs from, -1 for the base's."""
+def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
+    """By group number: the nearest group with solids that the group's first link hangs from, -1 where there is none.
+
+    Bare groups are passed over: a joint of several axes is modelled by hinges with massless links between them.
+    """
     parent = hand.link_parent
-    return np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)
+    above = np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)
+    solid = np.isin(np.arange(hand.num_links), hand.link_group[[p.link for p in hand.primitives]])
+    # Links come in depth-first order, so that what a bare parent hangs from is known before its children.
+    for link, group in enumerate(above.tolist()):
+        if group >= 0 and not solid[group]:
+            above[link] = above[group]
+    return above
 
 
 def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
@@ -191,7 +208,7 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
     weights[(pool.areas == 0) & (facing > -0.1)] *= _EDGE_WEIGHT
     reach = np.linalg.norm(placed - origins[groups], axis=1)
     heads = np.unique(hand.link_group)
-    for group in np.setdiff1d(heads, np.append(_parent_groups(hand)[heads], hand.link_group[0])):
+    for group in np.setdiff1d(heads, np.append(parent_groups(hand)[heads], hand.link_group[0])):
         members = groups == group
         if members.any():
             tip = members & (reach > 0.5 * reach[members].max())

@@ -12,18 +12,22 @@ from graspd_core.metrics.judge import Judge
 from graspd_core.metrics.wrenches import wrench_hull
 from graspd_core.types import GraspMetrics, Posture
 
-# Contacts that the wrench hull is made of. Its time grows with their square; twice as many raise ε by a fifth.
-MAX_CONTACTS = 16
+# Contacts that the wrench hull is made of. The protocol allows 32, whose hull in six dimensions has some 22,000 facets
+# and takes four times as long; that raises ε by a tenth (docs/metrics.md). Benchmarks ask for 32, planning does not.
+MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
 # Half the distance of a central difference [m].
 _STEP = 2e-4
 
 
-def measure(judge: Judge, posture: Posture) -> GraspMetrics:
-    """All static metrics of the judge's hand at `posture` on the judge's object."""
+def measure(judge: Judge, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:
+    """All static metrics of the judge's hand at `posture` on the judge's object.
+
+    ε and volume are those of at most `max_contacts` contacts.
+    """
     target = judge.target
     placed = contacts.place_hand(judge, posture)
     touching = placed.points[contacts.touching(placed)]
-    chosen = touching[farthest_points(touching, MAX_CONTACTS)]
+    chosen = touching[farthest_points(touching, max_contacts)]
     normals = surface_normals(judge.query, chosen)
     epsilon, volume = wrench_hull(chosen - target.center_of_mass, normals, target.friction, target.radius)
     return GraspMetrics(
@@ -34,7 +38,15 @@ def measure(judge: Judge, posture: Posture) -> GraspMetrics:
         self_penetration=overlap.self_penetration(judge, placed),
         epsilon=epsilon,
         volume=volume,
+        contact_area_5mm=contacts.contact_area(placed, 0.005),
+        contact_area_10mm=contacts.contact_area(placed, 0.01),
     )
+
+
+def contact_per_volume(metrics: GraspMetrics) -> float | None:
+    """CA/IV, contact area over intersection volume [1/m]; None where hand and object share no volume."""
+    volume = metrics.intersection_volume
+    return metrics.contact_area / volume if volume > 0 else None
 
 
 def surface_normals(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -14,8 +14,10 @@ from torch import Tensor
 
 from graspd_core.config import ClosedFormConfig, LossWeights
 from graspd_core.geometry.sdf import sample_sdf
+from graspd_core.optimise.losses import hard_contact, soft_contact
 from graspd_core.optimise.problem import Problem, Terms, evaluate, place
 from graspd_core.optimise.solver import Poses
+from graspd_core.se3 import rotation_from_quaternion
 
 _BETA1, _BETA2, _ADAM_EPSILON = 0.9, 0.98, 1e-8
 # Share of the step size that is left at the end of the run.
@@ -24,8 +26,13 @@ _FINAL_RATE = 0.05
 
 @dataclass(frozen=True)
 class AdamState:
-    """Iterate, moments and best iterate of every start, as rows of one matrix (translation, quaternion, joints)."""
+    """Iterate, moments and best iterate of every start, as rows of one matrix (translation, quaternion, joints).
 
+    The translation is that of `pivot`, the point of the hand that a step of the quaternion leaves where it is: about the
+    origin of a base frame far from the palm, a small turn would throw the fingers off the object.
+    """
+
+    pivot: Float[Tensor, "batch 3"]
     x: Float[Tensor, "batch variables"]
     mean: Float[Tensor, "batch variables"]
     square: Float[Tensor, "batch variables"]
@@ -54,6 +61,12 @@ def unpack(x: Float[Tensor, "batch variables"]) -> Poses:
     return Poses(x[:, :3], x[:, 3:7], x[:, 7:])
 
 
+def moved_along(poses: Poses, point: Float[Tensor, "*batch 3"]) -> Poses:
+    """The poses with their translation moved along a vector of the base frame [m]."""
+    turned = (rotation_from_quaternion(poses.quaternion) @ point[..., None]).squeeze(-1)
+    return Poses(poses.translation + turned, poses.quaternion, poses.joints)
+
+
 @dataclass(frozen=True)
 class ClosedForm:
     """The solver of docs/method.md, §2.
@@ -71,12 +84,13 @@ class ClosedForm:
         return self.config.explore_steps + self.config.refine_steps + self.config.polish_steps
 
     def init(self, problem: Problem, starts: Poses) -> AdamState:
-        x = pack(starts)
+        x = pack(moved_along(starts, problem.pivot))
         with torch.no_grad():
             nearest = evaluate_distance(problem, starts)
         zeros = torch.zeros_like(x)
         worst = x.new_full((len(x),), torch.inf)
-        return AdamState(x, zeros, zeros, nearest.clamp(0.0, self.config.radius_start), x, worst, worst)
+        pivot = problem.pivot.expand(len(x), 3)
+        return AdamState(pivot, x, zeros, zeros, nearest.clamp(0.0, self.config.radius_start), x, worst, worst)
 
     def step(self, problem: Problem, state: AdamState, index: int) -> AdamState:
         config = self.config
@@ -84,6 +98,8 @@ class ClosedForm:
             state = state[state.loss.argsort()[: self.keep]]
         remaining = max(0.0, 1.0 - index / max(config.explore_steps, 1))
         delta = config.delta_end * (config.delta_start / config.delta_end) ** remaining
+        if config.activation == "hard":
+            delta = config.delta_end
         polish = index >= config.explore_steps + config.refine_steps
         loss, gradient = self.value_and_gradient(problem, state.x, state.radius * remaining, delta, polish)
         if polish or (config.polish_steps == 0 and remaining == 0.0):
@@ -100,9 +116,8 @@ class ClosedForm:
 
     def best(self, state: AdamState) -> tuple[Poses, Float[Tensor, "batch"]]:
         judged = torch.isfinite(state.best_loss)
-        return unpack(torch.where(judged[:, None], state.best_x, state.x)), torch.where(
-            judged, state.best_loss, state.loss
-        )
+        poses = unpack(torch.where(judged[:, None], state.best_x, state.x))
+        return moved_along(poses, -state.pivot), torch.where(judged, state.best_loss, state.loss)
 
     def value_and_gradient(
         self,
@@ -114,8 +129,9 @@ class ClosedForm:
     ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"]]:
         """Loss per start and its gradient; a start whose gradient is not finite stands still."""
         x = x.detach().requires_grad_(True)
-        poses = unpack(x)
-        terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, fine=polish)
+        poses = moved_along(unpack(x), -problem.pivot)
+        activate = soft_contact if self.config.activation == "soft" else hard_contact
+        terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, polish, activate)
         loss = weighted(terms, self.config.polish_weights if polish else self.config.weights)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         finite = torch.isfinite(gradient).all(-1) & torch.isfinite(loss)
@@ -139,6 +155,7 @@ def adam_step(
     rates = torch.full_like(state.x[0], config.joint_rate)
     rates[:3] = config.translation_rate
     rates[3:7] = config.rotation_rate
+    rates[7:] *= problem.joint_scale
     x = state.x - rate * rates * direction
     quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
     joints = x[:, 7:].clamp(problem.lower, problem.upper)

@@ -24,6 +24,13 @@ def soft_contact(
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
+def hard_contact(
+    distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"], delta: float
+) -> Float[Tensor, "batch points"]:
+    """The ablation of `soft_contact`: one within δ of the padded surface, zero elsewhere, without any gradient."""
+    return ((distance - radius[:, None]).abs() <= delta).to(distance)
+
+
 def task(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Float[Tensor, "batch"]:
     """Soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst disturbance is resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()

@@ -114,6 +114,8 @@ def self_overlap(
     problem: Problem, joints: Float[Tensor, "batch joints"], adjacent: Bool[Tensor, "links links"]
 ) -> Float[Tensor, "batch"]:
     """Greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
+    if len(problem.solids.link) == 0:
+        return joints.new_zeros(len(joints))
     frames = forward(problem.kinematics, joints)
     points = place_in_base(problem.fine.matrix, *frames)
     depth = -solid_distance(problem.solids, *frames, points)
@@ -126,7 +128,7 @@ class Squeeze:
     """Balanced contact forces and the joint targets that make them.
 
     Attributes:
-        joints: position targets [rad].
+        joints: position targets [rad] or [m].
         forces: on the object, one per link [N].
         imbalance: norm of the net wrench over the sum of forces; one where there is no balance to be had.
     """
@@ -151,14 +153,15 @@ def squeeze(
     torque = joint_torques(problem, poses, touches, forces)
     limit = (effort * config.effort_share / torque.abs().clamp_min(1e-9)).amin(-1)
     scale = limit.clamp(max=config.grip_force)[:, None]
-    targets = (poses.joints + scale * torque / config.stiffness).clamp(problem.lower, problem.upper)
+    stiffness = torch.where(problem.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
+    targets = (poses.joints + scale * torque / stiffness).clamp(problem.lower, problem.upper)
     return Squeeze(targets, scale[..., None] * forces, torch.as_tensor(imbalance).to(problem.lower))
 
 
 def joint_torques(
     problem: Problem, poses: Poses, touches: Touches, forces: Float[Tensor, "batch slots 3"]
 ) -> Float[Tensor, "batch joints"]:
-    """τ = JᵀF [N·m], as the gradient of Σ F·x(q) over the hand's material points at the contacts."""
+    """τ = JᵀF [N·m], of sliding joints [N], as the gradient of Σ F·x(q) over the hand's material points at the contacts."""
     rotation = rotation_from_quaternion(poses.quaternion)
     x = (touches.position - poses.translation[:, None]) @ rotation
     joints = poses.joints.detach().requires_grad_(True)
@@ -231,8 +234,10 @@ def open_clear(
     start = torch.cat([poses.translation, poses.joints], -1)
     rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
     rates = torch.full_like(start[0], config.open_joint_rate)
+    rates[3:] *= problem.joint_scale
     rates[:3] = config.open_base_rate
     cost = torch.full_like(start[0], 0.1)
+    cost[3:] /= problem.joint_scale**2
     cost[:3] = 2e3
     with torch.no_grad():
         reached = hand_distance(problem, rotation_from_quaternion(poses.quaternion), start[:, :3], start[:, 3:])

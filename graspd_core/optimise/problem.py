@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,6 +33,8 @@ _REACH_WHEN_FINE = 0.01
 _TASK_POINTS, _FEATURE_PAIRS = 96, 96
 # Free space that the hand keeps to obstacles [m].
 OBSTACLE_MARGIN = 0.002
+# A base frame this near to the middle of the palm lies in the palm [m].
+_PALM_RADIUS = 0.05
 # Share of thin surface from which an object counts as thin-walled.
 _THIN_WALLED = 0.6
 
@@ -71,6 +74,8 @@ class Problem:
         sphere_weight: 1 / 2R of the checked pairs with R the sum of their radii, zero elsewhere [1/m].
         lower: joint limits [rad].
         upper: joint limits [rad].
+        pivot: the point that the solver turns the hand about, base frame [m].
+        joint_scale: travel of each joint that counts as much as one radian, one where it turns [rad] or [m].
         directions: unit disturbance wrenches.
         center: object's centre of mass [m].
         length: characteristic length of torques [m].
@@ -93,6 +98,8 @@ class Problem:
     sphere_weight: Float[Tensor, "spheres spheres"]
     lower: Float[Tensor, "joints"]
     upper: Float[Tensor, "joints"]
+    pivot: Float[Tensor, "3"]
+    joint_scale: Float[Tensor, "joints"]
     directions: Float[Tensor, "directions 6"]
     center: Float[Tensor, "3"]
     length: float
@@ -176,6 +183,8 @@ def build_problem(
         sphere_weight=tensor(np.triu(checked, 1) * 0.5 / (radii[:, None] + radii[None, :])),
         lower=tensor(hand.lower),
         upper=tensor(hand.upper),
+        pivot=tensor(hand.palm_center * (np.linalg.norm(hand.palm_center) > _PALM_RADIUS)),
+        joint_scale=tensor(hand.joint_scale),
         directions=disturbance_directions(directions, seed).to(device=device, dtype=dtype),
         center=tensor(scene.object.center_of_mass),
         length=scene.object.radius,
@@ -253,11 +262,13 @@ def evaluate(
     radius: Float[Tensor, "batch"],
     delta: float,
     fine: bool = False,
+    activate: Callable[..., Tensor] = losses.soft_contact,
 ) -> Terms:
     """All loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
 
     Args:
         fine: look at all candidates and all sharp points.
+        activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
     """
     points = problem.fine if fine else problem.coarse
     placed = place(problem, points, translation, quaternion, joints)
@@ -274,7 +285,7 @@ def evaluate(
         (distance.detach() - radius[:, None]).abs().topk(min(_TASK_POINTS, distance.shape[-1]), largest=False).indices
     )
     rows = torch.arange(len(near), device=near.device)[:, None]
-    activation = losses.soft_contact(distance[rows, near], radius, delta)
+    activation = activate(distance[rows, near], radius, delta)
     if problem.trust is not None:
         activation = activation * sample_trust(problem.trust, problem.sdf, placed.points[rows, near])
     support = wrench_support(

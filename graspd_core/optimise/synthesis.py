@@ -13,7 +13,10 @@ from torch import Tensor
 from graspd_core.config import PlanConfig
 from graspd_core.geometry.scene import Scene
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.overlap import deepest_overlap
+from graspd_core.optimise.annealing import search_annealing
 from graspd_core.optimise.closed_form import ClosedForm
+from graspd_core.optimise.graspd2022 import search_graspd2022
 from graspd_core.optimise.initial import draw_starts
 from graspd_core.optimise.obstacles import intrusion
 from graspd_core.optimise.postures import (
@@ -26,6 +29,7 @@ from graspd_core.optimise.postures import (
     squeeze,
 )
 from graspd_core.optimise.problem import Problem
+from graspd_core.optimise.random_closure import search_random_closure
 from graspd_core.optimise.search import Found, Search, problem_of
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.types import Contact, Grasp, Posture
@@ -68,7 +72,12 @@ def search_closed_form(
     return Found(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
 
 
-SEARCHES: dict[str, Search] = {"closed_form": search_closed_form}
+SEARCHES: dict[str, Search] = {
+    "closed_form": search_closed_form,
+    "graspd2022": search_graspd2022,
+    "annealing": search_annealing,
+    "random_closure": search_random_closure,
+}
 
 
 def synthesise(
@@ -103,6 +112,9 @@ def assemble(
     opened, clearance = open_clear(problem, poses, config.postures, stop)
     adjacent = torch.as_tensor(hand.adjacent, device=problem.lower.device)
     overlap = self_overlap(problem, poses.joints, adjacent)
+    if any(primitive.kind == "hull" for primitive in hand.primitives):
+        depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
+        overlap = torch.maximum(overlap, depth.to(overlap))
     scores = score(touches, pressed, clearance, overlap)
     if problem.obstacles is not None:
         ends = (opened.translation, opened.joints), (poses.translation, poses.joints)

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, LiftResult, Posture
-from graspd_core.verify.trial import breach, place_hand, set_targets
+from graspd_core.verify.trial import breach, place_hand, set_joints, set_targets
 from graspd_core.verify.world import Protocol, World
 
 _CHECK_EVERY = 25
@@ -143,7 +143,7 @@ def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit:
     for (start, end), name in zip(pairwise(postures), names, strict=True):
         for a in (*_SHARES, 1.0):
             set_targets(data, start, end, a)
-            data.qpos[world.joint_addresses] = data.ctrl
+            set_joints(world, data, data.ctrl)
             mujoco.mj_kinematics(world.model, data)
             for geom, said in world.obstacles:
                 depth = max(-mujoco.mj_geomDistance(world.model, data, geom, g, 0.0, None) for g in world.hand_geoms)

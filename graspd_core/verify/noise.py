@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle, rotation_from_quaternion
-from graspd_core.types import Grasp, Posture
+from graspd_core.types import Grasp, HoldResult, Posture
 from graspd_core.verify.trial import hold_trial
 from graspd_core.verify.world import Protocol, World
 
@@ -22,7 +22,14 @@ OFFSET, TURN = 0.005, float(np.deg2rad(5.0))
 def noisy_trial(
     world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
 ) -> float:
-    """Share of 8 hold trials that the grasp passes, each with the hand out of place by up to 5 mm and 5°.
+    """Share of 8 hold trials that the grasp passes, each with the hand out of place by up to 5 mm and 5°."""
+    return sum(hold.passed for hold in noisy_holds(world, grasp, protocol, seed=seed, stop=stop)) / TRIALS
+
+
+def noisy_holds(
+    world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
+) -> tuple[HoldResult, ...]:
+    """The 8 hold trials of a noisy trial.
 
     The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same
     errors. A start that the error pushes too deep into the object counts as not held.
@@ -30,7 +37,7 @@ def noisy_trial(
     rng = np.random.default_rng(seed)
     errors = [pose_error(rng) for _ in range(TRIALS)]
     moved = [displaced(grasp, *error, world.center_of_mass) for error in errors]
-    return sum(hold_trial(world, g, protocol, stop=stop).passed for g in moved) / TRIALS
+    return tuple(hold_trial(world, g, protocol, stop=stop) for g in moved)
 
 
 def pose_error(rng: np.random.Generator) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:

@@ -34,19 +34,10 @@ def hold_trial(
     import mujoco
 
     data = mujoco.MjData(world.model)
-    place_hand(world, data, grasp.pregrasp)
-    mujoco.mj_forward(world.model, data)
-    depth = start_penetration(world, data)
-    if depth > protocol.max_start_penetration:
-        return HoldResult(False, 0.0, 0.0, f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm")
     worst = np.zeros(2)
-    for stage, (start, end) in {
-        "closing": (grasp.pregrasp, grasp.grasp),
-        "squeezing": (grasp.grasp, grasp.squeeze),
-    }.items():
-        reason = _move(world, data, start, end, protocol, worst)
-        if reason:
-            return _result(worst, f"{reason} while {stage}")
+    reason = close_hand(world, data, grasp, protocol, worst)
+    if reason:
+        return _result(worst, reason)
     held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
     mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
     mass = float(world.model.body_mass[world.object_body])
@@ -59,8 +50,30 @@ def hold_trial(
             mujoco.mj_step(world.model, data, _CHECK_EVERY)
             reason = breach(world, data, protocol, worst)
             if reason:
-                return _result(worst, f"{reason} under a pull along {_axis_name(direction)}")
+                return _result(worst, f"{reason} under a pull along {axis_name(direction)}")
     return _result(worst, "")
+
+
+def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst: np.ndarray) -> str:
+    """From the pregrasp over the grasp to the squeeze; returns why the trial is over, empty if it is not.
+
+    `worst` travel [m] and turn [rad] of the object are brought up to date.
+    """
+    import mujoco
+
+    place_hand(world, data, grasp.pregrasp)
+    mujoco.mj_forward(world.model, data)
+    depth = start_penetration(world, data)
+    if depth > protocol.max_start_penetration:
+        return f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm"
+    for stage, (start, end) in {
+        "closing": (grasp.pregrasp, grasp.grasp),
+        "squeezing": (grasp.grasp, grasp.squeeze),
+    }.items():
+        reason = _move(world, data, start, end, protocol, worst)
+        if reason:
+            return f"{reason} while {stage}"
+    return ""
 
 
 def _result(worst: np.ndarray, reason: str) -> HoldResult:
@@ -82,16 +95,23 @@ def start_penetration(world: World, data: Any) -> float:
     return float(-min(contact.dist[on_object], default=0.0)) if data.ncon else 0.0
 
 
-def _axis_name(direction: np.ndarray) -> str:
+def axis_name(direction: np.ndarray) -> str:
     return f"{'-' if direction.min() < 0 else '+'}{'xyz'[int(np.abs(direction).argmax())]}"
 
 
 def place_hand(world: World, data: Any, posture: Posture) -> None:
     """Put base, joints and targets where a posture says; `mj_forward` is the caller's."""
-    data.qpos[world.joint_addresses] = posture.joint_positions
+    set_joints(world, data, posture.joint_positions)
     data.mocap_pos[0] = posture.position
     data.mocap_quat[0] = posture.quaternion_wxyz
     data.ctrl[:] = posture.joint_positions
+
+
+def set_joints(world: World, data: Any, values: np.ndarray) -> None:
+    """Put the actuated joints at `values` [rad] or [m], and those coupled to them where they belong."""
+    data.qpos[world.joint_addresses] = values
+    for address, mimic in zip(world.coupled_addresses, world.mimics, strict=True):
+        data.qpos[address] = mimic.multiplier * values[mimic.joint] + mimic.offset
 
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
@@ -136,6 +156,11 @@ def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> st
     travel = float(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))
     turn = 2.0 * float(np.arctan2(np.linalg.norm(pose[4:]), abs(pose[3])))
     worst[:] = np.maximum(worst, [travel, turn])
+    return broken_limit(protocol, travel, turn)
+
+
+def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
+    """Which limit a travel [m] and a turn [rad] break, as a sentence; empty for none."""
     if travel > protocol.max_displacement:
         return f"the object moved {travel * 100:.1f} cm"
     if turn > protocol.max_rotation:

@@ -13,25 +13,26 @@ published parameters. Nothing here is differentiable and nothing is shared with 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.scene import Neighbour, ObjectModel
-from graspd_core.geometry.sdf import sample_sdf
-from graspd_core.hands.model import HandModel
+from graspd_core.hands.model import HandModel, Mimic
 from graspd_core.se3 import quaternion_from_rotation
 from graspd_core.types import Plane, TriangleMesh
-
-_OBJECT = "graspd_object"
-# What the hand meets of the support, and what the object rests on.
-_TABLE, _REST = "the support", "graspd_rest"
-_GRAVITY = 9.81
-_GEOM_OF_KIND = {kind: f"mjGEOM_{kind.upper()}" for kind in ("box", "sphere", "capsule", "cylinder")}
+from graspd_core.verify.bodies import (
+    OBJECT,
+    TABLE,
+    add_neighbour,
+    add_object,
+    add_primitive,
+    add_support,
+    full_inertia,
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Protocol:
         timestep: [s].
         stiffness: position gain of every revolute joint [N·m/rad].
         damping: of every revolute joint [N·m·s/rad].
-        slide_stiffness: of every prismatic joint [N/m]: what `stiffness` comes to at the end of a 10 cm link.
+        slide_stiffness: of every prismatic joint [N/m]: what `stiffness` comes to at the end of a 5 cm link.
         slide_damping: of every prismatic joint, likewise [N·s/m].
         armature: rotor inertia of every joint [kg·m²] or [kg].
         stage_time: duration of pregrasp → grasp and of grasp → squeeze [s].
@@ -62,8 +63,8 @@ class Protocol:
     timestep: float = 0.004
     stiffness: float = 5.0
     damping: float = 0.1
-    slide_stiffness: float = 500.0
-    slide_damping: float = 10.0
+    slide_stiffness: float = 2000.0
+    slide_damping: float = 40.0
     armature: float = 1e-4
     stage_time: float = 0.4
     hold_time: float = 2.0
@@ -79,13 +80,20 @@ PROTOCOLS: dict[str, Protocol] = {
 }
 
 
+def at_friction(protocol: Protocol, friction: float) -> Protocol:
+    """The trial of an object whose friction is known: the protocol's coefficients, which suppose 0.6, in proportion."""
+    share = friction / Protocol.friction[0]
+    sliding, torsional, rolling = protocol.friction
+    return replace(protocol, friction=(sliding * share, torsional * share, rolling * share))
+
+
 @dataclass(frozen=True)
 class World:
     """A compiled model and where things are in it. The model is never written to after compilation.
 
     Attributes:
         model: the `mujoco.MjModel`.
-        joint_addresses: index into `qpos` of each hand joint, in the hand's order.
+        joint_addresses: index into `qpos` of each actuated hand joint, in the hand's order.
         object_address: index into `qpos` of the object's free joint (position, then wxyz).
         object_velocity: index into `qvel` of its free joint.
         object_body: body id of the object.
@@ -93,6 +101,8 @@ class World:
         hand_geoms: ids of the hand's geoms.
         obstacles: id and name of the geom of every obstacle to the hand.
         up: unit direction against gravity; None where there is none.
+        coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
+        mimics: the coupled joints.
     """
 
     model: Any
@@ -104,6 +114,8 @@ class World:
     hand_geoms: tuple[int, ...] = ()
     obstacles: tuple[tuple[int, str], ...] = ()
     up: Float[np.ndarray, "3"] | None = None
+    coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    mimics: tuple[Mimic, ...] = ()
 
 
 def build_world(
@@ -142,26 +154,31 @@ def build_world(
     # of MuJoCo have no such switch, because it is always on.
     option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
     _add_hand(spec, hand, protocol)
-    _add_object(spec, target, parts, protocol)
-    obstacles = [_TABLE] if support is not None else []
+    add_object(spec, target, parts, protocol.friction)
+    obstacles = [TABLE] if support is not None else []
     if support is not None:
-        _add_support(spec, hand, parts, protocol, support)
+        add_support(spec, hand, parts, protocol.friction, support)
     for index, neighbour in enumerate(neighbours):
         obstacles.append(f"neighbour {index + 1}")
-        _add_neighbour(spec, obstacles[-1], neighbour, target, protocol)
+        add_neighbour(spec, obstacles[-1], neighbour, target, protocol.friction)
     model = spec.compile()
-    addresses = [model.joint(f"joint:{name}").qposadr[0] for name in hand.joint_names]
     return World(
         model=model,
-        joint_addresses=np.array(addresses),
-        object_address=int(model.joint(_OBJECT).qposadr[0]),
-        object_velocity=int(model.joint(_OBJECT).dofadr[0]),
-        object_body=int(model.body(_OBJECT).id),
+        joint_addresses=_joint_addresses(model, hand.joint_names),
+        object_address=int(model.joint(OBJECT).qposadr[0]),
+        object_velocity=int(model.joint(OBJECT).dofadr[0]),
+        object_body=int(model.body(OBJECT).id),
         center_of_mass=target.center_of_mass,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
         obstacles=tuple((int(model.geom(name).id), name) for name in obstacles),
         up=None if support is None else support.normal,
+        coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
+        mimics=hand.mimics,
     )
+
+
+def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:
+    return np.array([model.joint(f"joint:{name}").qposadr[0] for name in names], dtype=np.int64)
 
 
 def _ignore(message: str) -> None:
@@ -169,10 +186,9 @@ def _ignore(message: str) -> None:
 
 
 def _add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:
-    import mujoco
-
     quaternions = quaternion_from_rotation(torch.as_tensor(hand.link_offset_rotation, dtype=torch.float64)).numpy()
     bodies: list[Any] = []
+    coupled = {mimic.link: mimic for mimic in hand.mimics}
     for link, name in enumerate(hand.link_names):
         parent = hand.link_parent[link]
         if parent < 0:
@@ -182,137 +198,67 @@ def _add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:
                 name=f"link:{name}", pos=hand.link_offset_translation[link], quat=quaternions[link]
             )
         bodies.append(body)
-        joint = int(hand.link_joint[link])
-        if joint >= 0:
-            _add_joint(spec, body, hand, link, joint, protocol)
+        if link in coupled:
+            _add_coupled_joint(spec, body, hand, coupled[link], protocol)
+        elif hand.link_joint[link] >= 0:
+            _add_joint(spec, body, hand, link, protocol)
         body.explicitinertial = True
         body.mass = max(float(hand.link_mass[link]), 1e-3)
         body.ipos = hand.link_com[link]
-        body.fullinertia = _full_inertia(hand.link_inertia[link], floor=1e-7)
+        body.fullinertia = full_inertia(hand.link_inertia[link], floor=1e-7)
     for index, primitive in enumerate(hand.primitives):
-        geom = bodies[primitive.link].add_geom(
-            pos=primitive.translation,
-            quat=quaternion_from_rotation(torch.as_tensor(primitive.rotation, dtype=torch.float64)).numpy(),
-            condim=4,
-            friction=protocol.friction,
-            # The hand's contact softness rules in every contact it takes part in.
-            priority=1,
-            solref=[0.005, 1.0],
-            solimp=[0.5, 0.99, 1e-4, 0.5, 2.0],
-        )
-        if primitive.kind == "hull":
-            geom.type = mujoco.mjtGeom.mjGEOM_MESH
-            geom.meshname = f"hand:{index}"
-            _add_mesh(spec, geom.meshname, primitive.vertices, primitive.faces)
-        else:
-            geom.type = getattr(mujoco.mjtGeom, _GEOM_OF_KIND[primitive.kind])
-            geom.size = np.resize(np.append(primitive.size, [0.0, 0.0]), 3)
+        add_primitive(spec, bodies[primitive.link], primitive, f"hand:{index}", protocol.friction)
     first, second = np.nonzero(np.triu(hand.adjacent, 1))
     for a, b in zip(first, second, strict=True):
         spec.add_exclude(bodyname1=f"link:{hand.link_names[a]}", bodyname2=f"link:{hand.link_names[b]}")
 
 
-def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, joint: int, protocol: Protocol) -> None:
+def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Protocol) -> None:
     import mujoco
 
+    joint = int(hand.link_joint[link])
     name = f"joint:{hand.joint_names[joint]}"
-    slides = hand.joint_kind[link] == "prismatic"
     body.add_joint(
         name=name,
-        type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
-        axis=hand.joint_axis[link],
+        **_joint_physics(hand, link, protocol),
         range=[hand.lower[joint], hand.upper[joint]],
         limited=True,
-        damping=protocol.slide_damping if slides else protocol.damping,
-        armature=protocol.armature,
         # A joint's stop is as hard as the time step allows (two steps), not MuJoCo's soft default of five.
         solref_limit=[2 * protocol.timestep, 1.0],
     )
     effort = float(hand.effort[joint])
     actuator = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-    actuator.set_to_position(kp=protocol.slide_stiffness if slides else protocol.stiffness)
+    actuator.set_to_position(kp=protocol.slide_stiffness if hand.slides[joint] else protocol.stiffness)
     actuator.forcelimited = True
     actuator.forcerange = [-effort, effort]
 
 
-def _add_object(spec: Any, target: ObjectModel, parts: Sequence[TriangleMesh], protocol: Protocol) -> None:
+def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, protocol: Protocol) -> None:
+    """A joint without motor or stops of its own, that an equality holds to its leader: loads on it reach the motor."""
     import mujoco
 
-    body = spec.worldbody.add_body(name=_OBJECT)
-    body.add_freejoint(name=_OBJECT)
-    body.explicitinertial = True
-    body.mass = target.mass
-    body.ipos = target.center_of_mass
-    body.fullinertia = _full_inertia(target.inertia, floor=1e-9)
-    for index, part in enumerate(parts):
-        name = f"part:{index}"
-        _add_mesh(spec, name, part.vertices, part.faces)
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=name,
-            condim=4,
-            friction=protocol.friction,
-            contype=1,
-            conaffinity=1,
-        )
+    name = f"joint:{mimic.name}"
+    body.add_joint(name=name, limited=False, **_joint_physics(hand, mimic.link, protocol))
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_JOINT,
+        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+        name1=name,
+        name2=f"joint:{hand.joint_names[mimic.joint]}",
+        data=[mimic.offset, mimic.multiplier, *[0.0] * 9],
+        # As stiff as gears: two time steps and hardly any softness, or a loaded finger would lag behind its leader.
+        solref=[2 * protocol.timestep, 1.0],
+        solimp=[0.9999, 0.9999, 1e-3, 0.5, 2.0],
+    )
 
 
-def _add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], protocol: Protocol, support: Plane) -> None:
+def _joint_physics(hand: HandModel, link: int, protocol: Protocol) -> dict[str, Any]:
+    """What joints with and without a motor share."""
     import mujoco
 
-    spec.option.gravity = -_GRAVITY * support.normal
-    lowest = min(float((part.vertices @ support.normal).min()) for part in parts)
-    for name, height in ((_TABLE, support.offset), (_REST, lowest)):
-        body = spec.worldbody.add_body(name=name, mocap=True)
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=[0.0, 0.0, 1.0],
-            pos=height * support.normal,
-            quat=_turn_z_to(support.normal),
-            condim=4,
-            friction=protocol.friction,
-        )
-    spec.add_exclude(bodyname1=_TABLE, bodyname2=_OBJECT)
-    for link in hand.link_names:
-        # Real hands carry their own weight.
-        spec.body(f"link:{link}").gravcomp = 1.0
-        spec.add_exclude(bodyname1=_REST, bodyname2=f"link:{link}")
-
-
-def _turn_z_to(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
-    """The shortest rotation of z onto a unit vector, wxyz."""
-    quaternion = np.array([1.0 + normal[2], -normal[1], normal[0], 0.0])
-    length = np.linalg.norm(quaternion)
-    return quaternion / length if length > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
-
-
-def _add_neighbour(spec: Any, name: str, neighbour: Neighbour, target: ObjectModel, protocol: Protocol) -> None:
-    import mujoco
-
-    body = spec.worldbody.add_body(name=name, mocap=True)
-    _add_mesh(spec, name, neighbour.mesh.vertices, neighbour.mesh.faces)
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, condim=4, friction=protocol.friction)
-    surface = torch.as_tensor(surface_samples(target.mesh, 1000, 0)[0]).to(neighbour.sdf.field)
-    if bool((sample_sdf(neighbour.sdf, surface)[0] < 0).any()):
-        # A grown hull that overlaps the object would throw it away.
-        spec.add_exclude(bodyname1=name, bodyname2=_OBJECT)
-
-
-def _add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
-    import mujoco
-
-    mesh = spec.add_mesh(name=name)
-    mesh.uservert = np.asarray(vertices, dtype=float).ravel()
-    mesh.userface = np.asarray(faces, dtype=np.int32).ravel()
-    # Masses are given explicitly, so a part may be as thin as it likes.
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-
-
-def _full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """MuJoCo's order xx yy zz xy xz yz, with principal moments raised to `floor` and the triangle inequality kept."""
-    moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
-    moments = np.maximum(moments, floor)
-    moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
-    m = axes @ np.diag(moments) @ axes.T
-    return [m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]]
+    slides = hand.joint_kind[link] == "prismatic"
+    return {
+        "type": mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
+        "axis": hand.joint_axis[link],
+        "damping": protocol.slide_damping if slides else protocol.damping,
+        "armature": protocol.armature,
+    }

@@ -50,6 +50,22 @@ def test_tolerance_grows_with_distance_within_bounds():
     assert part.height(np.array([[0.8, 0.0, -0.3]])) == pytest.approx([0.1], abs=1e-3)
 
 
+def test_parts_a_kilometre_apart_take_no_memory():
+    rng = np.random.default_rng(0)
+    table, _ = sheet(rng, 0.0)
+    points = np.vstack([table, table[:2000] + np.array([1000.0, 1000.0, 0.0])])
+    (part, *_) = find_planes(points, np.linalg.norm(points, axis=1), EYE, least=0.004, smallest=0.1)
+    # The two lie in one plane, 10^10 cells of a centimetre about both: the larger is the part.
+    assert part.inliers[: len(table)].all()
+    assert not part.inliers[len(table) :].any()
+
+
+def test_points_scattered_over_a_room_are_not_linked():
+    points = np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3))
+    assert link_length(points, 0.008) == 0.05
+    assert link_length(points / 100, 0.008) < 0.05
+
+
 def test_two_planes_are_two_parts():
     rng = np.random.default_rng(0)
     table, _ = sheet(rng, 0.0)

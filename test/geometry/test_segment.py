@@ -265,6 +265,22 @@ def test_nothing_at_the_target_lists_what_there_is(target, complaint):
         segment([view], target=target)
 
 
+def test_what_is_too_large_to_be_grasped_is_told_as_that():
+    view, _ = seen(THREE.meshes)
+    with pytest.raises(NoObjectError, match=r"3 things are seen, .* each is larger than largest_object=0.03 m"):
+        segment([view], settings=SegmentConfig(largest_object=0.03))
+
+
+@pytest.mark.parametrize("blind", [np.zeros((0, 3)), np.full((40, 3), np.nan)], ids=["empty", "all NaN"])
+@pytest.mark.parametrize("forward", [None, np.array([0.0, 0.0, 1.0])])
+def test_a_first_view_that_shows_nothing_does_not_choose(blind, forward):
+    view, _ = seen(THREE.meshes)
+    expected = segment([view])
+    found = segment([PointCloud(blind, np.array([5.0, 5.0, 5.0]), forward), view])
+    assert share_found(found, expected.views[0].points) == 1.0
+    assert share_near(found.views[0].points, THREE.truth, 1e-3) > 0.99
+
+
 def test_a_mask_of_background_finds_nothing():
     view, label = seen(THREE.meshes)
     with pytest.raises(NoObjectError, match="nothing but background under the mask; 3 things"):

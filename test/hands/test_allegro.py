@@ -133,3 +133,39 @@ def test_hand_mesh_lies_on_the_links_surfaces(hand: HandModel) -> None:
         distance = torch.minimum(distance, hand_sdf(hand, link, local))
     assert float(distance.max()) < 1e-9
     assert mesh.faces.max() == len(mesh.vertices) - 1
+
+
+def test_the_left_hand_is_the_mirror_image(hand: HandModel) -> None:
+    """Mirrored joint values give mirrored points: the mirror y → −y turns the sense of the three abduction joints."""
+    left = load_hand("allegro_left")
+    assert (left.joint_names, left.link_names) == (hand.joint_names, hand.link_names)
+    mirror, sense = np.array([1.0, -1.0, 1.0]), np.ones(16)
+    sense[[0, 4, 8]] = -1.0
+    np.testing.assert_allclose(np.sort(sense * np.stack([left.lower, left.upper]), axis=0), [hand.lower, hand.upper])
+    np.testing.assert_allclose(left.palm_center, mirror * hand.palm_center)
+    rng = np.random.default_rng(5)
+    for q in rng.uniform(hand.lower, hand.upper, (5, 16)):
+        one, other = link_poses(hand, q), link_poses(left, sense * q)
+        np.testing.assert_allclose(other[1], mirror * one[1], atol=1e-12)
+        # Every solid is its own mirror image in its frame, so that its middle and its axes tell where it is.
+        for a, b in zip(hand.primitives, left.primitives, strict=True):
+            assert (a.link, a.kind, a.size) == (b.link, b.kind, b.size)
+            middle = [r[p.link] @ p.translation + t[p.link] for p, (r, t) in ((a, one), (b, other))]
+            np.testing.assert_allclose(middle[1], mirror * middle[0], atol=1e-12)
+            axes = [r[p.link] @ p.rotation for p, (r, _) in ((a, one), (b, other))]
+            np.testing.assert_allclose(np.abs(np.sum(mirror[:, None] * axes[0] * axes[1], axis=0)), 1.0, atol=1e-12)
+
+
+def test_golden_fingertips_of_the_left_hand() -> None:
+    """At mid-range the abduction joints are zero, so that the published right hand's positions are mirrored."""
+    left = load_hand("allegro_left")
+    tips = link_poses(left, 0.5 * (left.lower + left.upper))[1][[left.link_index[name] for name in TIPS]]
+    np.testing.assert_allclose(tips, np.array(GOLDEN[0.5]) * [1.0, -1.0, 1.0], atol=1e-5)
+
+
+@pytest.mark.parametrize("posture", ["open_posture", "closed_posture"])
+def test_postures_of_the_left_hand_are_free_of_self_collision(posture: str) -> None:
+    left = load_hand("allegro_left")
+    points, links, _ = dense_samples(left, count=6000, seed=11)
+    overlap = link_overlaps(left, getattr(left, posture)[None], points, links)[0]
+    assert np.where(left.adjacent, 0.0, overlap).max() == 0.0

@@ -129,7 +129,7 @@ def test_a_description_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
         ('type="continuous"', 'type="floating"', "joint 'hinge' is of type 'floating'; known: revolute"),
         ('type="continuous"', 'type="fixed"', "no actuated joint"),
         ('<child link="finger"/>', '<child link="thumb"/>', "child link 'thumb', which the file does not define"),
-        ("<limit", '<mimic joint="other"/><limit', "joint 'hinge' mimics another joint"),
+        ("<limit", '<mimic joint="other"/><limit', "joint 'hinge' mimics 'other', which is no movable joint"),
         ("finger.obj", "lost.obj", "mesh 'package://pincer/meshes/lost.obj' was not found"),
         ('size="0.06 0.06 0.04"', 'size="0.06 0 0.04"', "sizes must be positive"),
         ('<box size="0.06 0.06 0.04"/>', "<cone/>", "unknown collision shape <cone>"),

@@ -67,6 +67,21 @@ def test_trouble_on_the_way_comes_out_as_it_is(hand):
     assert not read, "the object was read before it was known that the result cannot be told"
 
 
+@pytest.mark.parametrize(("timeless", "asked_for"), [(True, Time()), (False, Time(sec=7))])
+def test_what_came_without_a_time_is_told_by_the_newest_transforms(hand, timeless, asked_for):
+    asked: list[Time] = []
+
+    def lookup(target: str, source: str, stamp: Time, stop) -> np.ndarray:
+        asked.append(stamp)
+        return np.eye(4)
+
+    settings = replace(SETTINGS, output_frame="base", verify="none")
+    load = lambda resolution: load_scene("shape:sphere", resolution=resolution)  # noqa: E731
+    given = Request("r", "mesh", "object", Time(sec=7), settings, load, timeless=timeless)
+    Planner(hand, lookup).plan(given, never, lambda _: None)
+    assert asked == [asked_for]
+
+
 @pytest.mark.parametrize("ends_by", [Outcome.CANCELLED, Outcome.DEADLINE])
 def test_a_request_that_is_over_is_answered_while_its_object_is_still_being_read(hand, ends_by):
     reading, release, told = threading.Event(), threading.Event(), []

@@ -15,7 +15,7 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from graspd_core.bags.messages import cloud_from_depth_message
+from graspd_core.bags.messages import cloud_from_depth_message, points_from_message
 from graspd_core.bags.writer import (
     Record,
     camera_info_message,
@@ -28,7 +28,6 @@ from graspd_core.errors import BagError
 from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 from graspd_ros.player import main, play
-from graspd_ros.pointcloud import points_from_message
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5, (0.1, -0.05))
 DEPTH = np.linspace(0.4, 0.8, 24 * 32).reshape(24, 32)

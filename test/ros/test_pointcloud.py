@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sensor_msgs.msg import PointCloud2, PointField
 
+from graspd_core.bags.messages import points_from_message
 from graspd_core.errors import CloudError
-from graspd_ros.pointcloud import points_from_message
 
 # Seconds for 640 x 480 points on a machine that does other things too; 8 ms on a quiet one, a 30 Hz camera leaves 33.
 VGA_TIME = 0.06

@@ -1,0 +1,135 @@
+"""Records to figures: for every name (a preset, a rung) and object, then for every name over its objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from graspd_core.bench.store import Record
+
+# Figures of one grasp, by name: where each is found in its record, in the unit of the name.
+GRASP_FIGURES: dict[str, Callable[[dict[str, Any]], float | None]] = {
+    "sd_cm": lambda grasp: _inner(grasp, "sd", "displacement_cm"),
+    "gravity_cm": lambda grasp: _inner(grasp, "gravity", "displacement_cm"),
+    "penetration_mm": lambda grasp: _metric(grasp, "penetration", 1e3),
+    "self_penetration_mm": lambda grasp: _metric(grasp, "self_penetration", 1e3),
+    "contact_area_cm2": lambda grasp: _metric(grasp, "contact_area", 1e4),
+    "intersection_cm3": lambda grasp: _metric(grasp, "intersection_volume", 1e6),
+    "links": lambda grasp: _metric(grasp, "contact_links", 1.0),
+    "epsilon": lambda grasp: _metric(grasp, "epsilon", 1.0),
+    "volume": lambda grasp: _metric(grasp, "volume", 1.0),
+}
+# Shares of grasps that passed a trial; a grasp that was not found did not pass.
+TRIAL_FIGURES = ("standard", "hard", "noisy")
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one name on one object, all seeds together; None where there is none.
+
+    Attributes:
+        asked: grasps asked for.
+        given: grasps found.
+        held: grasps that passed the standard hold trial.
+        spent: CPU seconds of the optimiser and of those trials.
+
+    `values` has the medians of `GRASP_FIGURES` over the grasps, the shares of `TRIAL_FIGURES` of the grasps asked for,
+    and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`, `cpu_per_verified` (`spent` over `held`),
+    `first_cpu` and `first_wall` until the first verified grasp.
+    """
+
+    name: str
+    object: str
+    method: str
+    asked: int
+    given: int
+    held: int
+    spent: float
+    values: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, quartiles and mean over objects, and how many there were."""
+
+    median: float
+    low: float
+    high: float
+    mean: float
+    objects: int
+
+
+def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
+    """A row for every name and object, in the order of the records. Cells that raised are left out."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record["kind"] == kind and not record["error"]:
+            groups.setdefault((record["name"], record["object"]), []).append(record)
+    return [_row(group) for group in groups.values()]
+
+
+def _row(group: Sequence[Record]) -> Row:
+    asked, held = sum(r["asked"] for r in group), sum(r["held"] for r in group)
+    grasps = [grasp for r in group for grasp in r["grasps"]]
+    values: dict[str, float | None] = {name: _median(map(read, grasps)) for name, read in GRASP_FIGURES.items()}
+    for trial in TRIAL_FIGURES:
+        outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
+        tried = not grasps or any(outcome is not None for outcome in outcomes)
+        values[trial] = sum(outcome or 0.0 for outcome in outcomes) / asked if tried else None
+    # Planned runs have one total; raw ones count what a plan would have spent, the best of trials only.
+    spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)
+    values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / asked
+    prepared = sum(r["cpu"].get("scene", 0.0) for r in group)
+    values["cpu_with_scene"] = values["cpu_per_grasp"] + prepared / asked
+    values["cpu_per_verified"] = spent / held if held else None
+    for clock in ("cpu", "wall"):
+        values[f"first_{clock}"] = _median((r.get("first_verified") or {}).get(clock) for r in group)
+    values["peak_mb"] = max((r["peak_mb"] for r in group), default=None)
+    values["rounds"] = _median(float(r["rounds"]) if "rounds" in r else None for r in group)
+    one, given = group[0], sum(r["given"] for r in group)
+    return Row(one["name"], one["object"], one["method"], asked, given, held, spent, values)
+
+
+def spread(rows: Iterable[Row], figure: str) -> Spread | None:
+    """A figure's spread over objects; None where no object has it."""
+    values = [value for row in rows if (value := row.values.get(figure)) is not None]
+    if not values:
+        return None
+    low, middle, high = np.percentile(values, [25, 50, 75])
+    return Spread(float(middle), float(low), float(high), float(np.mean(values)), len(values))
+
+
+def per_verified(rows: Sequence[Row]) -> float | None:
+    """CPU seconds of the optimiser and the trials for each grasp that held, all objects together; None where none did.
+
+    Not a mean over objects: one on which nothing held has cost seconds, too.
+    """
+    held = sum(row.held for row in rows)
+    return sum(row.spent for row in rows) / held if held else None
+
+
+def by_name(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Rows of each name."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.name, []).append(row)
+    return groups
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
+    value = (grasp.get(trial) or {}).get(figure)
+    return None if value is None else float(value)
+
+
+def _metric(grasp: dict[str, Any], name: str, factor: float) -> float | None:
+    value = (grasp.get("metrics") or {}).get(name)
+    return None if value is None else float(value) * factor

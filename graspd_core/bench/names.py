@@ -1,0 +1,26 @@
+"""Names of presets: which is an ablation of which, and how each method is told from the others."""
+
+from __future__ import annotations
+
+# The first that fits a name tells its parent; a parent has none.
+_ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
+METHOD_NAMES = {
+    "closed_form": "closed form",
+    "graspd2022": "Grasp'D (2022)",
+    "annealing": "annealing",
+    "random_closure": "random closure",
+}
+
+
+def parent_of(name: str) -> str | None:
+    """The preset that `name` is an ablation of; None for one of its own."""
+    return next((parent for prefix, parent in _ABLATIONS if name.startswith(prefix)), None)
+
+
+def short_name(name: str) -> str:
+    """A label for the chart: an ablation goes by what it lacks."""
+    parent = parent_of(name)
+    if parent is None:
+        return name
+    method = "closed_form_" if name.startswith("closed_form_") else "graspd2022_"
+    return name.removeprefix(method).replace("_", " ")

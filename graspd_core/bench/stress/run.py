@@ -1,0 +1,193 @@
+"""One case in a process of its own: what it ended in, how long that took, how much memory, what the user saw.
+
+    python -m graspd_core.bench.stress.run NAME [--preset balanced]     prints one JSON object
+
+A grasp counts as verified only if it holds in a second trial too: from the file that a user would keep, with the
+object loaded anew and a world built anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_core.bench.stress.case import GRASP, Case
+from graspd_core.errors import GraspdError
+from graspd_core.geometry.scene import Scene, object_parts
+from graspd_core.types import GraspResult, Verdict
+
+# What a deadline may be overrun by [s].
+GRACE = 0.5
+# Beyond loading and planning, before the process is called hung [s].
+_PATIENCE = 60.0
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What came of a case.
+
+    Attributes:
+        case: its name.
+        ending: "grasp", the name of an `Outcome` or of a GraspdError; "crash" or "hang" where it was none of these.
+        message: what the user saw.
+        loading, planning: seconds.
+        memory: peak of the process [MB].
+        tried: grasps that were tried.
+        verified: how many of them held.
+        again: how many of those held in the second trial.
+        finite: no number of the result is NaN or infinite.
+    """
+
+    case: str
+    ending: str
+    message: str
+    loading: float = 0.0
+    planning: float = 0.0
+    memory: float = 0.0
+    tried: int = 0
+    verified: int = 0
+    again: int = 0
+    finite: bool = True
+
+
+def faults(case: Case, ending: Ending) -> tuple[str, ...]:
+    """What is wrong with an ending, one line each; none where all is well."""
+    wrong = []
+    if ending.ending not in case.expect:
+        wrong.append(f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}")
+    if ending.planning > case.deadline + GRACE:
+        wrong.append(f"planned {ending.planning:.1f} s at a deadline of {case.deadline} s")
+    if ending.loading > case.loading:
+        wrong.append(f"loaded for {ending.loading:.1f} s, longer than {case.loading} s")
+    if ending.memory > case.memory:
+        wrong.append(f"used {ending.memory:.0f} MB, more than {case.memory:.0f} MB")
+    if ending.again < ending.verified:
+        wrong.append(f"{ending.verified - ending.again} of {ending.verified} verified grasps fail a second trial")
+    if not ending.finite:
+        wrong.append("a number of the result is not finite")
+    if ending.ending != GRASP and not ending.message:
+        wrong.append("the user is told nothing")
+    return tuple(wrong)
+
+
+def run_elsewhere(case: Case, preset: str = "balanced") -> Ending:
+    """Run a case in a fresh process."""
+    limit = case.loading + case.deadline + _PATIENCE
+    command = [sys.executable, "-m", "graspd_core.bench.stress.run", case.name, "--preset", preset]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+    except subprocess.TimeoutExpired:
+        return Ending(case.name, "hang", f"no end after {limit:.0f} s", planning=limit)
+    try:
+        return Ending(**json.loads(done.stdout.splitlines()[-1]))
+    except (IndexError, ValueError, TypeError):
+        last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+        return Ending(case.name, "crash", last[0])
+
+
+def run_case(case: Case, preset: str = "balanced") -> Ending:
+    """Run a case in this process."""
+    from graspd_core.pipeline import load_hand, plan_grasps
+
+    hand = load_hand(case.hand)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        try:
+            scene = case.scene(Path(folder))
+        except GraspdError as error:
+            return Ending(case.name, type(error).__name__, str(error), time.perf_counter() - began, memory=_peak())
+        loaded = time.perf_counter()
+        options = {"count": 2, "deadline": case.deadline, "preset": preset} | case.options
+        result = plan_grasps(scene, hand, **options)
+        planned = time.perf_counter()
+        verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+        return Ending(
+            case.name,
+            GRASP if verified else result.outcome.name,
+            "; ".join([result.outcome.value, *scene.object.warnings]),
+            loaded - began,
+            planned - loaded,
+            _peak(),
+            len(result.grasps),
+            len(verified),
+            _hold_again(result, scene, hand, Path(folder) / "grasps.json", preset) if verified else 0,
+            _finite(result),
+        )
+
+
+def _hold_again(result: GraspResult, scene: Scene, hand: Any, path: Path, preset: str) -> int:
+    """How many verified grasps hold again, read back from a file."""
+    from graspd_core.config import load_preset
+    from graspd_core.io import grasps_of, load_document, save_result
+    from graspd_core.verify.trial import hold_trial
+    from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+
+    save_result(path, result, scene.object, hand, load_preset(preset))
+    kept = grasps_of(load_document(path))
+    protocol = at_friction(PROTOCOLS["standard"], scene.object.friction)
+    world = build_world(hand, scene.object, object_parts(scene.object), protocol)
+    return sum(hold_trial(world, grasp, protocol).passed for grasp in kept if grasp.verdict is Verdict.VERIFIED)
+
+
+def _finite(result: GraspResult) -> bool:
+    """Whether every number of every grasp that did not fail is finite; a trial that diverged may say so."""
+
+    def numbers(value: Any):
+        if isinstance(value, dict):
+            for inner in value.values():
+                yield from numbers(inner)
+        elif isinstance(value, list | tuple):
+            for inner in value:
+                yield from numbers(inner)
+        elif isinstance(value, np.ndarray):
+            yield from value.ravel().tolist()
+        elif isinstance(value, float):
+            yield value
+
+    good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
+    postures = [(g.pregrasp, g.grasp, g.squeeze) for g in result.grasps]
+    return bool(np.isfinite([*numbers(good), *numbers([asdict(p) for trio in postures for p in trio])]).all())
+
+
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def run_all(
+    cases: tuple[Case, ...], preset: str, told: Callable[[Case, Ending], None] = lambda case, ending: None
+) -> tuple[Ending, ...]:
+    """Every case, one after the other."""
+    endings = []
+    for case in cases:
+        endings.append(run_elsewhere(case, preset))
+        told(case, endings[-1])
+    return tuple(endings)
+
+
+def main() -> int:
+    import torch
+
+    from graspd_core.bench.stress.cases import CASES
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", choices=sorted(CASES))
+    parser.add_argument("--preset", default="balanced")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print(json.dumps(asdict(run_case(CASES[options.name], options.preset))))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,164 @@
+"""Results as Markdown, and into the marked sections of documents."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
+from graspd_core.bench.store import Record
+from graspd_core.errors import ConfigError
+from graspd_core.io import save_text
+
+# Columns of both tables: heading, figure, format; a summary takes means over objects.
+_COLUMNS = (
+    ("held", "standard", "{:.0%}"),
+    ("held, hard", "hard", "{:.0%}"),
+    ("held, noisy", "noisy", "{:.0%}"),
+    ("SD cm", "sd_cm", "{:.2f}"),
+    ("under gravity cm", "gravity_cm", "{:.2f}"),
+    ("penetration mm", "penetration_mm", "{:.2f}"),
+    ("self-penetration mm", "self_penetration_mm", "{:.2f}"),
+    ("contact area cm²", "contact_area_cm2", "{:.1f}"),
+    ("IV cm³", "intersection_cm3", "{:.2f}"),
+    ("links", "links", "{:.0f}"),
+    ("ε", "epsilon", "{:.3f}"),
+    ("CPU s per grasp", "cpu_per_grasp", "{:.3g}"),
+    ("CPU s per verified", "cpu_per_verified", "{:.3g}"),
+)
+_PLANNED = ("first_wall", "cpu_per_verified", "rounds")
+_SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "cpu_per_grasp", "cpu_per_verified")
+
+
+def summary_table(records: Sequence[Record]) -> str:
+    """A row a preset: means over its objects, of raw grasps."""
+    found = by_name(rows(records))
+    columns = [column for column in _COLUMNS if column[1] in _SUMMARY and _known(found, column[1])]
+    body = [
+        [f"`{name}`", *(_mean(group, figure, form) for _, figure, form in columns)] for name, group in found.items()
+    ]
+    return _table(["preset", *(heading for heading, _, _ in columns)], body)
+
+
+def object_tables(records: Sequence[Record]) -> str:
+    """A table a preset: medians over each object's grasps, and their means."""
+    blocks = []
+    for name, group in by_name(rows(records)).items():
+        columns = [column for column in _COLUMNS if _known({name: group}, column[1])]
+        body = [
+            [row.object, f"{row.held}/{row.asked}", *(_form(row.values[f], form) for _, f, form in columns[1:])]
+            for row in group
+        ]
+        body.append(["**mean**", *(_mean(group, figure, form) for _, figure, form in columns)])
+        blocks.append(f"`{name}`:\n\n{_table(['object', *(heading for heading, _, _ in columns)], body)}")
+    return "\n\n".join(blocks)
+
+
+def planned_table(records: Sequence[Record]) -> str:
+    """A row a preset of planned runs: verified grasps and what they cost, trials and all."""
+    body = []
+    for name, group in by_name(rows(records, "verified")).items():
+        held, asked = sum(row.held for row in group), sum(row.asked for row in group)
+        first, worst = spread(group, "first_cpu"), max((r.values["first_cpu"] or 0.0 for r in group), default=0.0)
+        body.append([
+            f"`{name}`", f"{held}/{asked}",
+            f"{first.median:.2f} ({worst:.2f})" if first else "–",
+            *(_mean(group, figure, "{:.3g}") for figure in _PLANNED),
+            f"{max(row.values['peak_mb'] or 0.0 for row in group):.0f}",
+        ])  # fmt: skip
+    headings = ["preset", "verified", "first verified CPU s, median (worst)", "first verified s", "CPU s per verified"]
+    return _table([*headings, "rounds", "peak MB"], body) if body else ""
+
+
+def pace_table(records: Sequence[Record]) -> str:
+    """The optimiser alone, and a fresh process."""
+    body = []
+    for r in records:
+        if r["error"]:
+            continue
+        if r["kind"] == "pace":
+            cost = r["cpu"]["optimise"]
+            steps = f", {cost / r['grasp_steps'] * 1e6:.0f} µs a grasp-step" if r["grasp_steps"] else ""
+            what = f"raw grasps, `{r['name']}`, {r['object']}, batch {r['asked']}"
+            body.append([what, f"{cost / r['asked']:.3f} CPU s each{steps}; {r['peak_mb']:.0f} MB at the peak"])
+        elif r["kind"] == "start":
+            what = f"first verified grasp of a fresh process without a cache, `{r['name']}`, {r['object']}"
+            body.append([what, f"{r['wall']['total']:.1f} s, {r['cpu']['total']:.1f} CPU s"])
+    return _table(["speed and size", ""], body) if body else ""
+
+
+def sections(records: Sequence[Record], chart: Path | None, ladder: Path | None, document: Path) -> dict[str, str]:
+    """Text of every section that a document may have, by the name of its marker."""
+    planned, pace = planned_table(records), pace_table(records)
+    return {
+        "bench": "\n\n".join(part for part in (_picture(chart, document), summary_table(records)) if part),
+        "bench-about": about(records),
+        "bench-planned": "\n\n".join(part for part in (planned, pace) if part),
+        "bench-ladder": _picture(ladder, document),
+        "bench-objects": object_tables(records),
+    }
+
+
+def about(records: Sequence[Record]) -> str:
+    """One sentence on what was run, where."""
+    raw = [r for r in records if r["kind"] == "raw"]
+    seeds, objects = sorted({r["seed"] for r in raw}), {r["object"] for r in raw}
+    codes, machines = sorted({r["code"] for r in records}), sorted({r["machine"] for r in records})
+    seconds = sum(r.get("cell_cpu", 0.0) for r in records)
+    return (
+        f"{len(records)} cells, {len(objects)} objects, seeds {', '.join(map(str, seeds))}; hand "
+        f"{', '.join(sorted({r['hand'] for r in records}))}; {seconds / 60:.0f} CPU minutes on {'; '.join(machines)}; "
+        f"code {', '.join(codes)}."
+    )
+
+
+def fill(document: Path, texts: Mapping[str, str]) -> list[str]:
+    """Rewrite the marked sections of a document; sections without text stay. Returns the names of those rewritten.
+
+    A section stands between `<!-- NAME:begin -->` and `<!-- NAME:end -->`.
+
+    Raises:
+        ConfigError: the document cannot be read, or has none of the sections.
+    """
+    try:
+        text = document.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{document}: {error.strerror or error}") from None
+    filled = []
+    for name, content in texts.items():
+        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+        if content and begin in text and end in text.split(begin, 1)[1]:
+            before, rest = text.split(begin, 1)
+            text = f"{before}{begin}\n{content}\n{end}{rest.split(end, 1)[1]}"
+            filled.append(name)
+    if not filled:
+        raise ConfigError(f"{document}: has none of the sections {', '.join(texts)}; valid: <!-- bench:begin --> …")
+    save_text(document, text)
+    return filled
+
+
+def _picture(chart: Path | None, document: Path) -> str:
+    if chart is None:
+        return ""
+    link = Path(os.path.relpath(chart.with_suffix(".png").resolve(), document.resolve().parent)).as_posix()
+    return f"![{'The ladder' if 'ladder' in chart.name else 'Speed against accuracy'}]({link})"
+
+
+def _known(groups: Mapping[str, Sequence[Row]], figure: str) -> bool:
+    return any(row.values.get(figure) is not None for group in groups.values() for row in group)
+
+
+def _mean(group: Sequence[Row], figure: str, form: str) -> str:
+    over = spread(group, figure)
+    value = per_verified(group) if figure == "cpu_per_verified" else over and over.mean
+    return _form(value, form)
+
+
+def _form(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)
+
+
+def _table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    lines = [headings, ["---"] * len(headings), *body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")

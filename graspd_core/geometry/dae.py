@@ -1,0 +1,158 @@
+"""COLLADA (.dae) meshes: the surface only, without the libraries that read the whole format.
+
+Read are triangles, polylists and polygons of every geometry that the visual scene instances, through the scene's node
+transforms, in metres by the file's `<unit>`. Faces with more than three corners are cut into a fan, which is exact for
+the convex ones that modellers write. The file's up axis is ignored, as ROS viewers do: a URDF's origins are written to
+that. Format: COLLADA 1.4.1 specification, Khronos Group, 2008.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from graspd_core.types import TriangleMesh
+
+_MOST_NODES = 20000
+_FACES = ("triangles", "polylist", "polygons")
+
+
+def read_dae(path: Path) -> TriangleMesh:
+    """All surfaces of a COLLADA file, joined, in the file's coordinates [m].
+
+    Raises:
+        ValueError: the file is not COLLADA, declares entities, holds no faces, or misses something that it refers to.
+        OSError: it cannot be read.
+    """
+    data = path.read_bytes()
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise ValueError("a document type declaration is refused")
+    try:
+        root = ET.fromstring(data)
+    except ET.ParseError as error:
+        raise ValueError(f"not well-formed XML: {error}") from error
+    for element in root.iter():
+        element.tag = str(element.tag).rpartition("}")[2]
+    if root.tag != "COLLADA":
+        raise ValueError(f"the root element is <{root.tag}>, not <COLLADA>")
+    named = {f"#{element.get('id')}": element for element in root.iter() if element.get("id")}
+    unit = root.find("asset/unit")
+    scale = float(unit.get("meter", "1")) if unit is not None else 1.0
+    if root.find("library_visual_scenes/visual_scene") is not None:
+        placed = _instances(root.findall("library_visual_scenes/visual_scene/node"), named)
+    else:
+        placed = [(np.eye(4), geometry) for geometry in root.findall("library_geometries/geometry")]
+    parts = [_surface(geometry, pose, named) for pose, geometry in placed]
+    vertices = np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in parts)]) * scale
+    starts = np.cumsum([0, *(len(corners) for corners, _ in parts)])
+    faces = [part + start for (_, part), start in zip(parts, starts, strict=False)]
+    joined = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
+    if len(joined) == 0:
+        raise ValueError("holds no triangles")
+    return TriangleMesh(vertices, joined)
+
+
+def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tuple[np.ndarray, ET.Element]]:
+    """Every geometry below the nodes, with its pose in the scene."""
+    placed: list[tuple[np.ndarray, ET.Element]] = []
+    stack = [(np.eye(4), node) for node in reversed(roots)]
+    visits = 0
+    while stack:
+        above, node = stack.pop()
+        visits += 1
+        if visits > _MOST_NODES:
+            raise ValueError(f"more than {_MOST_NODES} nodes, or nodes in a circle")
+        pose = above @ _pose(node)
+        for instance in (*node.findall("instance_geometry"), *node.findall("instance_controller")):
+            geometry = _target(named, instance.get("url"))
+            if geometry.tag == "controller":
+                geometry = _target(named, next((skin.get("source") for skin in geometry.iter("skin")), None))
+            placed.append((pose, geometry))
+        below = [*node.findall("node"), *(_target(named, i.get("url")) for i in node.findall("instance_node"))]
+        stack.extend((pose, child) for child in reversed(below))
+    return placed
+
+
+def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
+    """The product of a node's transforms, in the order in which they are written."""
+    pose = np.eye(4)
+    for element in node:
+        if element.tag not in ("matrix", "translate", "rotate", "scale"):
+            continue
+        values = np.array((element.text or "").split(), dtype=float)
+        step = np.eye(4)
+        if element.tag == "matrix":
+            step = values.reshape(4, 4)
+        elif element.tag == "translate":
+            step[:3, 3] = values
+        elif element.tag == "scale":
+            step[:3, :3] = np.diag(values.reshape(3))
+        else:
+            x, y, z = values[:3] / max(float(np.linalg.norm(values[:3])), 1e-12)
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            angle = np.deg2rad(values[3])
+            step[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        pose = pose @ step
+    return pose
+
+
+def _surface(
+    geometry: ET.Element, pose: np.ndarray, named: dict[str, ET.Element]
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    for element in geometry.iterfind("mesh/*"):
+        if element.tag not in _FACES:
+            continue
+        inputs = element.findall("input")
+        stride = 1 + max((int(entry.get("offset", "0")) for entry in inputs), default=0)
+        corner = next((entry for entry in inputs if entry.get("semantic") == "VERTEX"), None)
+        if corner is None:
+            raise ValueError(f"<{element.tag}> has no VERTEX input")
+        positions = _positions(_target(named, corner.get("source")), named)
+        offset = int(corner.get("offset", "0"))
+        loops = [np.array((p.text or "").split(), dtype=np.int64)[offset::stride] for p in element.findall("p")]
+        indices = np.concatenate([np.zeros(0, dtype=np.int64), *loops])
+        if element.tag == "triangles":
+            sides = np.full(len(indices) // 3, 3)
+        elif element.tag == "polylist":
+            sides = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
+        else:
+            sides = np.array([len(loop) for loop in loops], dtype=np.int64)
+        if sides.sum() > len(indices) or (len(indices) and not 0 <= indices.min() <= indices.max() < len(positions)):
+            raise ValueError(f"<{element.tag}> names vertices that are not there")
+        faces.append(_fans(indices, sides) + count)
+        vertices.append(positions)
+        count += len(positions)
+    corners = np.concatenate(vertices) @ pose[:3, :3].T + pose[:3, 3]
+    joined = np.concatenate(faces)
+    return corners, joined[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else joined
+
+
+def _positions(vertices: ET.Element, named: dict[str, ET.Element]) -> Float[np.ndarray, "vertices 3"]:
+    entry = next((entry for entry in vertices.findall("input") if entry.get("semantic") == "POSITION"), None)
+    if entry is None:
+        raise ValueError("<vertices> has no POSITION input")
+    source = _target(named, entry.get("source"))
+    accessor = source.find("technique_common/accessor")
+    stride = max(3, int(accessor.get("stride", "3"))) if accessor is not None else 3
+    values = np.array((source.findtext("float_array") or "").split(), dtype=float)
+    return values[: len(values) // stride * stride].reshape(-1, stride)[:, :3]
+
+
+def _fans(indices: Int[np.ndarray, "corners"], sides: Int[np.ndarray, "polygons"]) -> Int[np.ndarray, "faces 3"]:
+    starts = np.cumsum(sides) - sides
+    fans = [np.zeros((0, 3), dtype=np.int64)]
+    for number in np.unique(sides[sides > 2]):
+        first = starts[sides == number]
+        for k in range(1, int(number) - 1):
+            fans.append(np.stack([indices[first], indices[first + k], indices[first + k + 1]], axis=1))
+    return np.concatenate(fans)
+
+
+def _target(named: dict[str, ET.Element], reference: str | None) -> ET.Element:
+    if reference not in named:
+        raise ValueError(f"refers to {reference!r}, which is not in the file")
+    return named[reference]

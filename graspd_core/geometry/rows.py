@@ -1,0 +1,23 @@
+"""Rows of integers as single numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Int
+
+
+def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
+    """One number for each row, in the order of the rows; equal where rows are.
+
+    NumPy sorts numbers several times as fast as rows, and lets other threads run meanwhile.
+    """
+    if not len(rows):
+        return np.zeros(0, dtype=np.int64)
+    rows = rows - rows.min(0)
+    sides = tuple(int(side) for side in rows.max(0) + 1)
+    if math.prod(sides) < 2**63:
+        return np.asarray(np.ravel_multi_index(tuple(rows.T), sides))
+    # No room: the rows' ranks among each other.
+    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)

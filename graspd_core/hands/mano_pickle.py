@@ -1,0 +1,275 @@
+"""A pickle reader for MANO's files that runs nothing that a file asks for.
+
+A pickle is a program: it names classes and functions, and calls them. Here every name that MANO's format uses stands
+for an inert stand-in of this module, from which the numbers are read afterwards; neither numpy, scipy nor chumpy is
+called by the file, and every other name is refused. What bounds time and memory: the size of the file, a memo that is
+a dictionary (the C reader allocates as many slots as a file says), and no opcode that reserves memory beforehand.
+
+Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from graspd_core.errors import HandError
+
+# The licensed file has 3.8 MB.
+MAX_BYTES = 64 * 2**20
+# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
+_MAX_DENSE, _MAX_DEPTH = 2**22, 8
+# Kinds of numbers that an array may hold: booleans, integers, floats.
+_NUMERIC = "biuf"
+# Opcodes that reach outside the file or reserve memory before they read.
+_REFUSED_OPCODES = (
+    pickle.PERSID, pickle.BINPERSID, pickle.EXT1, pickle.EXT2, pickle.EXT4,
+    pickle.BYTEARRAY8, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
+)  # fmt: skip
+
+
+class Inert:
+    """An object of the file that is only kept: the arguments and the state that the file gives it.
+
+    Attributes:
+        arguments: what it was called with.
+        state: what it was told to become, None where nothing.
+    """
+
+    arguments: tuple[Any, ...]
+    state: Any
+
+    def __new__(cls, *arguments: Any) -> Any:
+        """Take anything."""
+        made = super().__new__(cls)
+        made.arguments = arguments
+        made.state = None
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        """Keep anything."""
+        self.state = state
+
+
+class Dtype(Inert):
+    """`numpy.dtype`: called with a code such as "f8"; its state's second entry is the byte order."""
+
+
+class Array(Inert):
+    """`numpy.ndarray`; its state is version, shape, dtype, whether in Fortran's order, and the raw bytes."""
+
+
+class Scalar(Inert):
+    """A numpy number: called with a dtype and the raw bytes."""
+
+
+class Sparse(Inert):
+    """A compressed scipy.sparse matrix; its state holds `data`, `indices`, `indptr` and the shape."""
+
+
+class SparseRows(Sparse):
+    """`csr_matrix`."""
+
+
+class Leaf(Inert):
+    """`chumpy.ch.Ch`: its value is `x`."""
+
+
+class Select(Inert):
+    """`chumpy.reordering.Select`: `a` flattened, taken at `idxs`, in `preferred_shape`."""
+
+
+class Ignored(Inert):
+    """Something that carries no number."""
+
+
+def _latin1(text: object, encoding: object = "latin1") -> bytes:
+    """`_codecs.encode`, by which Python 3 writes bytes into old protocols."""
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError("an encoding other than latin1")
+    return text.encode("latin1")
+
+
+def _rebuild(made: object, *_: object) -> object:
+    """`copy_reg._reconstructor`, by which protocol 0 makes objects."""
+    if not (isinstance(made, type) and issubclass(made, Inert)):
+        raise pickle.UnpicklingError("an object of no known class")
+    return made()
+
+
+def _empty_array(*_: object) -> Array:
+    """`numpy.core.multiarray._reconstruct`, which makes an empty array for the state to fill."""
+    return Array()
+
+
+@dataclass(frozen=True)
+class _Function:
+    """A function that a file may call, and can do nothing else with."""
+
+    name: str
+    call: Any = field(repr=False)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.call(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError(f"{self.name} has no state")
+
+
+_SPARSE = ("scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse.csr", "scipy.sparse._csr")
+# Everything that a file may name. Python 2 and 3, and old and new numpy and scipy, have different names for the same.
+ADMITTED: dict[tuple[str, str], Any] = {
+    **{
+        (f"numpy.{core}.multiarray", name): made
+        for core in ("core", "_core")
+        for name, made in (("_reconstruct", _Function("_reconstruct", _empty_array)), ("scalar", Scalar))
+    },
+    ("numpy", "ndarray"): Array,
+    ("numpy", "dtype"): Dtype,
+    **{(module, "csc_matrix"): Sparse for module in _SPARSE[:2]},
+    **{(module, "csr_matrix"): SparseRows for module in _SPARSE[2:]},
+    ("chumpy.ch", "Ch"): Leaf,
+    ("chumpy", "Ch"): Leaf,
+    ("chumpy.reordering", "Select"): Select,
+    **{(module, "_reconstructor"): _Function("_reconstructor", _rebuild) for module in ("copy_reg", "copyreg")},
+    ("_codecs", "encode"): _Function("encode", _latin1),
+    **{(module, name): Ignored for module in ("__builtin__", "builtins") for name in ("object", "set", "frozenset")},
+}
+
+
+class _Reader(pickle._Unpickler):
+    """The stand-ins for what a file names; a name outside `ADMITTED` is refused."""
+
+    dispatch: ClassVar[dict[int, Any]] = {
+        code: act for code, act in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
+    }
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The stand-in for a name."""
+        try:
+            return ADMITTED[module, name]
+        except KeyError:
+            raise _RefusedError(f"{module}.{name}") from None
+
+
+class _RefusedError(Exception):
+    """A name that is not in `ADMITTED`."""
+
+
+def read_pickle(path: Path) -> Any:
+    """What a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+
+    Raises:
+        HandError: no such file, too large, not a pickle, or one that names anything but `ADMITTED`; names the culprit.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise HandError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(content) > MAX_BYTES:
+        raise HandError(f"{path}: more than {MAX_BYTES // 2**20} MB, which no MANO file has")
+    try:
+        return _Reader(io.BytesIO(content), encoding="latin1").load()
+    except _RefusedError as refused:
+        raise HandError(
+            f"{path}: asks for {refused}, which a MANO file does not need: refused, and nothing of it was run"
+        ) from None
+    # A file that is no pickle fails in whatever way its bytes happen to; the file is the culprit.
+    except Exception as error:
+        raise HandError(f"{path}: not a MANO pickle: {type(error).__name__}: {error}".splitlines()[0]) from error
+
+
+def numbers(value: Any, depth: int = 0) -> np.ndarray:
+    """The dense array of numbers that a value of the file stands for, native byte order.
+
+    `depth` counts the expressions around it.
+
+    Raises:
+        ValueError: it stands for none; says why.
+    """
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
+    if isinstance(value, Array):
+        return _array(value)
+    if isinstance(value, Sparse):
+        return _dense(value, depth + 1)
+    if isinstance(value, Leaf):
+        return numbers(_entry(value, "x"), depth + 1)
+    if isinstance(value, Select):
+        return _selected(value, depth + 1)
+    if isinstance(value, (bool, int, float)):
+        return np.asarray(value)
+    if isinstance(value, (list, tuple)) and all(isinstance(x, (bool, int, float)) for x in value):
+        return np.asarray(value)
+    raise ValueError(f"holds {type(value).__name__} where numbers are expected")
+
+
+def _array(value: Array) -> np.ndarray:
+    state = value.state
+    if not isinstance(state, tuple) or len(state) != 5:
+        raise ValueError("holds an array without content")
+    _, shape, dtype, fortran, raw = state
+    kind = _dtype(dtype)
+    raw = raw.encode("latin1") if isinstance(raw, str) else raw
+    if not isinstance(raw, bytes) or not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError("holds an array whose content is no block of numbers")
+    flat = np.frombuffer(raw, dtype=kind)
+    # Checked in Python's integers, which cannot overflow.
+    count = 1
+    for n in shape:
+        count *= n
+    if count != len(flat):
+        raise ValueError(f"holds {len(flat)} numbers for an array of shape {shape}")
+    return flat.astype(kind.newbyteorder("=")).reshape(shape, order="F" if fortran else "C")
+
+
+def _dtype(value: Any) -> np.dtype:
+    code = value.arguments[0] if isinstance(value, Dtype) and value.arguments else None
+    if not isinstance(code, str) or len(code) > 3 or code[:1] not in _NUMERIC or not code[1:].isdigit():
+        raise ValueError(f"holds an array of {code!r}, which is no type of numbers")
+    order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
+    if order not in ("<", ">", "|", "="):
+        raise ValueError(f"holds an array in byte order {order!r}")
+    return np.dtype(("<" if order in ("|", "=") else order) + code)
+
+
+def _dense(value: Sparse, depth: int) -> np.ndarray:
+    data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
+    state = value.state
+    shape = state.get("_shape", state.get("shape"))
+    if not isinstance(shape, tuple) or len(shape) != 2 or not all(type(n) is int and n > 0 for n in shape):
+        raise ValueError(f"holds a sparse matrix of shape {shape!r}")
+    if shape[0] * shape[1] > _MAX_DENSE:
+        raise ValueError(f"holds a sparse matrix of shape {shape!r}, larger than any of MANO's")
+    major, minor = shape if isinstance(value, SparseRows) else shape[::-1]
+    consistent = len(starts) == major + 1 and starts[0] == 0 and starts[-1] == len(data) == len(indices)
+    if (
+        not consistent
+        or (np.diff(starts) < 0).any()
+        or (len(indices) and not 0 <= indices.min() <= indices.max() < minor)
+    ):
+        raise ValueError("holds a sparse matrix that does not fit together")
+    dense = np.zeros((major, minor))
+    np.add.at(dense, (np.repeat(np.arange(major), np.diff(starts)), indices), data)
+    return dense if isinstance(value, SparseRows) else dense.T
+
+
+def _selected(value: Select, depth: int) -> np.ndarray:
+    source, index = (numbers(_entry(value, key), depth).ravel() for key in ("a", "idxs"))
+    if index.dtype.kind not in "iu" or (len(index) and not 0 <= index.min() <= index.max() < len(source)):
+        raise ValueError("holds a selection outside its array")
+    shape = value.state.get("preferred_shape")
+    chosen = source[index]
+    return chosen if shape is None else chosen.reshape(tuple(int(n) for n in shape))
+
+
+def _entry(value: Inert, key: str) -> Any:
+    if not isinstance(value.state, dict) or key not in value.state:
+        raise ValueError(f"holds a {type(value).__name__} without {key!r}")
+    return value.state[key]

@@ -1,0 +1,104 @@
+"""XML files of hands: read leniently where descriptions in use are sloppy, strictly where a file could do harm.
+
+Namespaces are not resolved, so undeclared prefixes do no harm; comments may stand before the header. A document type
+declaration is refused: entities are the one part of XML that can blow up or reach for other files.
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from xml.parsers import expat
+
+from graspd_core.errors import HandError
+
+_LARGEST_FILE = 32 * 2**20
+_DEEPEST = 150
+# Elements that errors about their contents name.
+_OWNERS = ("link", "joint", "body", "geom", "mesh")
+
+
+class Element(ET.Element):
+    """An element that knows where it stands: `line`, and the named element that it belongs to, as text."""
+
+    line = 0
+    owner = ""
+
+
+def read_xml(path: Path) -> Element:
+    """The root element of an XML file.
+
+    Raises:
+        HandError: the file cannot be read, is not well-formed, has a document type declaration, or is far too large.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise HandError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB: not a hand")
+        text = _decoded(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise HandError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    return _parsed(path, _blanked(_blanked(text, r"<!--.*?-->"), r"<\?xml\s.*?\?>"))
+
+
+def wrong(path: Path, element: ET.Element, message: str) -> HandError:
+    """The error to raise about an element: names the file, the line, and the link or joint that it belongs to."""
+    line, owner = getattr(element, "line", 0), getattr(element, "owner", "")
+    place = f"{path}:{line}" if line else f"{path}"
+    if owner:
+        message = f"{owner} {message}" if message.startswith(("is ", "has ")) else f"{owner}: {message}"
+    return HandError(f"{place}: {message}")
+
+
+def _decoded(data: bytes) -> str:
+    for mark, encoding in (
+        (codecs.BOM_UTF8, "utf-8"),
+        (codecs.BOM_UTF16_LE, "utf-16"),
+        (codecs.BOM_UTF16_BE, "utf-16"),
+    ):
+        if data.startswith(mark):
+            return data.decode(encoding, errors="replace").lstrip("\ufeff")
+    declared = re.search(rb"<\?xml[^>]*?encoding=[\"']([\w.-]+)", data[:2000])
+    try:
+        name = codecs.lookup(declared.group(1).decode() if declared else "utf-8").name
+        return data.decode(name, errors="replace")
+    except LookupError:
+        return data.decode("utf-8", errors="replace")
+
+
+def _blanked(text: str, pattern: str) -> str:
+    """The text with what matches replaced by as many line ends as it held, so that line numbers stay right."""
+    return re.sub(pattern, lambda found: "\n" * found.group().count("\n"), text, flags=re.DOTALL)
+
+
+def _parsed(path: Path, text: str) -> Element:
+    top: list[Element] = []
+    stack: list[Element] = []
+    parser = expat.ParserCreate(encoding="utf-8")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = Element(tag, attributes)
+        element.line = parser.CurrentLineNumber
+        if tag in _OWNERS and "name" in attributes:
+            element.owner = f"{tag} {attributes['name']!r}"
+        elif stack:
+            element.owner = stack[-1].owner
+        if len(stack) >= _DEEPEST:
+            raise wrong(path, element, f"<{tag}> is nested more than {_DEEPEST} deep")
+        (stack[-1] if stack else top).append(element)
+        stack.append(element)
+
+    def end(tag: str) -> None:
+        del tag
+        stack.pop()
+
+    def refuse(*_: object) -> None:
+        raise HandError(f"{path}:{parser.CurrentLineNumber}: a <!DOCTYPE> is refused: it could define entities")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
+    try:
+        parser.Parse(text.lstrip().encode("utf-8", errors="replace"), True)
+    except expat.ExpatError as error:
+        raise HandError(f"{path}: not well-formed XML: {error}") from error
+    return top[0]

@@ -1,0 +1,69 @@
+"""Charts are drawn, show something, are the same every time, and their labels keep apart."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from graspd_core.bench import charts, charts_style
+from graspd_core.bench.figures import by_name, rows
+
+
+@pytest.fixture
+def records(record):
+    names = [
+        "fast",
+        "balanced",
+        "accurate",
+        "closed_form_hard_contact",
+        "random_closure",
+        "candidates=64",
+        "candidates=128",
+    ]
+    return [
+        record(name, thing, cpu={"scene": 1.0, "optimise": 1.0 + i, "standard": 3.0}, held=(i + j) % 4)
+        for i, name in enumerate(names)
+        for j, thing in enumerate(("box", "mug", "bowl"))
+    ]
+
+
+def test_charts_are_written_and_not_blank(tmp_path: Path, records):
+    from matplotlib.image import imread
+
+    speed, ladder = charts.draw_charts(records, tmp_path / "deep" / "chart")
+    assert speed == tmp_path / "deep" / "chart.png"
+    assert ladder == tmp_path / "deep" / "chart_ladder.png"
+    for name in ("chart", "chart_verified", "chart_ladder"):
+        picture = imread(tmp_path / "deep" / f"{name}.png")[..., :3]
+        assert picture.shape[1] > 400
+        inked = (np.abs(picture - 1.0) > 0.1).any(-1)
+        assert 0.005 < inked.mean() < 0.5, name
+        assert ElementTree.parse(tmp_path / "deep" / f"{name}.svg").getroot().tag.endswith("svg")
+
+
+def test_the_same_figures_draw_the_same_chart(tmp_path: Path, records):
+    presets = by_name(rows(records[:9]))
+    for name in ("one", "two"):
+        charts.draw_speed(presets, tmp_path / name, "cpu_per_grasp", "CPU seconds")
+    for ending in ("png", "svg"):
+        assert (tmp_path / f"one.{ending}").read_bytes() == (tmp_path / f"two.{ending}").read_bytes()
+
+
+def test_nothing_to_draw_is_no_chart(tmp_path: Path, record):
+    assert charts.draw_charts([record(kind="verified", grasps=[])], tmp_path / "chart") == (None, None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_labels_keep_clear_of_each_other():
+    points = [(1.0 + 0.01 * i, 1.0 + 0.02 * (i % 3)) for i in range(8)]
+    with charts_style.figure(4.5, 4.5) as (made, axis):
+        axis.plot(*zip(*points, strict=True), "o")
+        charts_style.place_labels(axis, points, [f"a preset {i}" for i in range(8)], ["black"] * 8)
+        made.canvas.draw()
+        boxes = [text.get_window_extent() for text in axis.texts]
+    assert len(boxes) == 8
+    assert not [pair for pair in combinations(range(8), 2) if boxes[pair[0]].overlaps(boxes[pair[1]])]

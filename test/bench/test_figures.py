@@ -1,0 +1,143 @@
+"""From records to figures, tables, comparisons and the front."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from graspd_core.bench import tables
+from graspd_core.bench.compare import comparison, moves
+from graspd_core.bench.figures import by_name, per_verified, rows, spread
+from graspd_core.bench.names import parent_of, short_name
+from graspd_core.bench.pareto import pareto_front
+from graspd_core.errors import ConfigError
+
+# Small whole numbers, so that points are often equal on an axis.
+POINTS = arrays(np.float64, st.tuples(st.integers(1, 12), st.integers(1, 3)), elements=st.integers(0, 5).map(float))
+
+SUMMARY = """\
+| preset | held | held, hard | SD cm | penetration mm | contact area cm² | CPU s per grasp | CPU s per verified |
+|---|---|---|---|---|---|---|---|
+| `fast` | 50% | 25% | 0.30 | 2.00 | 20.0 | 0.5 | 2.5 |
+| `balanced` | 62% | 38% | 0.25 | 1.75 | 20.0 | 0.5 | 2 |"""
+
+PLANNED = """\
+| preset | verified | first verified CPU s, median (worst) | first verified s | CPU s per verified | rounds | peak MB |
+|---|---|---|---|---|---|---|
+| `balanced` | 8/8 | 4.00 (4.00) | 8 | 2 | 2 | 600 |"""
+
+
+def test_a_grasp_that_was_not_found_counts_as_failed(record):
+    (row,) = rows([record()])
+    assert (row.asked, row.given, row.held) == (4, 3, 2)
+    assert row.values["standard"] == 0.5
+    assert row.values["hard"] == 0.25
+    assert row.values["noisy"] is None
+    assert row.values["sd_cm"] == 0.3
+    assert row.values["penetration_mm"] == pytest.approx(2.0)
+    assert row.values["cpu_per_grasp"] == 0.5
+    assert row.values["cpu_with_scene"] == 0.75
+    assert row.values["cpu_per_verified"] == 2.5
+    assert row.values["first_wall"] == 8.0
+
+
+def test_a_method_that_found_nothing_has_failed_every_trial(record):
+    (row,) = rows([record(given=0, held=0, grasps=[], first_verified=None)])
+    assert row.values["standard"] == row.values["hard"] == 0.0
+    assert row.values["sd_cm"] is None
+    assert row.values["cpu_per_verified"] is None
+
+
+def test_seeds_are_pooled_and_cells_that_raised_left_out(record):
+    found = rows([record(seed=0), record(seed=1, held=4), record("fast"), record("worse", error="died")])
+    assert [(row.name, row.asked, row.held) for row in found] == [("balanced", 8, 6), ("fast", 4, 2)]
+    assert set(by_name(found)) == {"balanced", "fast"}
+
+
+def test_the_spread_is_over_objects(record):
+    found = rows([record(thing=f"{held}", held=held, cpu={"optimise": float(held)}) for held in (0, 1, 2, 3, 4)])
+    over = spread(found, "cpu_per_grasp")
+    assert over is not None
+    assert (over.low, over.median, over.high, over.mean, over.objects) == (0.25, 0.5, 0.75, 0.5, 5)
+    assert spread(found, "noisy") is None
+
+
+def test_an_object_on_which_nothing_held_makes_verified_grasps_dearer(record):
+    found = rows([record(thing="easy"), record(thing="hard", held=0)])
+    assert per_verified(found) == 5.0
+    assert per_verified(found[1:]) is None
+
+
+def test_the_tables_are_these(record, planned):
+    records = [record("fast"), record(), record(thing="mug", held=3, grasps=record()["grasps"][:2] * 2), planned()]
+    records[2]["grasps"] = [records[0]["grasps"][i] for i in (0, 1, 0, 2)]
+    assert tables.summary_table(records) == SUMMARY
+    assert tables.planned_table(records) == PLANNED
+    objects = tables.object_tables(records)
+    assert "| mug | 3/4 | 50% | 0.20 | 1.50 | 20.0 | – |" not in objects, "columns without figures are left out"
+    assert "| mug | 3/4 | 50% | 0.20 | 1.50 | 20.0 | 8 | 0.5 | 1.67 |" in objects
+    assert objects.count("| **mean** |") == 2
+
+
+def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
+    document = tmp_path / "page.md"
+    document.write_text(
+        "before\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
+    )
+    chart = tmp_path / "figures" / "bench.png"
+    assert tables.fill(document, tables.sections([record()], chart, None, document)) == ["bench"]
+    text = document.read_text()
+    assert text.startswith("before\n<!-- bench:begin -->\n![Speed against accuracy](figures/bench.png)\n\n| preset |")
+    assert text.endswith("|\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n")
+    assert "old" not in text
+    document.write_text("no sections")
+    with pytest.raises(ConfigError, match="none of the sections bench, bench-about"):
+        tables.fill(document, tables.sections([record()], None, None, document))
+    with pytest.raises(ConfigError, match="No such file"):
+        tables.fill(tmp_path / "nowhere.md", {})
+
+
+def test_a_comparison_shows_what_moved_and_only_that(record, planned):
+    old = [record(), record(thing="mug"), record("fast"), planned()]
+    assert comparison(old, old) == "nothing moved"
+    slower = {"scene": 1.0, "optimise": 4.0, "standard": 3.0}
+    new = [record(), record(thing="mug", cpu=slower), record("accurate"), planned(first_verified=None)]
+    moved = {(m.kind, m.name, m.object, m.figure): (m.old, m.new) for m in moves(old, new)}
+    assert moved[("raw", "balanced", "mug", "cpu_per_grasp")] == (0.5, 1.0)
+    assert moved[("raw", "balanced", "all", "cpu_per_grasp")] == (0.5, 0.75)
+    assert moved[("verified", "balanced", "box", "first_cpu")] == (4.0, None)
+    assert not any(thing == "box" and kind == "raw" for kind, _, thing, _ in moved)
+    table = comparison(old, new)
+    assert "+100%" in table
+    assert "only in the old run: 1 (raw fast box)" in table
+    assert "only in this run: 1 (raw accurate box)" in table
+
+
+@given(POINTS)
+def test_the_front_is_what_nothing_beats(points: np.ndarray):
+    front = pareto_front(points)
+
+    def beaten(point: np.ndarray) -> bool:
+        return any((other <= point).all() and (other < point).any() for other in points)
+
+    assert front.any()
+    assert [not beaten(point) for point in points] == front.tolist()
+
+
+@given(POINTS, st.floats(0.5, 4.0))
+def test_the_front_does_not_depend_on_units_or_order(points: np.ndarray, factor: float):
+    order = np.random.default_rng(0).permutation(len(points))
+    assert (pareto_front(points * factor + 1.0)[order] == pareto_front(points[order])).all()
+
+
+def test_ablations_know_what_they_are_ablations_of():
+    assert parent_of("closed_form_hard_contact") == "balanced"
+    assert parent_of("graspd2022_no_leak") == "graspd2022_repaired"
+    assert parent_of("graspd2022_short") is parent_of("fast") is None
+    assert short_name("graspd2022_no_leak") == "no leak"
+    assert short_name("random_closure") == "random_closure"

@@ -1,0 +1,107 @@
+"""The LEAP hand that graspd ships with: golden values, geometry, postures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.meshes import primitive_mesh
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.overlap import link_overlaps
+from graspd_core.hands.surface import dense_samples
+
+TIPS = ("fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip")
+# Origins of the fingertip links in palm_lower [m] at a share of the joint range (None: zero, clipped to the limits),
+# from the published description through pytorch-kinematics.
+GOLDEN = {
+    None: [
+        [0.08210, 0.02266, -0.01952],
+        [0.08210, -0.02279, -0.01952],
+        [0.08210, -0.06824, -0.01952],
+        [-0.08240, 0.07666, -0.00692],
+    ],
+    0.5: [
+        [0.02002, 0.02266, -0.09861],
+        [0.02002, -0.02279, -0.09861],
+        [0.02002, -0.06824, -0.09861],
+        [-0.06132, 0.04303, -0.08248],
+    ],
+    0.75: [
+        [-0.04410, 0.00822, -0.08477],
+        [-0.04410, -0.03723, -0.08477],
+        [-0.04410, -0.08268, -0.08477],
+        [-0.07388, -0.04030, -0.07664],
+    ],
+}
+# Extents of the maker's meshes in their link frames [m]: lower corner, upper corner.
+FINGER = {
+    "mcp_joint": ([-0.0430, -0.0080, -0.0028], [0.0100, 0.0625, 0.0330]),
+    "pip": ([-0.0095, -0.0146, -0.0231], [0.0245, 0.0150, -0.0001]),
+    "dip": ([-0.0100, -0.0461, -0.0029], [0.0245, 0.0080, 0.0317]),
+    "fingertip": ([-0.0112, -0.0495, -0.0029], [0.0099, 0.0080, 0.0317]),
+}
+EXTENTS = {
+    "palm_lower": ([-0.1000, -0.0987, -0.0347], [0.0030, 0.0257, 0.0113]),
+    **{f"{name}{finger}": extent for name, extent in FINGER.items() for finger in ("", "_2", "_3")},
+    "pip_4": ([-0.0244, -0.0145, -0.0230], [0.0096, 0.0151, 0.0]),
+    "thumb_pip": ([-0.0100, -0.0173, -0.0249], [0.0100, 0.0173, 0.0001]),
+    "thumb_dip": ([-0.0186, -0.0096, -0.0316], [0.0099, 0.0545, 0.0030]),
+    "thumb_fingertip": ([-0.0112, -0.0622, -0.0309], [0.0184, 0.0094, 0.0021]),
+}
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return load_hand("leap_right")
+
+
+@pytest.mark.parametrize("share", GOLDEN)
+def test_golden_fingertips(hand: HandModel, share: float | None) -> None:
+    q = np.clip(0, hand.lower, hand.upper) if share is None else hand.lower + share * (hand.upper - hand.lower)
+    tips = link_poses(hand, q)[1][[hand.link_index[name] for name in TIPS]]
+    np.testing.assert_allclose(tips, GOLDEN[share], atol=1e-5)  # the golden values have five decimals
+
+
+def test_joints_keep_the_order_of_the_tree(hand: HandModel) -> None:
+    """Names are bare numbers that do not rise along a finger; sorting them would permute the joints."""
+    assert hand.joint_names == tuple("1 0 2 3 5 4 6 7 9 8 10 11 12 13 14 15".split())
+    np.testing.assert_allclose(hand.lower, [-0.314, -1.047, -0.506, -0.366] * 3 + [-0.349, -0.47, -1.2, -1.34])
+    np.testing.assert_allclose(hand.upper, [2.23, 1.047, 1.885, 2.042] * 3 + [2.094, 2.443, 1.9, 1.88])
+    np.testing.assert_allclose(hand.effort, 0.95)
+    assert hand.link_mass.sum() == pytest.approx(0.746)
+    assert hand.open_posture[hand.joint_names.index("12")] == 1.5
+    assert hand.open_posture[0] == 0.4
+
+
+def test_inertias_are_those_of_solid_bodies(hand: HandModel) -> None:
+    for inertia in hand.link_inertia:
+        a, b, c = np.linalg.eigvalsh(inertia)
+        assert a > 0
+        assert a + b >= c
+
+
+@pytest.mark.parametrize("name", EXTENTS)
+def test_primitives_cover_the_true_extents(hand: HandModel, name: str) -> None:
+    meshes = [primitive_mesh(p).vertices for p in hand.primitives_of[hand.link_index[name]]]
+    vertices = np.concatenate(meshes)
+    lower, upper = EXTENTS[name]
+    # 0.12 mm: the extents are rounded to 0.1 mm, fingers differ by as much, and the tip's dome has inscribed facets.
+    np.testing.assert_allclose(vertices.min(0), lower, atol=1.2e-4)
+    np.testing.assert_allclose(vertices.max(0), upper, atol=1.2e-4)
+
+
+@pytest.mark.parametrize("posture", ["open_posture", "closed_posture"])
+def test_postures_are_within_limits_and_free_of_self_collision(hand: HandModel, posture: str) -> None:
+    q = getattr(hand, posture)
+    assert ((hand.lower <= q) & (q <= hand.upper)).all()
+    points, links, _ = dense_samples(hand, count=6000, seed=11)
+    overlap = np.where(hand.adjacent, 0.0, link_overlaps(hand, q[None], points, links)[0])
+    assert overlap.max() == 0.0
+
+
+def test_thumb_opposes_the_fingers_when_open(hand: HandModel) -> None:
+    tips = link_poses(hand, hand.open_posture)[1][[hand.link_index[name] for name in TIPS]]
+    assert ((tips - hand.palm_center) @ hand.palm_normal > 0.03).all()
+    assert np.linalg.norm(tips[3] - tips[1]) > 0.08  # room for an object of 8 cm
