@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench-foundation bench-rgbd soak clean
+.PHONY: help setup test check format demo bench bench-quick bench-rgbd soak clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -35,8 +35,13 @@ format: setup  ## format and sort imports in place
 demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and figures out, in demo/
 	$(RUN)/python examples/demo.py
 
-bench-foundation: setup  ## make the README's results table anew
-	$(RUN)/python benchmarks/foundation.py --readme README.md $(if $(MESHES),--meshes $(MESHES))
+BENCH := $(RUN)/graspd bench --processes 2
+
+bench: setup  ## all methods and presets on all shapes: README's chart and tables anew (an hour and more; resumable)
+	$(BENCH) --suite main --suite ladder --out results/bench --chart docs/figures/bench --readme README.md --readme docs/bench.md
+
+bench-quick: setup  ## a small part of it, in minutes, to results/bench-quick
+	$(BENCH) --quick --out results/bench-quick --chart results/bench-quick/chart
 
 bench-rgbd: setup  ## make the table of docs/clouds.md anew: shapes on a table, rendered with sensor noise (an hour)
 	$(RUN)/python benchmarks/rgbd.py --readme docs/clouds.md

@@ -135,7 +135,8 @@ def load_document(path: str | Path) -> dict[str, Any]:
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     """The grasps of a document that `load_document` read, in rank order; the squeeze has the grasp's base pose.
 
-    Joint positions are those of the actuated joints, as everywhere in graspd: coupled ones follow from them. Metrics stay in the document: who wants to judge a grasp measures it anew.
+    Joint positions are those of the actuated joints, as everywhere in graspd: coupled ones follow from them. Metrics
+    stay in the document: who wants to judge a grasp measures it anew.
 
     Raises:
         FormatError: a grasp lacks a key, or holds something of the wrong kind there.

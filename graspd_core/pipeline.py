@@ -26,7 +26,7 @@ from graspd_core.geometry.scene import Scene, object_parts
 from graspd_core.geometry.shapes import make_shape
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.hands.model import HandModel
+from graspd_core.hands.model import HandModel, Mount, all_joint_names, all_joint_positions
 from graspd_core.metrics.judge import make_judge
 from graspd_core.metrics.quality import measure
 from graspd_core.optimise.effort import at_effort
@@ -50,10 +50,13 @@ from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
 __all__ = [
     "HandModel",
+    "Mount",
     "PinholeCamera",
     "PointCloud",
     "Scene",
     "Target",
+    "all_joint_names",
+    "all_joint_positions",
     "check_request",
     "cloud_from_depth",
     "elsewhere",

@@ -150,7 +150,7 @@ class Answers:
         shown = []
         best = convert.presentable(result)
         if best is not None:
-            shown.append(convert.joint_message(best.grasp, hand.joint_names, hand.base_link, request.stamp))
+            shown.append(convert.joint_message(best.grasp, hand, request.stamp))
             shown.append(convert.pose_message(best, request.frame_out, request.stamp))
         if request.settings.publish_markers and planned.worked_on:
             shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp))

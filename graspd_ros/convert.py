@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
+from graspd_core.pipeline import HandModel, all_joint_names, all_joint_positions
 from graspd_core.types import Grasp, GraspResult, Posture, Progress, Verdict
 
 
@@ -32,12 +32,12 @@ def pose_message(grasp: Grasp, frame: str, stamp: Time) -> PoseStamped:
     return PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of(grasp.grasp))
 
 
-def joint_message(posture: Posture, joint_names: Sequence[str], base_link: str, stamp: Time) -> JointState:
-    """Joint values of a posture [rad]; no velocities and no efforts."""
+def joint_message(posture: Posture, hand: HandModel, stamp: Time) -> JointState:
+    """Values of all movable joints, coupled ones too [rad] or [m]; no velocities and no efforts."""
     return JointState(
-        header=Header(frame_id=base_link, stamp=stamp),
-        name=list(joint_names),
-        position=[float(value) for value in posture.joint_positions],
+        header=Header(frame_id=hand.base_link, stamp=stamp),
+        name=list(all_joint_names(hand)),
+        position=all_joint_positions(hand, posture.joint_positions).tolist(),
     )
 
 

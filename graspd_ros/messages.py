@@ -17,6 +17,7 @@ from graspd_core.pipeline import HandModel
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Progress, Stage, Verdict
 from graspd_ros import convert
 from graspd_ros.codes import ErrorCode
+from graspd_ros.mount import parent_pose
 from graspd_ros.trajectory import Pace, base_poses, trajectory_of
 
 UNMEASURED = -1.0
@@ -90,7 +91,7 @@ def grasp_message(
     """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN."""
     _check_finite(grasp, rank)
     joints = [
-        convert.joint_message(posture, hand.joint_names, hand.base_link, header.stamp)
+        convert.joint_message(posture, hand, header.stamp)
         for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze)
     ]
     message = GraspMessage(
@@ -111,6 +112,10 @@ def grasp_message(
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
+    if hand.mount is not None:
+        message.mount_link = hand.mount.parent
+        message.mount_pregrasp_pose = parent_pose(message.pregrasp_pose, hand.mount)
+        message.mount_grasp_pose = parent_pose(message.grasp_pose, hand.mount)
     if grasp.metrics is not None:
         message.epsilon = _number(grasp.metrics.epsilon)
         message.penetration = _number(grasp.metrics.penetration)

@@ -45,7 +45,8 @@ def moveit_grasp(
         retreat: direction to lift in, of any length, in `retreat_frame`: usually up.
         retreat_frame: frame of `retreat`.
         retreat_distance: how far to lift [m].
-        T_parent_base: pose of the hand's base link in the end effector's parent link; None: they are one.
+        T_parent_base: pose of the hand's base link in the end effector's parent link; None: as the hand is mounted by
+            its description, and where that has no mount, they are one.
         messages: module with the message classes; None: moveit_msgs.msg.
 
     Raises:
@@ -58,10 +59,11 @@ def moveit_grasp(
     if not (np.isfinite(up).all() and up.any()):
         raise ConfigError(f"retreat: {retreat}; it must be a direction")
     messages = messages or _moveit_messages()
-    T_base_parent = np.eye(4) if T_parent_base is None else np.linalg.inv(T_parent_base)
     pregrasp = matrix_of_pose(grasp.pregrasp_pose)
     way = matrix_of_pose(grasp.grasp_pose)[:3, 3] - pregrasp[:3, 3]
-    pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ T_base_parent)
+    pose = grasp.mount_grasp_pose if grasp.mount_link else grasp.grasp_pose
+    if T_parent_base is not None:
+        pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ np.linalg.inv(T_parent_base))
     first, *closing = deepcopy(grasp.trajectory.points)
     quality = grasp.epsilon if grasp.epsilon >= 0 else 0.0
     return messages.Grasp(

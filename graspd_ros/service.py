@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 
 from graspd_core.config import load_preset
 from graspd_core.errors import GraspdError
-from graspd_core.pipeline import give_memory_back, hand_names, load_hand, warm_up
+from graspd_core.pipeline import all_joint_names, give_memory_back, hand_names, load_hand, warm_up
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action import GoalServer
 from graspd_ros.answers import Answers
@@ -150,7 +150,7 @@ class GraspNode(Node):
 
     def _on_list_hands(self, _: ListHands.Request, response: ListHands.Response) -> ListHands.Response:
         response.names, response.current = list(hand_names()), self._hand.name
-        response.joint_names, response.base_link = list(self._hand.joint_names), self._hand.base_link
+        response.joint_names, response.base_link = list(all_joint_names(self._hand)), self._hand.base_link
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

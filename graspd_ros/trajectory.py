@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_core.errors import ConfigError
-from graspd_core.pipeline import HandModel
+from graspd_core.pipeline import HandModel, all_joint_names, all_joint_positions
 from graspd_core.types import Grasp, Posture
 from graspd_ros.convert import pose_of
 
@@ -50,12 +50,13 @@ class Pace:
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
     """Pregrasp, grasp and squeeze, for a controller that starts on receipt (the stamp is zero) from any posture.
 
-    Positions are within the joint limits. The last point is a target that presses: joints stop short of it.
+    It names all movable joints, those too that follow others. Positions are within the joint limits. The last point is
+    a target that presses: joints stop short of it.
     """
     times = stage_times(grasp, hand, pace)
     return JointTrajectory(
         header=Header(frame_id=hand.base_link),
-        joint_names=list(hand.joint_names),
+        joint_names=list(all_joint_names(hand)),
         points=[_point(posture, hand, at) for posture, at in zip(_postures(grasp), times, strict=True)],
     )
 
@@ -71,7 +72,7 @@ def stage_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float
     The first is enough for any joint to come from anywhere within its limits; the base is taken to stand at the
     pregrasp by then.
     """
-    speed = np.minimum(np.where(_slides(hand), pace.base_speed, pace.joint_speed), hand.velocity)
+    speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
     closing = _stage_time(grasp.pregrasp, grasp.grasp, speed, pace)
     return first, first + closing, first + closing + _stage_time(grasp.grasp, grasp.squeeze, speed, pace)
@@ -86,12 +87,13 @@ def _stage_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> 
     return max(pace.shortest, _PEAK * max(joints, travel, turn))
 
 
-def _slides(hand: HandModel) -> np.ndarray:
-    slides = np.zeros(hand.num_joints, dtype=bool)
-    for joint, kind in zip(hand.link_joint, hand.joint_kind, strict=True):
-        if joint >= 0:
-            slides[joint] = kind == "prismatic"
-    return slides
+def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
+    """Of the actuated joints [rad/s] or [m/s]; a joint that follows one may not be faster than its own kind either."""
+    speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
+    for mimic in hand.mimics:
+        own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
+        speed[mimic.joint] = min(speed[mimic.joint], own / max(abs(mimic.multiplier), 1e-9))
+    return speed
 
 
 def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
@@ -100,11 +102,11 @@ def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
 
 def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint:
     # Rounding may put a joint that rests on its limit a hair beyond it, which controllers refuse.
-    positions = np.clip(posture.joint_positions, hand.lower, hand.upper)
+    positions = all_joint_positions(hand, np.clip(posture.joint_positions, hand.lower, hand.upper))
     # Whole nanoseconds, rounded up: never faster than allowed.
     seconds, nanoseconds = divmod(math.ceil(at * 1e9), 1_000_000_000)
     return JointTrajectoryPoint(
         positions=positions.tolist(),
-        velocities=[0.0] * hand.num_joints,
+        velocities=[0.0] * len(positions),
         time_from_start=Duration(sec=seconds, nanosec=nanoseconds),
     )

@@ -51,4 +51,4 @@ def test_presets_named_in_the_readme_exist():
 
 
 def test_results_have_a_place():
-    assert README.index("<!-- results:begin -->") < README.index("<!-- results:end -->")
+    assert README.index("<!-- bench:begin -->") < README.index("<!-- bench:end -->") < README.index("## Quick start")

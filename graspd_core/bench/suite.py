@@ -33,12 +33,12 @@ _LADDER_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
 _LADDER_PRESET = "balanced"
 _QUICK_OBJECTS = ("shape:sphere", "shape:box", "shape:mug")
 _QUICK_COUNT = 4
-# Presets whose cells take minutes; a quick run leaves them out.
-_SLOW_METHODS = ("graspd2022", "annealing")
+# The others take minutes a cell.
+_QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
 
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
 # Rungs of the ladder: what is changed, and to what; all else stays at `balanced`.
-LADDER: Mapping[str, Sequence[Mapping[str, float]]] = {
+LADDER: Mapping[str, Sequence[Mapping[str, int]]] = {
     "candidates": [{"closed_form.candidates": n} for n in (32, 64, 128, 256, 512)],
     "directions": [{"closed_form.directions": n} for n in (6, 12, 24, 48, 96)],
     "resolution": [{"resolution": n} for n in (16, 24, 32, 48, 64)],
@@ -104,7 +104,7 @@ def cells_of(suites: Sequence[str], request: Request) -> tuple[Cell, ...]:
 def main_suite(request: Request) -> tuple[Cell, ...]:
     """Every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
     make = _Maker(request)
-    defaults = [n for n in preset_names() if not request.quick or load_preset(n).method not in _SLOW_METHODS]
+    defaults = [name for name in preset_names() if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
     objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
     cells: list[Cell] = []
@@ -142,12 +142,12 @@ def ladder_suite(request: Request) -> tuple[Cell, ...]:
 SUITES: dict[str, Callable[[Request], tuple[Cell, ...]]] = {"main": main_suite, "ladder": ladder_suite}
 
 
-def rung_name(ladder: str, changes: Mapping[str, float]) -> str:
+def rung_name(ladder: str, changes: Mapping[str, int]) -> str:
     """Name of a rung's cells: the ladder and its value (steps: all of them together)."""
     return f"{ladder}={sum(changes.values()):g}"
 
 
-def override(settings: Any, changes: Mapping[str, float]) -> Any:
+def override(settings: Any, changes: Mapping[str, Any]) -> Any:
     """Settings with some fields changed, each by its dotted name. Raises ConfigError: there is no such field."""
     for name, value in changes.items():
         head, _, rest = name.partition(".")

@@ -92,9 +92,8 @@ def sections(records: Sequence[Record], chart: Path | None, ladder: Path | None,
     """Text of every section that a document may have, by the name of its marker."""
     planned, pace = planned_table(records), pace_table(records)
     return {
-        "bench": "\n\n".join(part for part in (_picture(chart, document), summary_table(records)) if part),
-        "bench-about": about(records),
-        "bench-planned": "\n\n".join(part for part in (planned, pace) if part),
+        "bench": "\n\n".join(filter(None, (_picture(chart, document), summary_table(records), about(records)))),
+        "bench-planned": "\n\n".join(filter(None, (planned, pace))),
         "bench-ladder": _picture(ladder, document),
         "bench-objects": object_tables(records),
     }

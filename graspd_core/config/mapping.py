@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -46,7 +47,7 @@ def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:
         return float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
-    if isinstance(value, int | float) and not (-float("inf") if signed else 0) <= value < float("inf"):
+    if isinstance(value, int | float) and not (math.isfinite(value) and (signed or value >= 0)):
         raise ConfigError(f"{where}: {value!r} must be a finite number{'' if signed else ', zero or more'}")
     return value
 

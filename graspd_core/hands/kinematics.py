@@ -37,7 +37,7 @@ class Kinematics:
     slide: Float[Tensor, "links 3 4"] | None
     joint: Int[Tensor, "links"]
     level_sizes: tuple[int, ...]
-    level_parents: tuple[Int[Tensor, "level"] | None, ...]
+    level_parents: tuple[Int[Tensor, "_"] | None, ...]
     order: Int[Tensor, "links"]
     multiplier: Float[Tensor, "links"] | None = None
     shift: Float[Tensor, "links"] | None = None

@@ -79,7 +79,7 @@ def read_mano(path: Path) -> ManoData:
     if not np.array_equal(tree[1], range(len(BODIES))) or tuple(tree[0, 1:]) != PARENTS[1:]:
         raise HandError(f"{path}: kintree_table is not MANO's tree of a wrist and five fingers of three joints")
     for key, rows in (("weights", data.weights), ("J_regressor", data.joint_regressor)):
-        if np.abs(rows.sum(1) - 1.0).max() > 1e-3:
+        if np.abs(rows.sum(1) - 1.0).max() > 0.01:
             raise HandError(f"{path}: {key}: rows do not sum to one")
     if len(data.faces) == 0 or data.faces.min() < 0 or data.faces.max() >= count:
         raise HandError(f"{path}: f: names vertices outside 0 to {count - 1}")

@@ -266,7 +266,7 @@ def _selected(value: Select, depth: int) -> np.ndarray:
         raise ValueError("holds a selection outside its array")
     shape = value.state.get("preferred_shape")
     chosen = source[index]
-    return chosen if shape is None else chosen.reshape(tuple(int(n) for n in shape))
+    return chosen if shape is None else chosen.reshape(numbers(shape, depth).astype(np.int64))
 
 
 def _entry(value: Inert, key: str) -> Any:

@@ -1,4 +1,4 @@
-"""Coupled joints of a URDF (`<mimic joint="..." multiplier="..." offset="..."/>`), chains resolved to actuated joints."""
+"""Coupled joints: `<mimic joint="..." multiplier="..." offset="..."/>`, chains resolved to actuated joints."""
 
 from __future__ import annotations
 

@@ -228,11 +228,9 @@ def _finite(
                 f"to {_LONGEST_SLIDE:g} m at most"
             )
         if joint.kind == "revolute" and not upper[i] - lower[i] <= _WIDEST:
-            middle = 0.5 * (lower[i] + upper[i]) if np.isfinite([lower[i], upper[i]]).all() else 0.0
-            # The turn that holds zero, or the one about the middle where zero is out of reach.
-            middle = 0.0 if lower[i] <= -np.pi and upper[i] >= np.pi else middle
-            low, high = max(lower[i], middle - np.pi), min(upper[i], middle + np.pi)
-            lower[i], upper[i] = (low, high) if low < high else (middle - np.pi, middle + np.pi)
+            # One turn: the one from -π to π, moved no farther than the limits ask for.
+            lower[i] = min(max(-np.pi, lower[i]), upper[i] - 2 * np.pi)
+            upper[i] = lower[i] + 2 * np.pi
             warnings.append(f"joint {joint.name!r} turns without end: kept to [{lower[i]:.3g}, {upper[i]:.3g}] rad")
     return lower, upper, tuple(warnings)
 

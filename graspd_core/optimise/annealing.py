@@ -256,9 +256,9 @@ def search_annealing(
     chains = max(_FEWEST_CHAINS, round(count * settings.chains_per_grasp))
     starts = draw_starts(scene, hand, chains, seed, device, dtype)
     annealed = minimise(annealing, problem, starts, hooks)
-    if annealed.interrupted == "cancelled":
-        return Found(problem, annealed.poses, annealed.interrupted)
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
+    if annealed.interrupted == "cancelled" or len(legal) == 0:
+        return Found(problem, annealed.poses[legal], annealed.interrupted)
     # What the deadline cut short is closed all the same: open fingers would be no grasps.
     closing = make_closing(problem, hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.scene import Scene
-from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.kinematics import forward, link_poses, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.optimise.obstacles import RETREAT, Obstacles, make_obstacles, obstacle_gaps
+from graspd_core.optimise.problem import fingertip_groups
 from graspd_core.optimise.solver import Poses
-from graspd_core.optimise.span import centred, close_up, half_widths, is_vice
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
 
@@ -28,6 +28,8 @@ _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
 # Among obstacles more places are drawn; how deep a hand reaches into one [m] that makes its place e times rarer, and
 # how far a hand is lifted off the support to stay above it [m].
 _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
+# The slab of the object that a hand closes around [m].
+_SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
 
 
 def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: str, dtype: torch.dtype) -> Poses:
@@ -35,8 +37,6 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
 
     After the published initialisation of Grasp'D (a random surface point, palm towards it, random roll), but on the
     hull, so that no palm starts inside a hollow, and with place and roll drawn in favour of narrow cross-sections.
-    A hand that closes like a vice cannot reach to one side: it starts with the object in the middle between its jaws,
-    and these as near to it as they come together.
     Where there are obstacles, hands that would reach into them, or could not have come there, are drawn last.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -54,9 +54,6 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
     rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -facing)
     rotation = rotation_from_axis_angle(facing, uniform(-np.pi, np.pi)) @ rotation
     palm = torch.as_tensor(points) + uniform(*_STANDOFF)[:, None] * outward
-    surface = torch.as_tensor(surface_samples(scene.object.mesh, _SPAN_POINTS, seed)[0])
-    if is_vice(hand):
-        palm = centred(surface, palm, rotation, hand)
     translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
     spread = torch.as_tensor(hand.upper - hand.lower)
     noise = _JOINT_NOISE * (torch.rand(pool, len(spread), generator=generator, dtype=torch.float64) - 0.5)
@@ -69,17 +66,15 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
         raised, blocked = raise_clear(obstacles, rotation, translation, frames)
         palm, translation = palm + raised - translation, raised
 
-    half_width = half_widths(surface, palm, rotation, hand)
+    surface, _ = surface_samples(scene.object.mesh, _SPAN_POINTS, seed)
+    half_width = half_widths(torch.as_tensor(surface), palm, rotation, hand)
     # Gumbel noise makes the best `count` a draw without replacement with weights exp(−half width / scale).
     gumbel = -torch.log(-torch.log(uniform(1e-12, 1.0)))
     chosen = (gumbel - half_width / _SPAN_SCALE - blocked / _DEPTH_SCALE).topk(count).indices
-    translation, rotation, joints = translation[chosen], rotation[chosen], joints[chosen]
-    if is_vice(hand):
-        joints = close_up(scene.sdf, hand, rotation, translation, joints)
     return Poses(
-        translation.to(device, dtype),
-        quaternion_from_rotation(rotation).to(device, dtype),
-        joints.to(device, dtype),
+        translation[chosen].to(device, dtype),
+        quaternion_from_rotation(rotation[chosen]).to(device, dtype),
+        joints[chosen].to(device, dtype),
     )
 
 
@@ -99,6 +94,35 @@ def raise_clear(
     behind = translation + RETREAT * (rotation @ obstacles.retreat)
     gaps = [obstacle_gaps(obstacles, rotation, at, *frames).amin(-1) for at in (translation, behind)]
     return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
+
+
+def half_widths(
+    surface: Float[Tensor, "points 3"],
+    palm: Float[Tensor, "batch 3"],
+    rotation: Float[Tensor, "batch 3 3"],
+    hand: HandModel,
+) -> Float[Tensor, "batch"]:
+    """How far the object reaches from the middle of the palm along the direction in which the fingers close [m].
+
+    Only the slab of the object counts that the fingers close around: a hand's breadth wide, and as deep as they reach.
+    """
+    normal = torch.as_tensor(hand.palm_normal)
+    closing = torch.as_tensor(closing_axis(hand))
+    local = (surface[None] - palm[:, None]) @ rotation
+    along, depth = local @ closing, local @ normal
+    across = local @ torch.linalg.cross(normal, closing)
+    within = (across.abs() < _SLAB_HALF_BREADTH) & (depth < _SLAB_DEPTH)
+    width = torch.where(within, along.abs(), 0.0).amax(-1)
+    # A palm that faces past the object has nothing to close around.
+    return torch.where(within.any(-1), width, torch.inf)
+
+
+def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
+    """Unit direction in the palm plane along which the fingertips travel most from open to closed, base frame."""
+    tips = [int(np.flatnonzero(hand.link_group == group)[-1]) for group in fingertip_groups(hand)]
+    travel = (link_poses(hand, hand.closed_posture)[1] - link_poses(hand, hand.open_posture)[1])[tips]
+    in_plane = travel - np.outer(travel @ hand.palm_normal, hand.palm_normal)
+    return np.linalg.svd(in_plane)[2][0]
 
 
 def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:

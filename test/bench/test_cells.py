@@ -17,6 +17,7 @@ from graspd_core.config import PlanConfig, load_preset
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.geometry.mesh import save_mesh
 from graspd_core.geometry.shapes import make_shape
+from graspd_core.types import TriangleMesh
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "f00", "allegro_right", "f11", 0, 4, ("standard", "hard"))
 
@@ -100,16 +101,14 @@ def test_a_cell_that_raises_is_a_record_with_its_error(monkeypatch: pytest.Monke
     assert store.read_cell(tmp_path, CELL, "1+a") is None, "it is run again next time"
 
 
-def test_a_method_that_finds_nothing_is_a_cell_with_nothing_held():
-    # A sphere of 12 cm is too large for the hand: the trial settings do not matter, nothing gets that far.
-    config = override(load_preset("fast"), {"postures.grip_force": 0.0})
-    (thing,) = find_objects(("shape:sphere",))
-    cell = replace(CELL, settings=config, source=thing.source, count=1, trials=("standard",))
-    record = run.run_cell(cell, "1+a")
-    assert record["error"] == ""
-    assert record["held"] == 0
-    assert record["first_verified"] is None
+def test_an_object_that_cannot_be_grasped_is_a_cell_with_nothing_held(tmp_path: Path):
+    box = make_shape("box")
+    save_mesh(TriangleMesh(box.vertices * 10, box.faces), tmp_path / "crate.ply")
+    config, source = load_preset("random_closure"), str(tmp_path / "crate.ply")
+    record = run.run_cell(replace(CELL, settings=config, source=source, count=1, trials=("standard",)), "1+a")
+    assert (record["error"], record["held"], record["first_verified"]) == ("", 0, None)
     assert len(record["grasps"]) == record["given"] <= record["asked"]
+    assert record["peak_mb"] > 10.0
     json.dumps(record, allow_nan=False)
 
 

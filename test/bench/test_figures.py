@@ -93,10 +93,11 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     assert tables.fill(document, tables.sections([record()], chart, None, document)) == ["bench"]
     text = document.read_text()
     assert text.startswith("before\n<!-- bench:begin -->\n![Speed against accuracy](figures/bench.png)\n\n| preset |")
-    assert text.endswith("|\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n")
+    assert "\n\n1 cells, 1 objects, seeds 0; hand allegro_right; 0 CPU minutes on 2 cores; code 0.1.0+abc.\n" in text
+    assert text.endswith("\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n")
     assert "old" not in text
     document.write_text("no sections")
-    with pytest.raises(ConfigError, match="none of the sections bench, bench-about"):
+    with pytest.raises(ConfigError, match="none of the sections bench, bench-planned"):
         tables.fill(document, tables.sections([record()], None, None, document))
     with pytest.raises(ConfigError, match="No such file"):
         tables.fill(tmp_path / "nowhere.md", {})

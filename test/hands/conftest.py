@@ -1,4 +1,4 @@
-"""Hands that nobody has built: random trees of links and joints as URDF texts, one MJCF file, and ways to break them."""
+"""Hands that nobody has built: random trees of links and joints as URDF texts, an MJCF file, ways to break them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DAE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="
 MJCF = """<mujoco model="tri"><compiler angle="degree" eulerseq="zyx"/>
 <default><geom type="capsule"/><default class="f"><joint axis="0 1 0" range="-10 90"/><geom size="0.01 0.02"/>
 <default class="v"><geom contype="0" conaffinity="0"/></default></default></default>
-<asset><mesh name="t" vertex="0 0 0 .02 0 0 0 .02 0 0 0 .03" scale="1 -1 1"/><mesh name="w" file="wedge.stl"/></asset>
+<asset><mesh name="t" vertex="0 0 0 .02 0 0 0 .02 0 0 0 .03" scale="1 -1 1"/><mesh name="w" file="wedge.obj"/></asset>
 <worldbody><geom type="plane" size="1 1 .1"/>
 <body name="palm" pos="1 2 3" euler="10 20 30" childclass="f"><freejoint/><geom type="box" size=".04 .04 .01"/>
   <body name="a" pos="0.04 0 0.01" euler="10 -20 30">
@@ -37,7 +37,8 @@ MJCF = """<mujoco model="tri"><compiler angle="degree" eulerseq="zyx"/>
       <geom type="mesh" mesh="w" pos="0 0 .02"/></body></body>
 </body></worldbody>
 <equality><joint joint1="k" joint2="j3" polycoef="0.1 .5 0 0 0"/></equality>
-<actuator><position joint="j1" forcerange="-2 2" kp="1"/><motor joint="s1" ctrlrange="0 5" gear="3"/></actuator></mujoco>"""
+<actuator><position joint="j1" forcerange="-2 2" kp="1"/><motor joint="s1" ctrlrange="0 5" gear="3"/></actuator>
+</mujoco>"""
 GEOMETRIES = (
     '<box size="0.02 0.03 0.04"/>',
     '<sphere radius="0.012"/>',

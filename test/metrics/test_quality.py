@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.metrics.judge import make_judge
-from graspd_core.metrics.quality import measure, surface_normals
+from graspd_core.metrics.quality import PROTOCOL_CONTACTS, contact_per_volume, measure, surface_normals
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
 from graspd_core.types import Posture, TriangleMesh
 
@@ -71,3 +71,31 @@ def test_normals_point_out_on_either_side_of_the_surface(gripper, box, as_object
     expected = np.array([[1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 0, 0]])
     # Differences of float32 distances (1e-8 m) over 0.4 mm.
     assert surface_normals(judge.query, points) == pytest.approx(expected, abs=1e-4)
+
+
+def test_wider_contacts_about_a_box(gripper, box, as_object, at):
+    judge = make_judge(as_object(box), gripper)
+    assert len(judge.surface.points) >= 2000
+    # Inner faces half a millimetre off. Within 5 mm of the box's planes: the inner faces, 4.5 mm of the sides about
+    # them, nothing of the palm, whose face is 5 mm below the box's.
+    metrics = measure(judge, at((0, 0, -0.0501), (0.0145, 0.0145)))
+    assert metrics.contact_area_5mm == pytest.approx(2 * (0.03 * 0.06 + 0.18 * 0.0045), rel=0.08)
+    # Within 10 mm: 9.5 mm of the sides, and the palm's strip below the box, 60 mm and 8.6 mm about its edges wide.
+    strip = 0.04 * (0.06 + 2 * 0.0086)
+    assert metrics.contact_area_10mm == pytest.approx(2 * (0.03 * 0.06 + 0.18 * 0.0095) + strip, rel=0.08)
+
+
+def test_area_over_volume_of_a_block_sunk_into_a_face(block, box, as_object, at):
+    metrics = measure(make_judge(as_object(box), block), at((0.045, 0, 0), (0.0,)))
+    # 5 mm deep over 30 x 20 mm; a band of 4 mm about a perimeter of 100 mm is within 2 mm of the face.
+    assert contact_per_volume(metrics) == pytest.approx(0.1 * 0.004 / (0.005 * 0.03 * 0.02), rel=0.2)
+    assert contact_per_volume(dataclasses.replace(metrics, intersection_volume=0.0)) is None
+
+
+def test_more_contacts_only_widen_the_wrench_hull(gripper, box, as_object, at):
+    judge, posture = make_judge(as_object(box), gripper), at((0, 0, -0.05), (0.0145, 0.0145))
+    few, many = (measure(judge, posture, max_contacts=count) for count in (8, PROTOCOL_CONTACTS))
+    # Farthest points are nested: the first eight are among the first 32. Joggled by 1e-10.
+    assert many.epsilon >= few.epsilon - 1e-8
+    assert many.volume > few.volume
+    assert dataclasses.replace(many, epsilon=0.0, volume=0.0) == dataclasses.replace(few, epsilon=0.0, volume=0.0)

@@ -29,6 +29,7 @@ from graspd_core.optimise.postures import Touches, hand_distance
 from graspd_core.optimise.search import Found
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Plane
 
 DOUBLE = torch.float64
 SETTINGS = AnnealingConfig(steps=40, close_steps=20, chains_per_grasp=4.0, directions=64)
@@ -157,6 +158,14 @@ def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
     nearest = hand_distance(first.problem, rotation, first.poses.translation, first.poses.joints).amin(-1)
     # Even so short a run closes most hands onto the object; the hand's 60 points may miss the very spot.
     assert (nearest < 0.005).sum() >= 6
+
+
+def test_chains_that_never_leave_a_collision_give_nothing(scenes, hand):
+    # The support ends a metre above the object: in two steps no hand gets out of it.
+    buried = replace(scenes["sphere"], support=Plane(np.array([0.0, 0.0, 1.0]), 1.0))
+    short = replace(CONFIG, annealing=replace(SETTINGS, steps=2))
+    found = search_annealing(buried, hand, count=2, seed=0, config=short, hooks=Hooks(), device="cpu", dtype=DOUBLE)
+    assert (found.interrupted, len(found.poses.joints)) == ("", 0)
 
 
 def test_it_stops_when_told_and_closes_what_the_deadline_left(scenes, hand):

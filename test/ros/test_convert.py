@@ -10,6 +10,7 @@ import yaml
 from builtin_interfaces.msg import Time
 
 from graspd_core.paths import config_dir
+from graspd_core.pipeline import load_hand
 from graspd_core.types import (
     Grasp,
     GraspResult,
@@ -45,10 +46,13 @@ def test_the_pose_names_its_frame_and_turns_wxyz_to_xyzw():
 
 
 def test_the_joint_state_names_its_joints_and_carries_positions_only():
-    message = convert.joint_message(grasp(Verdict.VERIFIED).grasp, ("a", "b"), "palm", Time())
-    assert message.header.frame_id == "palm"
-    assert list(message.name) == ["a", "b"]
-    assert list(message.position) == [0.25, -1.0]
+    hand = load_hand("parallel_gripper", candidates=8)
+    posture = dataclasses.replace(grasp(Verdict.VERIFIED).grasp, joint_positions=np.array([0.0625]))
+    message = convert.joint_message(posture, hand, Time())
+    assert message.header.frame_id == "base_link"
+    # The jaw that follows the other has its own value.
+    assert list(message.name) == ["left_jaw", "right_jaw"]
+    assert list(message.position) == [0.0625, 0.0625]
     assert not message.velocity
     assert not message.effort
 

@@ -16,6 +16,8 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from graspd_core.config import preset_names
+
 RESULT_TIMEOUT = 60.0
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 40.0}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 60.0}
@@ -84,7 +86,7 @@ def test_whatever_cannot_be_served_is_refused_by_name(client, node):
     cases = [
         ({"source": 9}, "BAD_REQUEST", "source: 9"),
         ({**SPHERE, "hand": "no_such_hand"}, "WRONG_HAND", "'no_such_hand' is not loaded"),
-        ({**SPHERE, "preset": "no_such_preset"}, "BAD_REQUEST", "valid: accurate, balanced, fast"),
+        ({**SPHERE, "preset": "no_such_preset"}, "BAD_REQUEST", f"valid: {', '.join(preset_names())}"),
         ({**SPHERE, "time_budget": float("nan")}, "BAD_REQUEST", "time_budget: nan"),
         ({**SPHERE, "num_grasps": 100_000}, "BAD_REQUEST", "num_grasps: 100000"),
         ({**SPHERE, "object_pose": Pose(position=Point(x=float("nan")))}, "BAD_REQUEST", "object_pose"),

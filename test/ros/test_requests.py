@@ -36,6 +36,18 @@ def sighting(points: np.ndarray, frame: str = "camera", stamp: Time = NOW) -> Si
     return Sighting("cloud", frame, stamp, 1000 * 10**9, lambda: PointCloud(points, np.zeros(3)))
 
 
+@pytest.mark.parametrize(("given", "told", "timeless"), [(Time(), NOW, True), (Time(sec=7), Time(sec=7), False)])
+def test_a_mesh_without_a_time_stands_where_it_does_now(tmp_path, given, told, timeless):
+    (tmp_path / "can.obj").touch()
+    settings = Settings(mesh_roots=[str(tmp_path)])
+    uri = str(tmp_path / "can.obj")
+    message = GraspRequest(source=GraspRequest.MESH, mesh_uri=uri, header=Header(stamp=given))
+    request = intake().from_message("r", settings, message)
+    assert (request.stamp, request.timeless) == (told, timeless)
+    by_path = intake().from_mesh("r", settings, uri)
+    assert (by_path.stamp, by_path.timeless) == (NOW, True)
+
+
 def refusal(**fields) -> RequestError:
     with pytest.raises(RequestError) as refused:
         check_request(GraspRequest(**fields), HAND)
@@ -52,7 +64,7 @@ def refusal(**fields) -> RequestError:
         ({"id": "x" * 10**6}, "at most 128"),
         ({"source": 4}, "source: 4; valid: CLOUD=0"),
         ({"num_grasps": MOST_GRASPS + 1}, "num_grasps: 257; valid: 1 to 256"),
-        ({"preset": "/etc/passwd.yaml"}, "preset: '/etc/passwd.yaml'; valid: accurate, balanced, fast"),
+        ({"preset": "/etc/passwd.yaml"}, f"preset: '/etc/passwd.yaml'; valid: {', '.join(preset_names())}"),
         ({"seed": -2}, "seed: -2"),
         ({"time_budget": -1.0}, "time_budget: -1.0"),
         ({"time_budget": math.inf}, "time_budget: inf"),

@@ -7,8 +7,6 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from graspd_core.errors import SimulatorError
 from graspd_core.geometry.mesh import content_hash, mass_properties
@@ -40,27 +38,26 @@ def hand_at(height: float, finger: float) -> Posture:
     return Posture(np.array([0.0, 0.0, height]), UP, np.array([finger, finger]))
 
 
-def fall(kept: float = 1.0) -> float:
-    """Semi-implicit Euler from rest, of whose velocity a step keeps a share: 10.42 cm in the limit of small steps."""
+def fall(drag: float = 0.0) -> float:
+    """Semi-implicit Euler from rest against a drag of `drag (1 + v) v`; 10.42 cm without it, in small steps."""
     height = speed = 0.0
     for _ in range(STEPS):
-        speed = (speed + GRAVITY * STEP) * kept
+        speed += (GRAVITY - drag * (1 + speed) * speed) * STEP
         height += speed * STEP
     return height
 
 
 def test_free_fall(world, frozen):
     far = hand_at(-1.0, 0.0)
-    assert 0.5 * GRAVITY * (STEPS * STEP) ** 2 == pytest.approx(0.1042, abs=5e-5)
-    # Bullet damps by 4 % a second; float32 rounds micrometres.
-    assert displacements(world, far, SIX) == pytest.approx(np.full(6, fall(1 - 0.04 * STEP)), abs=2e-5)
+    # Bullet's damping of 0.04, linear and quadratic in the velocity; it computes in float32.
+    assert displacements(world, far, SIX) == pytest.approx(np.full(6, fall(0.04)), abs=2e-6)
     assert displacement_trial(world, far) == pytest.approx(0.1068, abs=1e-4)
     assert frozen_displacement(frozen, far) == pytest.approx(fall(), rel=1e-6)
 
 
 def test_a_frozen_grip_holds_in_every_direction(world, frozen):
-    grip = hand_at(-0.045, 0.025)
-    # Bullet's margin of 1 mm about the cube is pushed out of either finger alike.
+    # Either finger 0.2 mm deep: else nothing presses, and MuJoCo's cube slides out. Bullet has a margin of 1 mm.
+    grip = hand_at(-0.045, 0.0252)
     assert displacements(world, grip, SIX).max() < 0.0005
     assert frozen_displacement(frozen, grip) < 0.0005
 
@@ -89,8 +86,7 @@ def test_the_same_figure_whatever_ran_before_and_in_another_process(world):
     assert displacement_trial(pickle.loads(pickle.dumps(world)), grip) == first
 
 
-@settings(max_examples=5, deadline=None)
-@given(seed=st.integers(0, 2**31))
+@pytest.mark.parametrize("seed", range(3))
 def test_turning_and_moving_everything_changes_nothing(seed, world, gripper, cube):
     rotation = random_rotations(1, torch.Generator().manual_seed(seed), torch.float64)[0].numpy()
     shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 3)

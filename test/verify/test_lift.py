@@ -20,7 +20,8 @@ from graspd_core.verify.lift import LiftSettings, lift_trial, retreat_posture
 from graspd_core.verify.trial import hold_trial, judge
 from graspd_core.verify.world import PROTOCOLS, World, build_world
 
-STANDARD = PROTOCOLS["standard"]
+# On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
+STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
 # The fixtures' gripper reaches along +z; a table whose free side is −z makes that "down". The cube ends at z = 20 mm.
 TABLE = Plane(np.array([0.0, 0.0, -1.0]), -0.02)
 GOOD = (0.015, 0.025, (0.04, 0.04))

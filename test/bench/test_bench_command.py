@@ -1,0 +1,144 @@
+"""`graspd bench`: it resumes after a kill, keeps finished cells after Ctrl-C, and names what is wrong in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graspd_core.bench import workers
+from graspd_core.bench.cells.cell import Cell
+from graspd_core.bench.store import read_results
+from graspd_core.cli import main
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
+from graspd_core.config import PlanConfig
+
+GRASPD = [sys.executable, "-m", "graspd_core.cli", "bench"]
+# Two cells of a few seconds, whose method does next to nothing.
+SMALL = ["--presets", "random_closure", "--objects", "shape:sphere", "--count", "2", "--trials", "standard"]
+CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "f00", "allegro_right", "f11", 0, 4, ("standard",))
+
+BAD: list[tuple[list[str], str]] = [
+    (["--presets", "best"], "unknown preset 'best'; valid presets: accurate, "),
+    (["--objects", "shape:teapot"], "unknown shape 'teapot'; valid shapes: bottle, "),
+    (["--objects", "cup.obj"], "cup.obj: no such mesh file; shape:NAME is an authored shape: bottle, "),
+    (["--suite", "tall"], "unknown suite 'tall'; valid suites: main, ladder"),
+    (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid trials: standard, hard, "),
+    (["--hand", "claw"], "unknown hand 'claw'; known: "),
+    (["--count", "0"], "count: 0 grasps; valid: 1 to 1024"),
+    (["--seeds", "-1"], "seed: -1; valid: 0 to"),
+    (["--processes", "0"], "processes: 0; at least 1"),
+    (["--compare", "nowhere.json"], "nowhere.json: No such file"),
+    (["--frobnicate"], "unrecognized arguments: --frobnicate"),
+]
+
+
+@pytest.mark.parametrize(("options", "culprit"), BAD, ids=lambda value: str(value)[:40])
+def test_a_bad_option_is_named_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], culprit: str
+):
+    assert main(["bench", "--out", str(tmp_path / "out"), *options]) == EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert culprit in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "none").mkdir()
+    assert main(["bench", "--objects", str(tmp_path / "none")]) == EXIT_BAD_INPUT
+    assert "none: no mesh in this folder; valid endings: dae" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(["bench", *SMALL, "--out", str(tmp_path / "file" / "out")]) == EXIT_BAD_INPUT
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_cells_that_raise_are_named_at_the_end_and_the_others_kept(
+    tmp_path: Path, record, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def run(cells: list[Cell], folder: Path, code: str, processes: int, stop: Any):
+        for cell in cells:
+            error = "ValueError: odd" if cell.seed else ""
+            yield cell, record(cell.name, cell.object, seed=cell.seed, kind=cell.kind, error=error)
+
+    monkeypatch.setattr(workers, "run_cells", run)
+    assert main(["bench", *SMALL, "--seeds", "0", "1", "--out", str(tmp_path)]) == 1
+    out, err = capsys.readouterr()
+    assert "graspd: failed: raw random_closure sphere seed 1: ValueError: odd" in err
+    assert "| `random_closure` | 50% |" in out
+    assert len(read_results(tmp_path / "results.json")) == 2
+
+
+def test_a_worker_that_dies_costs_its_cell_only(tmp_path: Path):
+    # A spawned worker unpickles its cell first: one that cannot be is the end of it.
+    fatal = Cell(**{**vars(CELL), "settings": _Fatal()})
+    ((cell, record),) = workers.run_cells([fatal], tmp_path, "1+a", 1)
+    assert cell is fatal
+    assert record["error"] == "RuntimeError: its process died with exit code 7"
+    assert json.loads(next(tmp_path.iterdir()).read_text())["error"] == record["error"]
+
+
+class _Fatal(PlanConfig):
+    """Settings that kill whoever unpickles them."""
+
+    def __reduce__(self) -> Any:
+        return os._exit, (7,)
+
+
+def finished(folder: Path) -> dict[str, float]:
+    """Cells on disk and when they were written."""
+    return {path.name: path.stat().st_mtime for path in folder.glob("raw-*.json")}
+
+
+def wait_for_a_cell(process: subprocess.Popen[str], folder: Path) -> None:
+    while not finished(folder):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
+    """SIGKILL in the middle; the second run does only what is missing, the third one nothing."""
+    command = [*GRASPD, *SMALL, "--seeds", "0", "1", "2", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for_a_cell(process, tmp_path)
+    process.kill()
+    process.communicate()
+    # Its worker ends by itself, a moment later; until then it may finish a cell.
+    time.sleep(2.0)
+    before = finished(tmp_path)
+    assert 1 <= len(before) < 3
+    assert not (tmp_path / "results.json").exists()
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert done.returncode == EXIT_OK, done.stderr
+    assert f"{len(before)} of 3 cells had finished before" in done.stderr
+    assert {name: finished(tmp_path)[name] for name in before} == before
+    cells = read_results(tmp_path / "results.json")
+    assert sorted(cell["seed"] for cell in cells) == [0, 1, 2]
+    again = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert "3 of 3 cells had finished before" in again.stderr
+    assert again.stdout == done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_ctrl_c_keeps_finished_cells(tmp_path: Path):
+    command = [*GRASPD, *SMALL, "--seeds", *map(str, range(40)), "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for_a_cell(process, tmp_path)
+    os.kill(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == EXIT_INTERRUPTED, errors
+    assert "Traceback" not in errors
+    kept = len(finished(tmp_path))
+    assert f"interrupted; {kept} of 40 cells are kept" in errors
