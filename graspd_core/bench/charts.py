@@ -46,11 +46,6 @@ PANELS = (
 )
 # What a log axis shows of less than this [cm].
 _LEAST = 0.01
-# The x axes of the two charts of speed.
-_TIMES = {
-    "": ("cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),
-    "_verified": ("cpu_per_verified", "CPU seconds per verified grasp, trials included (one thread, log scale)"),
-}
 
 
 @dataclass(frozen=True)
@@ -63,16 +58,43 @@ class Point:
     y: tuple[float, float, float]
 
 
-def draw_charts(records: Sequence[Record], path: Path) -> tuple[Path | None, Path | None]:
-    """Draw what the records have: PATH.png and .svg, PATH_verified, PATH_ladder.
+def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
+    """Draw what the records have figures for: PATH.png and .svg, PATH_verified, PATH_planned, PATH_ladder.
 
-    Returns the PNG of the chart of speed and that of the ladder, None where there was nothing to draw.
+    Returns the PNGs drawn, by "speed", "verified", "planned" and "ladder".
     """
     found = rows(records)
     ladder = [row for row in found if row.name.split("=")[0] in LADDER]
     presets = by_name(row for row in found if row not in ladder)
-    drawn = [draw_speed(presets, path.with_name(path.name + end), *time) for end, time in _TIMES.items()]
-    return drawn[0], draw_ladder(ladder, path.with_name(f"{path.name}_ladder")) if ladder else None
+    drawn = {
+        "speed": draw_speed(presets, path, "cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),
+        "verified": draw_speed(
+            presets,
+            path.with_name(f"{path.name}_verified"),
+            "cpu_per_verified",
+            "CPU seconds per verified grasp, trials included (one thread, log scale)",
+        ),
+        "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned")),
+        "ladder": draw_ladder(ladder, path.with_name(f"{path.name}_ladder")) if ladder else None,
+    }
+    return {name: png for name, png in drawn.items() if png}
+
+
+def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
+    """Seconds per verified grasp against seconds to the first, both as planned. None where there is nothing to draw."""
+    panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
+    points = points_of(presets, "first_cpu", panel)
+    if not points:
+        return None
+    with figure(4.8, 4.2, squeeze=False) as (made, axes):
+        axis = axes[0][0]
+        _draw_panel(axis, points, panel)
+        axis.set_xscale("linear")
+        axis.set_xlabel("CPU seconds to the first verified grasp")
+        axis.set_xlim(left=0.0)
+        names = [p.name for p in points]
+        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [COLOURS[p.method] for p in points])
+        return save(made, path)
 
 
 def draw_speed(presets: dict[str, list[Row]], path: Path, time: str, label: str) -> Path | None:

@@ -27,6 +27,8 @@ COUNTS: Mapping[str, int] = {"closed_form": 16, "graspd2022": 8, "annealing": 8,
 VERIFIED, BATCH = 8, 32
 # Presets that people plan with.
 PLANNED = ("fast", "balanced", "accurate")
+# What `balanced` is compared with: the same effort in every round.
+STEADY = "balanced_steady"
 # The ladder's trials: its second figure shows these only.
 _LADDER_TRIALS = ("standard",)
 _LADDER_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
@@ -106,18 +108,20 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     make = _Maker(request)
     defaults = [name for name in preset_names() if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
+    planned = {name: config for name, config in presets.items() if name in PLANNED}
+    if "balanced" in planned:
+        planned[STEADY] = override(planned["balanced"], {"rounds.first_effort": 1.0, "rounds.growth": 1.0})
     objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
     cells: list[Cell] = []
     for thing in objects:
         for name, config in presets.items():
             cells += make("raw", name, config, thing, _count(request, config), request.trials or USUAL)
         # The closed form's own presets are what `plan_grasps` is used with; the others are only compared raw.
-        for name, config in presets.items():
-            if name in PLANNED:
-                cells += make("verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
+        for name, config in planned.items():
+            cells += make("verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
     if not request.objects:
         (cylinder,), (mug,) = find_objects(("shape:cylinder",)), find_objects(("shape:mug",))
-        for name in (name for name in presets if name in PLANNED):
+        for name in (name for name in PLANNED if name in presets):
             cells += make("pace", name, presets[name], cylinder, BATCH)[:1]
         if "balanced" in presets:
             cells += make("start", "balanced", presets["balanced"], mug, 1)[:1]

@@ -88,13 +88,15 @@ def pace_table(records: Sequence[Record]) -> str:
     return _table(["speed and size", ""], body) if body else ""
 
 
-def sections(records: Sequence[Record], chart: Path | None, ladder: Path | None, document: Path) -> dict[str, str]:
+def sections(records: Sequence[Record], charts: Mapping[str, Path], document: Path) -> dict[str, str]:
     """Text of every section that a document may have, by the name of its marker."""
     planned, pace = planned_table(records), pace_table(records)
     return {
-        "bench": "\n\n".join(filter(None, (_picture(chart, document), summary_table(records), about(records)))),
-        "bench-planned": "\n\n".join(filter(None, (planned, pace))),
-        "bench-ladder": _picture(ladder, document),
+        "bench": "\n\n".join(
+            filter(None, (_picture(charts, "speed", document), summary_table(records), about(records)))
+        ),
+        "bench-planned": "\n\n".join(filter(None, (_picture(charts, "planned", document), planned, pace))),
+        "bench-ladder": _picture(charts, "ladder", document),
         "bench-objects": object_tables(records),
     }
 
@@ -137,11 +139,14 @@ def fill(document: Path, texts: Mapping[str, str]) -> list[str]:
     return filled
 
 
-def _picture(chart: Path | None, document: Path) -> str:
-    if chart is None:
+_TITLES = {"speed": "Speed against accuracy", "planned": "Planned grasps", "ladder": "The ladder"}
+
+
+def _picture(charts: Mapping[str, Path], name: str, document: Path) -> str:
+    if name not in charts:
         return ""
-    link = Path(os.path.relpath(chart.with_suffix(".png").resolve(), document.resolve().parent)).as_posix()
-    return f"![{'The ladder' if 'ladder' in chart.name else 'Speed against accuracy'}]({link})"
+    link = Path(os.path.relpath(charts[name].resolve(), document.resolve().parent)).as_posix()
+    return f"![{_TITLES[name]}]({link})"
 
 
 def _known(groups: Mapping[str, Sequence[Row]], figure: str) -> bool:

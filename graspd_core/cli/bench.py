@@ -87,13 +87,13 @@ def _report(options: argparse.Namespace, records: list[dict[str, Any]], old: lis
     from graspd_core.bench import tables
     from graspd_core.bench.compare import comparison
 
-    chart = ladder = None
+    charts: dict[str, Path] = {}
     if options.chart:
         from graspd_core.bench.charts import draw_charts
 
-        chart, ladder = draw_charts(records, options.chart)
+        charts = draw_charts(records, options.chart)
     for document in options.readme:
-        tables.fill(document, tables.sections(records, chart, ladder, document))
+        tables.fill(document, tables.sections(records, charts, document))
     print(tables.summary_table(records))
     if planned := tables.planned_table(records):
         print(f"\n{planned}")

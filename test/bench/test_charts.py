@@ -12,6 +12,8 @@ import pytest
 from graspd_core.bench import charts, charts_style
 from graspd_core.bench.figures import by_name, rows
 
+ENDS = ("_verified", "_planned", "_ladder")
+
 
 @pytest.fixture
 def records(record):
@@ -31,13 +33,12 @@ def records(record):
     ]
 
 
-def test_charts_are_written_and_not_blank(tmp_path: Path, records):
+def test_charts_are_written_and_not_blank(tmp_path: Path, records, planned):
     from matplotlib.image import imread
 
-    speed, ladder = charts.draw_charts(records, tmp_path / "deep" / "chart")
-    assert speed == tmp_path / "deep" / "chart.png"
-    assert ladder == tmp_path / "deep" / "chart_ladder.png"
-    for name in ("chart", "chart_verified", "chart_ladder"):
+    drawn = charts.draw_charts([*records, planned(), planned("fast")], tmp_path / "deep" / "chart")
+    assert {png.name for png in drawn.values()} == {f"chart{end}.png" for end in ("", *ENDS)}
+    for name in ("chart", *(f"chart{end}" for end in ENDS)):
         picture = imread(tmp_path / "deep" / f"{name}.png")[..., :3]
         assert picture.shape[1] > 400
         inked = (np.abs(picture - 1.0) > 0.1).any(-1)
@@ -54,7 +55,7 @@ def test_the_same_figures_draw_the_same_chart(tmp_path: Path, records):
 
 
 def test_nothing_to_draw_is_no_chart(tmp_path: Path, record):
-    assert charts.draw_charts([record(kind="verified", grasps=[])], tmp_path / "chart") == (None, None)
+    assert charts.draw_charts([record(kind="pace")], tmp_path / "chart") == {}
     assert list(tmp_path.iterdir()) == []
 
 

@@ -90,7 +90,7 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
         "before\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
     )
     chart = tmp_path / "figures" / "bench.png"
-    assert tables.fill(document, tables.sections([record()], chart, None, document)) == ["bench"]
+    assert tables.fill(document, tables.sections([record()], {"speed": chart}, document)) == ["bench"]
     text = document.read_text()
     assert text.startswith("before\n<!-- bench:begin -->\n![Speed against accuracy](figures/bench.png)\n\n| preset |")
     assert "\n\n1 cells, 1 objects, seeds 0; hand allegro_right; 0 CPU minutes on 2 cores; code 0.1.0+abc.\n" in text
@@ -98,7 +98,7 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     assert "old" not in text
     document.write_text("no sections")
     with pytest.raises(ConfigError, match="none of the sections bench, bench-planned"):
-        tables.fill(document, tables.sections([record()], None, None, document))
+        tables.fill(document, tables.sections([record()], {}, document))
     with pytest.raises(ConfigError, match="No such file"):
         tables.fill(tmp_path / "nowhere.md", {})
 
