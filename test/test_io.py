@@ -14,6 +14,7 @@ from graspd_core.config import PlanConfig
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.geometry.load import load_scene
 from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import Mount
 from graspd_core.io import check_writable, grasps_of, load_document, result_document, save_result
 from graspd_core.types import (
     Contact,
@@ -237,3 +238,38 @@ def test_unwritable_paths_are_refused_and_writable_ones_left_alone(tmp_path: Pat
         check_writable(tmp_path / "file" / "grasps.json")
     check_writable(tmp_path / "new" / "grasps.json")
     assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_coupled_joints_are_written_with_their_own_values_and_read_back_as_they_were(result, target):
+    hand = replace(load_hand("barrett_like", candidates=8), mount=Mount("tool0", (0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)))
+    rng = np.random.default_rng(0)
+
+    def at(posture: Posture) -> Posture:
+        return replace(posture, joint_positions=rng.uniform(hand.lower, hand.upper))
+
+    grasp = result.grasps[0]
+    grasp = replace(grasp, pregrasp=at(grasp.pregrasp), grasp=at(grasp.grasp), squeeze=at(grasp.squeeze))
+    document = json.loads(json.dumps(result_document(replace(result, grasps=(grasp,)), target, hand, PlanConfig())))
+    names, values = document["hand"]["joint_names"], document["grasps"][0]["joint_positions"]
+    assert len(names) == len(values) == 8
+    value = dict(zip(names, values, strict=True))
+    for mimic in document["hand"]["mimic"]:
+        assert value[mimic["joint"]] == pytest.approx(mimic["multiplier"] * value[mimic["of"]] + mimic["offset"])
+    assert document["hand"]["mount"] == {
+        "parent": "tool0", "position": [0.0, 0.0, 0.1], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]
+    }  # fmt: skip
+    (after,) = grasps_of(document)
+    for name in ("pregrasp", "grasp", "squeeze"):
+        assert np.array_equal(getattr(after, name).joint_positions, getattr(grasp, name).joint_positions)
+
+
+def test_a_file_from_before_joints_could_be_coupled_is_read(document, result):
+    del document["hand"]["mimic"]
+    del document["hand"]["mount"]
+    assert np.array_equal(grasps_of(document)[0].grasp.joint_positions, result.grasps[0].grasp.joint_positions)
+
+
+def test_too_few_joint_values_are_refused(document):
+    document["grasps"][0]["squeeze_joint_positions"].pop()
+    with pytest.raises(FormatError, match="squeeze_joint_positions has 15 values for 16 joints"):
+        grasps_of(document)

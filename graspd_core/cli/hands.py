@@ -19,7 +19,9 @@ def add_command(commands: Any) -> None:
     inspect = actions.add_parser("inspect", help="the tree, joints, palm and postures of a hand")
     inspect.set_defaults(run=run_inspect)
     inspect.add_argument("hand", metavar="FILE|NAME", help="URDF, MJCF, hand description, or a name in the box")
-    inspect.add_argument("--picture", type=Path, metavar="out.png", help="draw it: open and closed, palm and candidates")
+    inspect.add_argument(
+        "--picture", type=Path, metavar="out.png", help="draw it: open and closed, palm and candidates"
+    )
     inspect.add_argument("--yaml", type=Path, metavar="out.yaml", help="write a hand description with what was found")
     inspect.add_argument("--candidates", type=int, default=600, help="contact candidates (default 600)")
 

@@ -158,10 +158,8 @@ def _read(path: Path):
     import trimesh
 
     try:
-        if path.suffix.lower() == ".dae":
-            mesh = read_dae(path)
-        else:
-            mesh = trimesh.load_scene(path, process=False).to_mesh()
+        collada = path.suffix.lower() == ".dae"
+        mesh = read_dae(path) if collada else trimesh.load_scene(path, process=False).to_mesh()
     except (MemoryError, KeyboardInterrupt):
         raise
     # The readers behind trimesh raise whatever their format's parser does, from KeyError to struct.error.

@@ -9,24 +9,27 @@ one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, place, placement, point_jacobian
+from graspd_core.hands.fingers import (
+    Fingers,
+    find_fingers,
+    knuckle_row,
+    palm_points,
+    placed_tips,
+    straight_joints,
+    units,
+)
+from graspd_core.hands.kinematics import forward, make_kinematics, place, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.overlap import link_overlaps
-from graspd_core.hands.sampling import surface_points
 from graspd_core.hands.surface import dense_samples
 
-# Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
-# the fourth leave a half, three around a circle or two against one leave a third or less.
-_ALIKE = 0.42
-# Directions within this cosine of each other are the same; a thumb's are not those of the fingers.
-_SAME_WAY = 0.7
 # Radii of the balls that fingertips close and open around, and the ball's distance from the palm, in finger lengths.
 _CLOSED, _OPEN, _AHEAD = 0.12, 0.55, 0.4
 _STARTS, _SPREAD, _STEPS, _RATE = 24, 0.4, 150, 0.06
@@ -37,39 +40,9 @@ _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 20.0
 _SPOT = 0.02
 
 
-@dataclass(frozen=True, eq=False)
-class _Fingers:
-    """The fingers at straight joints.
-
-    Attributes:
-        points: fingertips in the frame of their links [m].
-        links: the link of each.
-        roots: where each finger joins the palm, base frame [m].
-        tips: the fingertips in the base frame [m].
-        palm: the group of links that all fingers hang from.
-        wrist: joints that move the palm itself.
-        mates: the fingers of a human-like hand that bend the same way, without its thumb; none in a gripper.
-        bend: the unit direction in which they do, base frame; zero in a gripper.
-    """
-
-    points: Float[np.ndarray, "tips 3"]
-    links: Int[np.ndarray, "tips"]
-    roots: Float[np.ndarray, "tips 3"]
-    tips: Float[np.ndarray, "tips 3"]
-    palm: int
-    wrist: Int[np.ndarray, "wrist"]
-    mates: Bool[np.ndarray, "tips"]
-    bend: Float[np.ndarray, "3"]
-
-    @property
-    def length(self) -> float:
-        """Mean length of a finger [m]."""
-        return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
-
-
 def guess_palm(hand: HandModel) -> HandModel:
     """The hand with a palm centre, a palm normal and an approach, and a warning that they are guessed."""
-    fingers = _fingers(hand)
+    fingers = find_fingers(hand)
     normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
     return replace(
         hand,
@@ -82,7 +55,7 @@ def guess_palm(hand: HandModel) -> HandModel:
 
 def guess_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed")) -> HandModel:
     """The hand with those postures guessed that `which` names, to suit its palm, and a warning that they are."""
-    fingers = _fingers(hand)
+    fingers = find_fingers(hand)
     ahead = hand.palm_center + _AHEAD * fingers.length * hand.palm_normal
     height = float(((fingers.tips - hand.palm_center) @ hand.palm_normal).mean())
     if height > _AHEAD * fingers.length:
@@ -96,96 +69,23 @@ def guess_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"))
     return replace(hand, **guessed, warnings=(*hand.warnings, text))
 
 
-def _straight(hand: HandModel) -> Float[np.ndarray, "joints"]:
-    """Joints at zero, or as near as they come."""
-    return np.clip(0.0, hand.lower, hand.upper)
-
-
-def _fingers(hand: HandModel) -> _Fingers:
-    groups = hand.link_group
-    heads = np.unique(groups)
-    above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}
-    solid = {int(groups[p.link]) for p in hand.primitives}
-    # A leaf without solids is a frame or a sensor: what carries it is the fingertip.
-    leaves = set()
-    for group in set(above) - set(above.values()):
-        while group > 0 and group not in solid:
-            group = above[group]
-        leaves.add(group)
-    leaves = {g for g in leaves if g > 0 and not any(_is_above(g, other, above) for other in leaves - {g})}
-    chains = [_chain(leaf, above) for leaf in sorted(leaves)] or [[int(heads[-1]), 0]]
-    palm = next(g for g in chains[0][1:] if all(g in chain for chain in chains))
-    wrist = sorted({int(hand.link_joint[g]) for g in _chain(palm, above)[:-1]})
-    rotations, translations = link_poses(hand, _straight(hand))
-    rng = np.random.default_rng(0)
-    points, roots = [], []
-    for chain in chains:
-        root = translations[chain[chain.index(palm) - 1]]
-        tip = chain[0]
-        cloud = [np.zeros((0, 3))]
-        for primitive in hand.primitives:
-            if groups[primitive.link] == tip:
-                link = primitive.link
-                cloud.append(surface_points(primitive, 200, rng)[0] @ rotations[link].T + translations[link])
-        reached = np.concatenate(cloud) if len(cloud) > 1 else translations[[tip]]
-        distance = np.linalg.norm(reached - root, axis=1)
-        points.append(reached[distance >= np.quantile(distance, 0.85)].mean(0))
-        roots.append(root)
-    links, tips = np.array([chain[0] for chain in chains]), np.array(points)
-    local = np.einsum("tji,tj->ti", rotations[links], tips - translations[links])
-    mates, bend = _mates(hand, local, links, _units(tips - np.array(roots), 1e-6), wrist)
-    return _Fingers(local, links, np.array(roots), tips, palm, np.array(wrist, dtype=int), mates, bend)
-
-
-def _chain(group: int, above: dict[int, int]) -> list[int]:
-    """The group and all above it, the base's last."""
-    chain = [group]
-    while above[chain[-1]] >= 0:
-        chain.append(above[chain[-1]])
-    return chain
-
-
-def _is_above(group: int, other: int, above: dict[int, int]) -> bool:
-    return group in _chain(other, above)[1:]
-
-
-def _mates(
-    hand: HandModel,
-    points: Float[np.ndarray, "tips 3"],
-    links: Int[np.ndarray, "tips"],
-    straight: Float[np.ndarray, "tips 3"],
-    wrist: list[int],
-) -> tuple[Bool[np.ndarray, "tips"], Float[np.ndarray, "3"]]:
-    """Which fingers point and bend the same way, and which way they bend; none and zero for a gripper."""
-    q = _straight(hand)
-    travel = 0.5 * (hand.lower + hand.upper) - q
-    travel[wrist] = 0.0
-    # Half a millimetre is the noise of limits that are meant to be symmetric.
-    sweep = _units(point_jacobian(hand, q, points, links) @ travel, 5e-4)
-    alike = (sweep @ sweep.T > _SAME_WAY) & (straight @ straight.T > _SAME_WAY)
-    mates = alike[alike.sum(1).argmax()]
-    if np.linalg.norm(sweep.mean(0)) <= _ALIKE or (len(points) > 1 and mates.sum() <= max(1, len(points) / 2)):
-        return np.zeros(len(points), dtype=bool), np.zeros(3)
-    return mates, _units(sweep[mates].mean(0), 0.0)
-
-
-def _along(hand: HandModel, fingers: _Fingers) -> Float[np.ndarray, "3"]:
+def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
     """The direction in which a gripper's fingers point at mid-range, square to the line or plane that they stand on."""
     half_way = placed_tips(hand, fingers, 0.5 * (hand.lower + hand.upper)) - fingers.roots
-    along = _units(half_way.mean(0), 1e-6)
+    along = units(half_way.mean(0), 1e-6)
     if not along.any():
-        along = _units(fingers.tips.mean(0) - _palm_points(hand, fingers).mean(0), 1e-6)
+        along = units(fingers.tips.mean(0) - palm_points(hand, fingers).mean(0), 1e-6)
     _, sizes, rows = np.linalg.svd(fingers.roots - fingers.roots.mean(0))
     ground = rows[: len(sizes)][sizes > max(0.3 * sizes[0], 1e-3)]
     upright = along - ground.T @ (ground @ along)
     if np.linalg.norm(upright) > 0.5:
-        return _units(upright, 0.0)
+        return units(upright, 0.0)
     return along if along.any() else np.array([0.0, 0.0, 1.0])
 
 
-def _center(hand: HandModel, fingers: _Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def _center(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """The point of the palm's surface in front of which the fingers meet [m]."""
-    surface = _palm_points(hand, fingers)
+    surface = palm_points(hand, fingers)
     middle = 0.5 * (surface.min(0) + surface.max(0))
     roots = fingers.roots.mean(0)
     aside = 0.5 * (middle + roots) if fingers.mates.any() else roots
@@ -195,21 +95,9 @@ def _center(hand: HandModel, fingers: _Fingers, normal: Float[np.ndarray, "3"]) 
     return aside + normal * float((offset @ normal)[near].max())
 
 
-def _palm_points(hand: HandModel, fingers: _Fingers) -> Float[np.ndarray, "points 3"]:
-    """Surface points of the palm, or where the fingers join it if it has no solids, base frame [m]."""
-    rotations, translations = link_poses(hand, _straight(hand))
-    rng = np.random.default_rng(0)
-    parts = [
-        surface_points(p, 400, rng)[0] @ rotations[p.link].T + translations[p.link]
-        for p in hand.primitives
-        if hand.link_group[p.link] == fingers.palm
-    ]
-    return np.concatenate(parts) if parts else fingers.roots
-
-
 def _around_ball(
     hand: HandModel,
-    fingers: _Fingers,
+    fingers: Fingers,
     ball: Float[np.ndarray, "3"],
     radius: float,
     rest: Float[np.ndarray, "joints"],
@@ -229,7 +117,7 @@ def _around_ball(
     home = torch.as_tensor(rest - hand.lower) / half - 1.0
     still = torch.zeros(hand.num_joints, dtype=torch.bool)
     still[fingers.wrist] = True
-    wrist = torch.as_tensor(_straight(hand))
+    wrist = torch.as_tensor(straight_joints(hand))
     generator = torch.Generator().manual_seed(0)
     noise = torch.rand(_STARTS, hand.num_joints, generator=generator, dtype=torch.float64) - 0.5
     noise[0] = 0.0
@@ -264,13 +152,7 @@ def _around_ball(
         return values[best].copy(), ball + fingers.length * shift[best].numpy()
 
 
-def placed_tips(hand: HandModel, fingers: _Fingers, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "tips 3"]:
-    """Fingertips at a posture, base frame [m]."""
-    rotations, translations = link_poses(hand, q)
-    return np.einsum("tij,tj->ti", rotations[fingers.links], fingers.points) + translations[fingers.links]
-
-
-def _outward(hand: HandModel, fingers: _Fingers, away: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips 3"]:
+def _outward(hand: HandModel, fingers: Fingers, away: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips 3"]:
     """Which way each finger opens in the palm's plane, given where its tip lies from the ball.
 
     Fingers that bend together straighten together, square to the row of their knuckles, and the thumb goes the other
@@ -278,25 +160,19 @@ def _outward(hand: HandModel, fingers: _Fingers, away: Float[np.ndarray, "tips 3
     """
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     if not fingers.mates.any():
-        return _units(away @ plane, 1e-6)
+        return units(away @ plane, 1e-6)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:
-        row = _row(fingers)
+        row = knuckle_row(fingers)
         straight = straight - (straight @ row) * row
-    return np.where(fingers.mates[:, None], 1.0, -1.0) * _units(straight, 1e-6)
+    return np.where(fingers.mates[:, None], 1.0, -1.0) * units(straight, 1e-6)
 
 
-def _row(fingers: _Fingers) -> Float[np.ndarray, "3"]:
-    """The direction in which the knuckles of two mates or more lie side by side."""
-    knuckles = fingers.roots[fingers.mates]
-    return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
-
-
-def _side_by_side(fingers: _Fingers) -> Float[np.ndarray, "tips 3"]:
+def _side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
     """Where each fingertip's ball lies from the middle one [m]: fingers side by side close side by side."""
     aside = np.zeros_like(fingers.roots)
     if fingers.mates.sum() > 1:
-        knuckles, row = fingers.roots[fingers.mates], _row(fingers)
+        knuckles, row = fingers.roots[fingers.mates], knuckle_row(fingers)
         aside[fingers.mates] = np.outer((knuckles - knuckles.mean(0)) @ row, row)
     return aside
 
@@ -308,9 +184,3 @@ def _worst_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) -> 
     joined = (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
     points, links, _ = dense_samples(hand, count=600, seed=3)
     return np.where(joined, 0.0, link_overlaps(hand, q, points, links)).max(axis=(1, 2))
-
-
-def _units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
-    """Unit vectors; zero where shorter than `least`."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)

@@ -28,11 +28,11 @@ class JointReport:
 
     name: str
     kind: str
-    lower: float
-    upper: float
-    effort: float
-    open: float
-    closed: float
+    lower: float = float("nan")
+    upper: float = float("nan")
+    effort: float = float("nan")
+    open: float = float("nan")
+    closed: float = float("nan")
     coupling: str = ""
 
 
@@ -147,11 +147,12 @@ def _joints(hand: HandModel) -> tuple[JointReport, ...]:
         if name in coupled:
             mimic = coupled[name]
             text = f"= {mimic.multiplier:g} · {hand.joint_names[mimic.joint]} {mimic.offset:+g}"
-            found.append(JointReport(name, kind, *(float("nan"),) * 5, text))
+            found.append(JointReport(name, kind, coupling=text))
             continue
         i = hand.joint_names.index(name)
         columns = (hand.lower, hand.upper, hand.effort, hand.open_posture, hand.closed_posture)
-        found.append(JointReport(name, kind, *(float(column[i]) for column in columns)))
+        lower, upper, effort, opened, closed = (float(column[i]) for column in columns)
+        found.append(JointReport(name, kind, lower, upper, effort, opened, closed))
     return tuple(found)
 
 

@@ -19,7 +19,7 @@ from graspd_core.hands.surface import candidates as surface_candidates
 from graspd_core.hands.urdf import read_urdf
 from graspd_core.paths import config_dir
 
-# A joint's greatest torque [N·m], or a sliding joint's greatest force [N], where neither URDF nor description gives one.
+# A joint's greatest torque [N·m], a sliding joint's greatest force [N], where neither URDF nor description gives one.
 DEFAULT_EFFORT, DEFAULT_FORCE = 0.7, 40.0
 _CANDIDATE_SEED = 0
 

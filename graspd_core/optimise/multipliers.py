@@ -41,7 +41,7 @@ def adamax_step(
     """The state after step number `count`, from one; a negative rate climbs. `memory` keeps that share of `top`."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     top = torch.maximum(memory * state.top, gradient.abs())
-    return Adamax(state.value - rate / (1 - _BETA1**count) * mean / (top + _EPSILON), mean, top)
+    return Adamax(torch.addcdiv(state.value, mean, top + _EPSILON, value=-rate / (1 - _BETA1**count)), mean, top)
 
 
 def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:

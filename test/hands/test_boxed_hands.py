@@ -69,9 +69,8 @@ def test_no_link_is_inside_another(hand: HandModel, posture: str) -> None:
 def test_fingertips_close_in_front_of_the_palm(hand: HandModel) -> None:
     assert np.linalg.norm(hand.palm_normal) == pytest.approx(1.0)
     opened, closed = tips(hand, hand.open_posture), tips(hand, hand.closed_posture)
-    assert (
-        np.linalg.norm(closed - closed.mean(0), axis=1).mean() < np.linalg.norm(opened - opened.mean(0), axis=1).mean()
-    )
+    spread_open, spread_closed = (np.linalg.norm(ends - ends.mean(0), axis=1).mean() for ends in (opened, closed))
+    assert spread_closed < spread_open
     for ends in (opened, closed):
         assert ((ends.mean(0) - hand.palm_center) @ hand.palm_normal) > -0.01
 

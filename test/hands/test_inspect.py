@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from graspd_core.cli import main
+from graspd_core.cli import build_parser, main
 from graspd_core.hands.inspect import as_text, as_yaml, report
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
@@ -107,3 +108,11 @@ def test_the_command_refuses_in_one_line(
     printed = capsys.readouterr().err
     assert message in printed
     assert printed.count("\n") == 1
+
+
+def test_the_commands_of_the_page_parse() -> None:
+    page = Path(__file__).parents[2] / "docs" / "hands.md"
+    lines = [line.strip() for line in page.read_text().splitlines() if line.startswith("    graspd ")]
+    assert len(lines) >= 2
+    for line in lines:
+        build_parser().parse_args(shlex.split(line)[1:])

@@ -61,7 +61,9 @@ def test_a_package_is_found_where_ros_says(
     workspace: Path, variable: str, folder: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = "package://far/m/wedge.obj"
-    with pytest.raises(HandError, match="link 'a': mesh 'package://far/m/wedge.obj' was not found in any package path"):
+    with pytest.raises(
+        HandError, match=r"link 'a': mesh 'package://far/m/wedge.obj' was not found in any package path"
+    ):
         _read(workspace, name)
     monkeypatch.setenv(variable, f"/nowhere:{workspace / folder}")
     assert len(_read(workspace, name).primitives) == 1

@@ -61,7 +61,8 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
         ('upper="1"', 'upper="1e9"', r"joint 'hinge' turns without end: kept to \[-0.5, "),
         (
             "</robot>",
-            '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="palm"/></joint></robot>',
+            '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="palm"/></joint>'
+            "</robot>",
             r"link 'world' and fixed joint 'w' above the base 'palm' were dropped",
         ),
         (
@@ -90,7 +91,8 @@ def test_a_welded_joint_stays_where_its_limits_put_it(tmp_path: Path) -> None:
     tail = (
         '<link name="x"/><link name="y"/><joint name="still" type="revolute"><parent link="palm"/><child link="x"/>'
         '<axis xyz="0 0 1"/><limit lower="0.3" upper="0.3"/></joint><joint name="follows" type="prismatic">'
-        '<parent link="x"/><child link="y"/><limit lower="-9" upper="9"/><mimic joint="still" multiplier="0.1"/></joint>'
+        '<parent link="x"/><child link="y"/><limit lower="-9" upper="9"/>'
+        '<mimic joint="still" multiplier="0.1"/></joint>'
     )
     hand = _read(tmp_path, HAND.replace("</robot>", f"{tail}</robot>"))
     rotations, translations = link_poses(hand, np.zeros(1))

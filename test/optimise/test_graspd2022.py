@@ -205,7 +205,7 @@ def test_the_same_seed_gives_the_same_bits_and_nothing_is_not_a_number(name, pro
 def test_it_brings_its_own_cost_down(name, problem, starts, solver_of):
     # On a fixed level set that the hands already touch.
     config = replace(
-        VARIANTS[name], steps=30, coarse_steps=0, scaling="object", stiffness=1e3, force_rate=0.05, starts="hull"
+        VARIANTS[name], steps=60, coarse_steps=0, scaling="object", stiffness=1e3, force_rate=0.05, starts="hull"
     )
     near = replace(starts, translation=0.6 * starts.translation)
     first = run(replace(config, steps=1), problem, near, solver_of)[1]

@@ -123,6 +123,15 @@ def test_the_pose_is_that_of_the_arms_last_link(moveit_msgs: ModuleType):
     np.testing.assert_allclose(matrix_of_pose(back), matrix_of_pose(message().grasp_pose), atol=1e-12)
 
 
+def test_the_pose_of_a_mounted_hand_is_that_of_the_link_that_carries_it(moveit_msgs: ModuleType):
+    ours = message()
+    ours.mount_link, ours.mount_grasp_pose = "tool0", Pose(position=Point(z=0.4))
+    assert moveit_grasp(ours, **UP, messages=moveit_msgs).grasp_pose.pose == ours.mount_grasp_pose
+    # What is said here counts for more.
+    theirs = moveit_grasp(ours, **UP, T_parent_base=np.eye(4), messages=moveit_msgs)
+    np.testing.assert_allclose(matrix_of_pose(theirs.grasp_pose.pose), matrix_of_pose(ours.grasp_pose), atol=1e-12)
+
+
 def test_a_failed_grasp_is_not_handed_on(moveit_msgs: ModuleType):
     with pytest.raises(ConfigError, match=r"mesh-1/0.*lost the object"):
         moveit_grasp(message(Verdict.FAILED), **UP, messages=moveit_msgs)

@@ -1,0 +1,151 @@
+"""The fingers of a hand: where they join the palm, where their tips are, and which of them bend the same way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.hands.kinematics import link_poses, point_jacobian
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.sampling import surface_points
+
+# Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
+# the fourth leave a half, three around a circle or two against one leave a third or less.
+_ALIKE = 0.42
+# Directions within this cosine of each other are the same; a thumb's are not those of the fingers.
+_SAME_WAY = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Fingers:
+    """The fingers at straight joints.
+
+    Attributes:
+        points: fingertips in the frame of their links [m].
+        links: the link of each.
+        roots: where each finger joins the palm, base frame [m].
+        tips: the fingertips in the base frame [m].
+        palm: the group of links that all fingers hang from.
+        wrist: joints that move the palm itself.
+        mates: the fingers of a human-like hand that bend the same way, without its thumb; none in a gripper.
+        bend: the unit direction in which they do, base frame; zero in a gripper.
+    """
+
+    points: Float[np.ndarray, "tips 3"]
+    links: Int[np.ndarray, "tips"]
+    roots: Float[np.ndarray, "tips 3"]
+    tips: Float[np.ndarray, "tips 3"]
+    palm: int
+    wrist: Int[np.ndarray, "wrist"]
+    mates: Bool[np.ndarray, "tips"]
+    bend: Float[np.ndarray, "3"]
+
+    @property
+    def length(self) -> float:
+        """Mean length of a finger [m]."""
+        return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
+
+
+def find_fingers(hand: HandModel) -> Fingers:
+    groups = hand.link_group
+    heads = np.unique(groups)
+    above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}
+    solid = {int(groups[p.link]) for p in hand.primitives}
+    # A leaf without solids is a frame or a sensor: what carries it is the fingertip.
+    leaves = set()
+    for group in set(above) - set(above.values()):
+        while group > 0 and group not in solid:
+            group = above[group]
+        leaves.add(group)
+    leaves = {g for g in leaves if g > 0 and not any(_is_above(g, other, above) for other in leaves - {g})}
+    chains = [_chain(leaf, above) for leaf in sorted(leaves)] or [[int(heads[-1]), 0]]
+    palm = next(g for g in chains[0][1:] if all(g in chain for chain in chains))
+    wrist = sorted({int(hand.link_joint[g]) for g in _chain(palm, above)[:-1]})
+    rotations, translations = link_poses(hand, straight_joints(hand))
+    rng = np.random.default_rng(0)
+    points, roots = [], []
+    for chain in chains:
+        root = translations[chain[chain.index(palm) - 1]]
+        tip = chain[0]
+        cloud = [np.zeros((0, 3))]
+        for primitive in hand.primitives:
+            if groups[primitive.link] == tip:
+                link = primitive.link
+                cloud.append(surface_points(primitive, 200, rng)[0] @ rotations[link].T + translations[link])
+        reached = np.concatenate(cloud) if len(cloud) > 1 else translations[[tip]]
+        distance = np.linalg.norm(reached - root, axis=1)
+        points.append(reached[distance >= np.quantile(distance, 0.85)].mean(0))
+        roots.append(root)
+    links, tips = np.array([chain[0] for chain in chains]), np.array(points)
+    local = np.einsum("tji,tj->ti", rotations[links], tips - translations[links])
+    mates, bend = _mates(hand, local, links, units(tips - np.array(roots), 1e-6), wrist)
+    return Fingers(local, links, np.array(roots), tips, palm, np.array(wrist, dtype=int), mates, bend)
+
+
+def _chain(group: int, above: dict[int, int]) -> list[int]:
+    """The group and all above it, the base's last."""
+    chain = [group]
+    while above[chain[-1]] >= 0:
+        chain.append(above[chain[-1]])
+    return chain
+
+
+def _is_above(group: int, other: int, above: dict[int, int]) -> bool:
+    return group in _chain(other, above)[1:]
+
+
+def _mates(
+    hand: HandModel,
+    points: Float[np.ndarray, "tips 3"],
+    links: Int[np.ndarray, "tips"],
+    straight: Float[np.ndarray, "tips 3"],
+    wrist: list[int],
+) -> tuple[Bool[np.ndarray, "tips"], Float[np.ndarray, "3"]]:
+    """Which fingers point and bend the same way, and which way they bend; none and zero for a gripper."""
+    q = straight_joints(hand)
+    travel = 0.5 * (hand.lower + hand.upper) - q
+    travel[wrist] = 0.0
+    # Half a millimetre is the noise of limits that are meant to be symmetric.
+    sweep = units(point_jacobian(hand, q, points, links) @ travel, 5e-4)
+    alike = (sweep @ sweep.T > _SAME_WAY) & (straight @ straight.T > _SAME_WAY)
+    mates = alike[alike.sum(1).argmax()]
+    if np.linalg.norm(sweep.mean(0)) <= _ALIKE or (len(points) > 1 and mates.sum() <= max(1, len(points) / 2)):
+        return np.zeros(len(points), dtype=bool), np.zeros(3)
+    return mates, units(sweep[mates].mean(0), 0.0)
+
+
+def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
+    """Surface points of the palm, or where the fingers join it if it has no solids, base frame [m]."""
+    rotations, translations = link_poses(hand, straight_joints(hand))
+    rng = np.random.default_rng(0)
+    parts = [
+        surface_points(p, 400, rng)[0] @ rotations[p.link].T + translations[p.link]
+        for p in hand.primitives
+        if hand.link_group[p.link] == fingers.palm
+    ]
+    return np.concatenate(parts) if parts else fingers.roots
+
+
+def placed_tips(hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "tips 3"]:
+    """Fingertips at a posture, base frame [m]."""
+    rotations, translations = link_poses(hand, q)
+    return np.einsum("tij,tj->ti", rotations[fingers.links], fingers.points) + translations[fingers.links]
+
+
+def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:
+    """The direction in which the knuckles of two mates or more lie side by side."""
+    knuckles = fingers.roots[fingers.mates]
+    return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
+
+
+def straight_joints(hand: HandModel) -> Float[np.ndarray, "joints"]:
+    """Joints at zero, or as near as they come."""
+    return np.clip(0.0, hand.lower, hand.upper)
+
+
+def units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
+    """Unit vectors; zero where shorter than `least`."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)

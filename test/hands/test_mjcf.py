@@ -1,0 +1,85 @@
+"""MJCF files: what is read means what MuJoCo makes of it, and what is not read is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspd_core.errors import HandError
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.library import read_hand_file
+from graspd_core.hands.model import HandModel
+
+
+def _read(folder: Path, text: str) -> HandModel:
+    path = folder / "changed.xml"
+    path.write_text(text)
+    return read_hand_file(path)
+
+
+def test_geoms_limits_and_warnings(folder: Path, mjcf: str) -> None:
+    hand = _read(folder, mjcf)
+    kinds = {hand.link_names[p.link]: p.kind for p in hand.primitives}
+    # The visual wedge on a2 does not count, because a capsule there collides.
+    assert kinds == {"palm": "box", "a": "capsule", "a2": "capsule", "tip": "hull", "b": "hull", "b2": "hull"}
+    lower, upper = np.deg2rad([-10, -5, -10]), np.deg2rad([90, 60, 90])
+    np.testing.assert_allclose(hand.lower, [*lower, 0])
+    np.testing.assert_allclose(hand.upper, [*upper, 0.05])
+    finger = hand.primitives_of[hand.link_index["a"]][0]
+    assert finger.size == pytest.approx((0.01, 0.025))
+    np.testing.assert_allclose(finger.translation, [0, 0, 0.025])
+    np.testing.assert_allclose(
+        np.ptp(hand.primitives_of[hand.link_index["tip"]][0].vertices, axis=0), [0.02, 0.04, 0.02]
+    )
+    assert hand.link_mass[hand.link_index["tip"]] == 0.01
+    assert [text.split(" was")[0].split(" were")[0] for text in hand.warnings] == [
+        "geoms of the world itself",
+        "the free joint of the base 'palm'",
+    ]
+
+
+def test_visual_geoms_stand_in_where_none_collides(folder: Path, mjcf: str) -> None:
+    hand = _read(folder, mjcf.replace('<geom pos="0 0 .02"/>', "", 1))
+    assert hand.primitives_of[hand.link_index["a2"]][0].kind == "hull"
+    assert any("visual ones are taken: a2" in text for text in hand.warnings)
+
+
+def test_a_base_that_turns_hangs_in_the_world(folder: Path, mjcf: str) -> None:
+    hand = _read(folder, mjcf.replace("<freejoint/>", '<joint name="wrist"/>'))
+    assert (hand.base_link, hand.joint_names[0]) == ("world", "wrist")
+    np.testing.assert_allclose(link_poses(hand, np.zeros(5))[1][hand.link_index["palm"]], [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<freejoint/>", '<include file="x.xml"/>', "<include> is not read"),
+        ('<body name="tip"', '<frame/><body name="tip"', "body 'a2': <frame> is not read"),
+        ("</worldbody>", '<body name="mug"/></worldbody>', "the world has 2 bodies, a hand has one: palm, mug"),
+        ('type="slide"', 'type="ball"', "joint 's1' is of type 'ball'; known: hinge, slide"),
+        ('range="0 .05"', "", "joint 's1' slides by 100 m"),
+        ('range="-5 60"', 'range="5 -60"', "joint 'j2' has lower 0.0872665 above upper -1.0472"),
+        ('axis="1 0 1"', 'axis="0 0 0"', "joint 'j2': <joint axis='0 0 0'>: has no direction"),
+        ('euler="10 -', 'quat="1 0 0 0" euler="10 -', "body 'a': <body> has several orientations: quat, euler"),
+        ('eulerseq="zyx"', 'eulerseq="zz"', "eulerseq='zz'>: expected three of x, y, z"),
+        ('childclass="f"', 'childclass="g"', "class 'g' is not defined; known: main, f, v"),
+        ('size=".01 .02 .01"', 'size=".01 -.02 .01"', "body 'tip': <geom size='.01 -.02 .01'>: expected 3 positive"),
+        ('type="ellipsoid"', 'type="hfield"', "body 'tip': <geom type='hfield'> is not read; known: box"),
+        ('mesh="w"', 'mesh="q"', "names the mesh 'q'; known: t, w"),
+        ('file="wedge.obj"', 'file="lost.obj"', "mesh 'w': mesh 'lost.obj' was not found"),
+        ('polycoef="0.1 .5 0 0 0"', 'polycoef="0.1 .5 2 0 0"', "only a straight line is read"),
+        ('joint2="j3"', 'joint2="j9"', "names the joint 'j9'; known: j1, j2, j3, s1, k"),
+        ("<equality>", '<equality><weld body1="a" body2="b"/>', "equality <weld> is not read"),
+        ('fromto="0 0 0 0 0 .05"', 'fromto="0 0 0 0 0 0"', "only a capsule or cylinder of some length"),
+        ('name="b2"', 'name="a2"', "link 'a2' is defined twice"),
+        ('mass=".01"', 'mass="-1"', "body 'tip': weighs -1 kg"),
+    ],
+)
+def test_what_is_not_read_is_named(folder: Path, mjcf: str, old: str, new: str, message: str) -> None:
+    assert old in mjcf
+    with pytest.raises(HandError, match=message) as caught:
+        _read(folder, mjcf.replace(old, new, 1))
+    assert str(caught.value).startswith(str(folder / "changed.xml"))
+    assert "\n" not in str(caught.value)
