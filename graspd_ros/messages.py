@@ -91,8 +91,7 @@ def grasp_message(
     """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN."""
     _check_finite(grasp, rank)
     joints = [
-        convert.joint_message(posture, hand, header.stamp)
-        for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze)
+        convert.joint_message(posture, hand, header.stamp) for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze)
     ]
     message = GraspMessage(
         header=header,

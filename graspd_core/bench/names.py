@@ -17,6 +17,11 @@ def parent_of(name: str) -> str | None:
     return next((parent for prefix, parent in _ABLATIONS if name.startswith(prefix)), None)
 
 
+def is_rung(name: str) -> bool:
+    """Whether a name is of a rung of a ladder, `steps=90` say, and not of a preset."""
+    return "=" in name
+
+
 def short_name(name: str) -> str:
     """A label for the chart: an ablation goes by what it lacks."""
     parent = parent_of(name)

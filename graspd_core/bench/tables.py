@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
+from graspd_core.bench.names import is_rung
 from graspd_core.bench.store import Record
 from graspd_core.errors import ConfigError
 from graspd_core.io import save_text
@@ -33,7 +34,7 @@ _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "
 
 def summary_table(records: Sequence[Record]) -> str:
     """A row a preset: means over its objects, of raw grasps."""
-    found = by_name(rows(records))
+    found = by_name(row for row in rows(records) if not is_rung(row.name))
     columns = [column for column in _COLUMNS if column[1] in _SUMMARY and _known(found, column[1])]
     body = [
         [f"`{name}`", *(_mean(group, figure, form) for _, figure, form in columns)] for name, group in found.items()
@@ -44,7 +45,7 @@ def summary_table(records: Sequence[Record]) -> str:
 def object_tables(records: Sequence[Record]) -> str:
     """A table a preset: medians over each object's grasps, and their means."""
     blocks = []
-    for name, group in by_name(rows(records)).items():
+    for name, group in by_name(row for row in rows(records) if not is_rung(row.name)).items():
         columns = [column for column in _COLUMNS if _known({name: group}, column[1])]
         body = [
             [row.object, f"{row.held}/{row.asked}", *(_form(row.values[f], form) for _, f, form in columns[1:])]

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from graspd_core.types import TriangleMesh
 
-_MOST_NODES = 20000
+_MOST_NODES = 4000
 _FACES = ("triangles", "polylist", "polygons")
 
 

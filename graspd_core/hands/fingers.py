@@ -49,6 +49,7 @@ class Fingers:
 
 
 def find_fingers(hand: HandModel) -> Fingers:
+    """The chains that end in links which move no others, each with the far end of its last solids for a tip."""
     groups = hand.link_group
     heads = np.unique(groups)
     above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}

@@ -32,7 +32,7 @@ from graspd_core.hands.surface import dense_samples
 
 # Radii of the balls that fingertips close and open around, and the ball's distance from the palm, in finger lengths.
 _CLOSED, _OPEN, _AHEAD = 0.12, 0.55, 0.4
-_STARTS, _SPREAD, _STEPS, _RATE = 24, 0.4, 150, 0.06
+_STARTS, _SPREAD, _STEPS, _RATE = 16, 0.4, 90, 0.08
 # How much the search minds one-sided fingertips, joints away from where they rest, a ball away from its place,
 # overlap [1/m].
 _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 20.0
@@ -44,12 +44,16 @@ def guess_palm(hand: HandModel) -> HandModel:
     """The hand with a palm centre, a palm normal and an approach, and a warning that they are guessed."""
     fingers = find_fingers(hand)
     normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
+    warnings = [*hand.warnings, "palm guessed; name it in a hand description if it is wrong"]
+    if len(fingers.wrist):
+        names = ", ".join(hand.joint_names[joint] for joint in fingers.wrist)
+        warnings.append(f"joints that carry the palm, left at zero: {names}; grasps are those of the palm there")
     return replace(
         hand,
         palm_center=_center(hand, fingers, normal),
         palm_normal=normal,
         approach=normal,
-        warnings=(*hand.warnings, "palm guessed; name it in a hand description if it is wrong"),
+        warnings=tuple(warnings),
     )
 
 

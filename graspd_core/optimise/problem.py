@@ -183,7 +183,7 @@ def build_problem(
         sphere_weight=tensor(np.triu(checked, 1) * 0.5 / (radii[:, None] + radii[None, :])),
         lower=tensor(hand.lower),
         upper=tensor(hand.upper),
-        pivot=tensor(hand.palm_center * (np.linalg.norm(hand.palm_center) > _PALM_RADIUS)),
+        pivot=tensor(_pivot(hand)),
         joint_scale=tensor(hand.joint_scale),
         directions=disturbance_directions(directions, seed).to(device=device, dtype=dtype),
         center=tensor(scene.object.center_of_mass),
@@ -192,6 +192,12 @@ def build_problem(
         obstacles=make_obstacles(scene, hand, device, dtype),
         trust=None if scene.trust is None else trust_floor + (1 - trust_floor) * scene.trust.to(device, dtype),
     )
+
+
+def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
+    """The middle of the palm, or the base frame's origin where that lies in the palm [m]."""
+    far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
+    return hand.palm_center if far else np.zeros(3)
 
 
 def fingertip_groups(hand: HandModel) -> Int[np.ndarray, "tips"]:

@@ -81,8 +81,11 @@ PROTOCOLS: dict[str, Protocol] = {
 
 
 def at_friction(protocol: Protocol, friction: float) -> Protocol:
-    """The trial of an object whose friction is known: the protocol's coefficients, which suppose 0.6, in proportion."""
-    share = friction / Protocol.friction[0]
+    """The trial of an object more slippery than the 0.6 that protocols suppose: their coefficients in proportion.
+
+    A rougher object is tried as the protocol says, so that no grasp passes by friction that nobody measured.
+    """
+    share = min(friction / Protocol.friction[0], 1.0)
     sliding, torsional, rolling = protocol.friction
     return replace(protocol, friction=(sliding * share, torsional * share, rolling * share))
 

@@ -29,7 +29,7 @@ BAD: list[tuple[list[str], str]] = [
     (["--presets", "best"], "unknown preset 'best'; valid presets: accurate, "),
     (["--objects", "shape:teapot"], "unknown shape 'teapot'; valid shapes: bottle, "),
     (["--objects", "cup.obj"], "cup.obj: no such mesh file; shape:NAME is an authored shape: bottle, "),
-    (["--suite", "tall"], "unknown suite 'tall'; valid suites: main, ladder"),
+    (["--suite", "tall"], "unknown suite 'tall'; valid suites: main, "),
     (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid trials: standard, hard, "),
     (["--hand", "claw"], "unknown hand 'claw'; known: "),
     (["--count", "0"], "count: 0 grasps; valid: 1 to 1024"),

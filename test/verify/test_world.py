@@ -14,7 +14,7 @@ import pytest
 from graspd_core.geometry.convex import convex_parts
 from graspd_core.geometry.shapes import MUG_HALF, MUG_WALL, make_shape
 from graspd_core.verify.trial import DIRECTIONS, start_penetration
-from graspd_core.verify.world import PROTOCOLS, World, build_world
+from graspd_core.verify.world import PROTOCOLS, World, at_friction, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
@@ -110,3 +110,11 @@ def test_a_finger_fits_into_the_hollow_of_a_mug(gripper, cube):
     data.mocap_pos[0] = [0, 0, bottom - 0.005 + 0.07]
     mujoco.mj_forward(world.model, data)
     assert start_penetration(world, data) > 0.003
+
+
+@pytest.mark.parametrize(
+    ("given", "standard", "hard"), [(0.15, (0.15, 0.005), (0.075, 0.0005)), (1.5, (0.6, 0.02), (0.3, 0.002))]
+)
+def test_a_slippery_object_is_tried_as_slippery_as_it_is(given, standard, hard):
+    found = [at_friction(PROTOCOLS[name], given).friction[:2] for name in ("standard", "hard")]
+    np.testing.assert_allclose(found, [standard, hard])
