@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     done = read_cells(options.out, cells, None if options.any_code or options.no_run else code)
     todo = [] if options.no_run else [cell for cell in cells if cell not in done]
     errors = []
-    with Interrupt() as interrupt, Lines(len(cells), len(cells) - len(todo)) as lines:
+    with Interrupt() as interrupt, Lines(len(cells), len(done)) as lines:
         for cell, record in run_cells(todo, options.out, code, options.processes, interrupt.came):
             done[cell] = record
             lines(record)

@@ -31,11 +31,11 @@ from graspd_core.hands.overlap import link_overlaps
 from graspd_core.hands.surface import dense_samples
 
 # Radii of the balls that fingertips close and open around, and the ball's distance from the palm, in finger lengths.
-_CLOSED, _OPEN, _AHEAD = 0.12, 0.55, 0.4
-_STARTS, _SPREAD, _STEPS, _RATE = 16, 0.4, 90, 0.08
+_CLOSED, _OPEN, _AHEAD = 0.16, 0.55, 0.4
+_STARTS, _SPREAD, _STEPS, _RATE = 24, 0.4, 100, 0.08
 # How much the search minds one-sided fingertips, joints away from where they rest, a ball away from its place,
 # overlap [1/m].
-_BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 20.0
+_BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 60.0
 # Breadth of the palm's surface that its middle is found on [m].
 _SPOT = 0.02
 

@@ -250,6 +250,10 @@ def test_hulls_hold_the_skin_at_rest(mano: ManoHand) -> None:
 def test_the_hand_is_anatomical(mano: ManoHand) -> None:
     hand = mano.model
     assert hand.num_joints == 45
+    # Bodies are neighbours of the bodies that they hang from, whatever massless links lie between.
+    for body in range(1, 16):
+        assert hand.adjacent[hand.link_index[BODIES[body]], hand.link_index[BODIES[PARENTS[body]]]]
+    assert not hand.adjacent[hand.link_index["index3"], hand.link_index["thumb3"]]
     assert (hand.lower < hand.upper).all()
     tips = [hand.link_index[f"{finger}3"] for finger in ("index", "middle", "pinky", "ring")]
     base = link_poses(hand, np.zeros(45))[1]

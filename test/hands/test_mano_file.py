@@ -15,7 +15,8 @@ from scipy.sparse import csr_matrix
 from graspd_core.errors import HandError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.mano_file import read_mano
-from graspd_core.hands.mano_pickle import ADMITTED, numbers, read_pickle
+from graspd_core.hands.mano_numbers import numbers
+from graspd_core.hands.mano_pickle import ADMITTED, read_pickle
 
 SYNTHETIC = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "mano_synthetic.py"))
 

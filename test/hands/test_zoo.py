@@ -120,7 +120,7 @@ def test_a_broken_file_raises_a_hand_error_or_loads(
 
 
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None, **DRAWS)
+@settings(max_examples=6, deadline=None, **DRAWS)
 @given(data=st.data())
 def test_any_tree_is_given_a_palm_postures_and_candidates(
     folder: Path, trees: st.SearchStrategy, data: st.DataObject
