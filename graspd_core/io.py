@@ -149,7 +149,7 @@ def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
         return tuple(_grasp_of(values, actuated) for values in document["grasps"])
     except KeyError as error:
         raise FormatError(f"grasps: a grasp lacks the key {error}") from None
-    except (TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise FormatError(f"grasps: {error}") from None
 
 

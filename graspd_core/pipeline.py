@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -18,7 +19,7 @@ from graspd_core.geometry.choice import Target
 from graspd_core.geometry.cloud import PointCloud, transform_cloud
 from graspd_core.geometry.depth import cloud_from_depth
 from graspd_core.geometry.load import load_scene
-from graspd_core.geometry.memory import give_memory_back
+from graspd_core.geometry.memory import give_memory_back, share_arenas
 from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.own_process import elsewhere, work_elsewhere
 from graspd_core.geometry.perceive import scene_from_views
@@ -68,17 +69,21 @@ __all__ = [
     "plan_grasps",
     "retreat_posture",
     "scene_from_views",
+    "share_arenas",
     "transform_cloud",
     "warm_up",
 ]
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
 
 # How far apart the seeds of two rounds are.
 _SEED_STEP = 1_000_003
+
+# Objects are cut into convex parts one at a time.
+_CUTTING = threading.Lock()
 
 
 def plan_grasps(
@@ -118,17 +123,19 @@ def plan_grasps(
     config = load_preset(preset) if isinstance(preset, str) else preset
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = _Run(scene, time.perf_counter(), deadline, progress or (lambda _: None), stop or (lambda: False))
+    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing.
+    rounds = [] if run.over() else _rounds(scene, config, verify)
     # The collision parts take about as long as the optimiser: build them beside it.
-    parts = _in_background(object_parts, scene.object) if verify != "none" else None
+    parts = _in_background(lambda: _cut(run)) if rounds and verify != "none" else None
     hooks = Hooks(
-        report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, 0),
+        report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
         # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its postures.
         stop=run.over,
     )
     grasps: tuple[Grasp, ...] = ()
     first, good, optimising = None, 0, 0.0
     # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
-    for attempt, settings in enumerate(_rounds(scene, config, verify)):
+    for attempt, settings in enumerate(rounds):
         began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
         found = synthesise(scene, hand, count=count - good, seed=seeded, config=settings, hooks=hooks, device=device)
         optimising += time.perf_counter() - began
@@ -200,12 +207,21 @@ def _rounds(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
     return [at_effort(config, effort) for effort in efforts]
 
 
-def _in_background(work: Callable[[T], R], argument: T) -> Future[R]:
-    """Start work in a thread of its own; nobody waits for it but who asks for its result."""
+def _in_background(work: Callable[[], T]) -> Future[T]:
+    """Start work in a thread of its own; nobody waits for it but who asks for its result, and the process's end."""
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
-    future = pool.submit(work, argument)
+    future = pool.submit(work)
     pool.shutdown(wait=False)
     return future
+
+
+def _cut(run: _Run) -> tuple[TriangleMesh, ...]:
+    """The object's convex parts, one object at a time; none where the run was over before its turn came.
+
+    Runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
+    """
+    with _CUTTING:
+        return () if run.known_over() else object_parts(run.scene.object)
 
 
 class _Run:
@@ -224,7 +240,11 @@ class _Run:
         return self.cancelled
 
     def over(self) -> bool:
-        return self.stop() or time.perf_counter() >= self.end
+        return self.stop() or self.known_over()
+
+    def known_over(self) -> bool:
+        """As `over`, for other threads: the stop hook is asked by the run's own thread alone."""
+        return self.cancelled or time.perf_counter() >= self.end
 
     def report(self, stage: Stage, step: int, of: int, best: float, verified: int) -> None:
         self.progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began))

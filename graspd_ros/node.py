@@ -34,8 +34,10 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.utilities import try_shutdown
 
     from graspd_core.errors import GraspdError
+    from graspd_core.pipeline import share_arenas
     from graspd_ros.service import GraspNode
 
+    share_arenas()
     sys.setswitchinterval(SWITCH_INTERVAL)
     wake, failed = threading.Event(), threading.Event()
 

@@ -273,3 +273,10 @@ def test_too_few_joint_values_are_refused(document):
     document["grasps"][0]["squeeze_joint_positions"].pop()
     with pytest.raises(FormatError, match="squeeze_joint_positions has 15 values for 16 joints"):
         grasps_of(document)
+
+
+@pytest.mark.parametrize("wrong", [[], None, "allegro", {"joint_names": 3}, {"joint_names": [], "mimic": [7]}])
+def test_a_hand_of_the_wrong_kind_is_refused(document, wrong: object):
+    document["hand"] = wrong
+    with pytest.raises(FormatError, match="grasps: "):
+        grasps_of(document)

@@ -12,6 +12,7 @@ import pytest
 from graspd_core import pipeline
 from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
+from graspd_core.geometry import cache
 from graspd_core.pipeline import load_hand, load_scene, plan_grasps
 from graspd_core.types import Grasp, GraspResult, LiftResult, Outcome, Plane, Progress, Stage, Verdict
 
@@ -166,6 +167,39 @@ def test_a_deadline_is_kept(scene, hand, result, verify: str):
     assert time.perf_counter() - begun < 0.2 + LATE
     assert late.outcome is Outcome.DEADLINE
     assert late.grasps == ()
+
+
+def test_a_run_that_is_over_before_it_begins_begins_nothing(scene, hand):
+    told: list[Stage] = []
+    cancelled = plan_grasps(scene, hand, count=1, progress=lambda p: told.append(p.stage), stop=lambda: True)
+    late = plan_grasps(scene, hand, count=1, progress=lambda p: told.append(p.stage), deadline=1e-9)
+    assert (cancelled.outcome, late.outcome) == (Outcome.CANCELLED, Outcome.DEADLINE)
+    assert cancelled.grasps == late.grasps == ()
+    assert told == [Stage.DONE, Stage.DONE]
+
+
+def test_collision_parts_of_cancelled_runs_do_not_pile_up(scene, hand, result):
+    fresh = replace(scene, object=replace(scene.object, sha256="of nobody else"))
+    stop = threading.Event()
+    before = set(threading.enumerate())
+    with pipeline._CUTTING:
+        cancelled = plan_grasps(fresh, hand, count=1, progress=lambda _: stop.set(), stop=stop.is_set)
+    assert cancelled.outcome is Outcome.CANCELLED
+    # The thread that waited for its turn ends at once, and nothing was cut.
+    for thread in set(threading.enumerate()) - before:
+        thread.join(5)
+        assert not thread.is_alive()
+    assert "parts-of nobody else" not in cache._memory
+
+
+def test_what_held_in_an_earlier_round_stays_told(scene, hand):
+    config = load_preset("fast")
+    # The least that a round keeps is eight, so that nine take two.
+    short = replace(config.closed_form, explore_steps=3, refine_steps=3, polish_steps=3, keep_per_grasp=0.5)
+    told: list[Progress] = []
+    plan_grasps(scene, hand, count=9, preset=replace(config, closed_form=short), verify="none", progress=told.append)
+    assert [p.verified for p in told] == sorted(p.verified for p in told)
+    assert 0 < told[-2].verified <= told[-1].verified
 
 
 def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, result, monkeypatch: pytest.MonkeyPatch):

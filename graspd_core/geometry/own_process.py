@@ -16,7 +16,7 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from graspd_core.geometry.memory import give_memory_back
+from graspd_core.geometry.memory import give_memory_back, share_arenas
 
 T = TypeVar("T")
 
@@ -98,6 +98,7 @@ def elsewhere(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
 def _serve(pipe: Connection) -> None:
     # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    share_arenas()
     while True:
         try:
             call = pipe.recv_bytes()

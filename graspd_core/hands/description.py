@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -65,16 +66,18 @@ def read_description(path: Path) -> HandDescription:
         HandError: not YAML, an unknown or missing key, or a value of the wrong type; names file, line and key.
     """
     try:
-        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        text = path.read_text(encoding="utf-8")
+        node, data = yaml.compose(text, Loader=yaml.SafeLoader), yaml.safe_load(text)
     except OSError as error:
         raise HandError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    # A value error is one of text that is not UTF-8, or of a value that only looks like a date.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = mark.line + 1 if mark else 1
         problem = getattr(error, "problem", None) or type(error).__name__
         raise HandError(f"{path}:{line}: not well-formed YAML: {problem}") from error
-    lines = _key_lines(node)
-    data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    # Keys that YAML reads as something else than what is written, or that it merges, are looked for in vain.
+    lines: dict[str, int] = defaultdict(lambda: 1, _key_lines(node))
     root = _mapping(path, 1, "the file", data)
     _check_keys(path, lines, root, "", _KEYS, _REQUIRED)
     palm = _mapping(path, lines["palm"], "palm", root["palm"]) if "palm" in root else {}
@@ -94,7 +97,7 @@ def read_description(path: Path) -> HandDescription:
         for joint, value in values.items():
             if not _is_number(value):
                 raise HandError(f"{path}:{lines[f'{key}.{joint}']}: {key}.{joint}: expected a number, got {value!r}")
-        return {str(joint): float(value) for joint, value in values.items()}
+        return {joint: float(value) for joint, value in values.items()}
 
     for key, value in (("name", root.get("name", "")), ("urdf", root["urdf"]), ("palm.link", palm.get("link", ""))):
         if not isinstance(value, str):
@@ -186,20 +189,22 @@ def _check_joints(hand: HandModel, description: HandDescription, key: str, value
 
 
 def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
-    """Line number of every key of nested mappings, keys joined by dots."""
+    """Line number of every key of the file and of the mappings in it, the two joined by a dot."""
     lines: dict[str, int] = {}
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             name = f"{prefix}{key.value}"
             lines[name] = key.start_mark.line + 1
-            lines |= _key_lines(value, f"{name}.")
+            # No deeper: by its aliases a mapping may hold itself.
+            lines |= {} if prefix else _key_lines(value, f"{name}.")
     return lines
 
 
 def _mapping(path: Path, line: int, what: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise HandError(f"{path}:{line}: {what}: expected a mapping of keys to values, got {value!r}")
-    return value
+    # Some hands' joints have bare numbers for names.
+    return {str(key): entry for key, entry in value.items()}
 
 
 def _check_keys(

@@ -117,7 +117,7 @@ def as_text(found: HandReport) -> str:
 
 def as_yaml(found: HandReport, urdf: str) -> str:
     """A hand description that says what the report says, to be edited; `urdf` is the path to write into it."""
-    lines = [f"urdf: {urdf}", "", "palm:", f"  link: {found.links[0].name}"]
+    lines = [f"urdf: {_quoted(urdf)}", "", "palm:", f"  link: {_quoted(found.links[0].name)}"]
     lines += [f"  center: {_list(found.palm_center)}", f"  normal: {_list(found.palm_normal)}"]
     lines += ["", f"approach: {_list(found.approach)}"]
     for key in ("open", "closed"):
@@ -126,7 +126,8 @@ def as_yaml(found: HandReport, urdf: str) -> str:
             if not joint.coupling:
                 # Rounded towards the inside, or a posture at a limit would be beyond it.
                 value = float(np.clip(round(getattr(joint, key), 3), joint.lower, joint.upper))
-                lines.append(f"  {_quoted(joint.name)}: {value}")
+                # Written out: YAML reads 1e-05 as text.
+                lines.append(f"  {_quoted(joint.name)}: {np.format_float_positional(value, trim='0')}")
     return "\n".join(lines) + "\n"
 
 
@@ -173,5 +174,5 @@ def _list(values: Float[np.ndarray, "3"]) -> str:
 
 
 def _quoted(name: str) -> str:
-    """A joint's name as a YAML key: a bare number would be read as one."""
+    """A name as YAML: a bare number would be read as one, and a colon or a hash as something else."""
     return '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -99,10 +99,10 @@ def narrowed(
             continue
         ends = sorted(((low - mimic.offset) / mimic.multiplier, (high - mimic.offset) / mimic.multiplier))
         joint = mimic.joint
+        velocity[joint] = min(velocity[joint], speed / abs(mimic.multiplier))
         narrow = max(lower[joint], ends[0]), min(upper[joint], ends[1])
         if narrow[0] >= narrow[1]:
             warnings.append(f"coupled joint {mimic.name!r}: its limits leave no room to move, and were not kept")
             continue
         lower[joint], upper[joint] = narrow
-        velocity[joint] = min(velocity[joint], speed / abs(mimic.multiplier))
     return lower, upper, velocity, tuple(warnings)

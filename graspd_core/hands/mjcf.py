@@ -20,7 +20,7 @@ from graspd_core.hands.mimic import Coupling, resolved_couplings
 from graspd_core.hands.mjcf_geoms import read_geom
 from graspd_core.hands.mjcf_values import Settings, read_axis, read_pose, read_settings, with_defaults
 from graspd_core.hands.model import HandModel, JointKind, Primitive
-from graspd_core.hands.tree import JointSpec, LinkSpec, assemble, axis_rotation
+from graspd_core.hands.tree import JointSpec, LinkSpec, assemble, axis_rotation, refuse_crowds
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}
 _REFUSED = ("include", "frame", "replicate", "attach", "composite", "flexcomp", "plugin")
@@ -48,6 +48,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     for element in root.iter():
         if element.tag in _REFUSED:
             raise wrong(path, element, f"<{element.tag}> is not read; save the compiled model as one plain MJCF file")
+    refuse_crowds(path, *(len(root.findall(f"worldbody//{tag}")) for tag in ("body", "joint", "geom")))
     settings = read_settings(path, root)
     parts = _Parts(settings, _mesh_assets(settings, root))
     bodies = root.findall("worldbody/body")
@@ -211,7 +212,8 @@ def _efforts(settings: Settings, root: ET.Element) -> dict[str, float]:
             element = with_defaults(settings, given, "main")
             key = "forcerange" if "forcerange" in element.attrib or element.tag != "motor" else "ctrlrange"
             force = np.abs(read_numbers(settings.path, element, key, 2, "0 0")).max()
-            gear = [float(x) for x in (element.get("gear") or "1").split()[:1] if x.strip("+-.0123456789e") == ""]
-            if "joint" in element.attrib and force > 0:
-                efforts[str(element.get("joint"))] = float(force) * abs(gear[0] if gear and gear[0] else 1.0)
+            count = len(element.get("gear", "").split()) or 1
+            gear = float(np.abs(read_numbers(settings.path, element, "gear", count, "1"))[0])
+            if "joint" in element.attrib and force > 0 and gear > 0:
+                efforts[str(element.get("joint"))] = float(force) * gear
     return efforts

@@ -17,6 +17,10 @@ from graspd_core.hands.tree import axis_rotation
 
 _Attributes = Mapping[str, Mapping[str, str]]
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+# All write to the same attributes: a class's defaults for one are those for the others.
+_ACTUATORS = (
+    "general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +83,20 @@ def _collect_classes(
     name: str,
     above: Mapping[str, Mapping[str, str]],
 ) -> None:
-    own = {tag: dict(values) for tag, values in above.items()}
+    # Only the first class can be written in several pieces.
+    own = {tag: dict(values) for tag, values in (classes.get(name) or above).items()}
     for child in element:
         if child.tag != "default":
-            own[child.tag] = {**own.get(child.tag, {}), **child.attrib}
-    classes[name] = {tag: {**classes.get(name, {}).get(tag, {}), **values} for tag, values in own.items()}
+            own[_kin(child.tag)] = {**own.get(_kin(child.tag), {}), **child.attrib}
+    classes[name] = own
     for child in element.findall("default"):
         if not child.get("class"):
             raise wrong(path, child, "a nested <default> has no class")
         _collect_classes(path, child, classes, str(child.get("class")), own)
+
+
+def _kin(tag: str) -> str:
+    return "general" if tag in _ACTUATORS else tag
 
 
 def with_defaults(settings: Settings, element: ET.Element, child_class: str) -> ET.Element:
@@ -99,7 +108,7 @@ def with_defaults(settings: Settings, element: ET.Element, child_class: str) -> 
     name = element.get("class", child_class)
     if name not in settings.classes:
         raise wrong(settings.path, element, f"class {name!r} is not defined; known: {', '.join(settings.classes)}")
-    merged = dict(settings.classes[name].get(element.tag, {}))
+    merged = dict(settings.classes[name].get(_kin(element.tag), {}))
     if any(key in element.attrib for key in _ORIENTATIONS):
         merged = {key: value for key, value in merged.items() if key not in _ORIENTATIONS}
     whole = Element(element.tag, {**merged, **element.attrib})

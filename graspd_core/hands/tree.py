@@ -5,6 +5,7 @@ The order of links and joints is pytorch-kinematics': depth-first, children in t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from graspd_core.hands.mimic import Coupling, narrowed
 from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
 
 # More than this is no hand, and would take minutes to check against itself.
-_MOST_LINKS, _LONGEST_CHAIN = 300, 100
+_MOST_LINKS, _MOST_SOLIDS, _LONGEST_CHAIN = 300, 2000, 100
 # A joint that moves less than this is welded [rad] or [m].
 _STILL = 1e-6
 # Wider limits than this say nothing [rad]; a slide that is longer is in another unit [m].
@@ -61,6 +62,17 @@ class JointSpec:
     upper: float = np.inf
     effort: float = np.inf
     velocity: float = np.inf
+
+
+def refuse_crowds(path: Path, links: int, joints: int, solids: int) -> None:
+    """Raise HandError for more links, joints or solids than a hand has, before any of them is looked at."""
+    for what, count, most in (
+        ("links", links, _MOST_LINKS),
+        ("joints", joints, _MOST_LINKS),
+        ("collision and visual shapes", solids, _MOST_SOLIDS),
+    ):
+        if count > most:
+            raise HandError(f"{path}: {count} {what}; a hand has at most {most}")
 
 
 def assemble(
@@ -194,7 +206,7 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
 
 
 def _refuse_repeated(path: Path, what: str, names: Sequence[str]) -> None:
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         raise HandError(f"{path}: {what} {repeated[0]!r} is defined twice; names are unique")
 

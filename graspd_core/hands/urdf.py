@@ -13,7 +13,7 @@ from graspd_core.hands.elements import read_numbers, read_origin
 from graspd_core.hands.markup import read_xml, wrong
 from graspd_core.hands.mimic import read_couplings
 from graspd_core.hands.model import HandModel, JointKind
-from graspd_core.hands.tree import JointSpec, LinkSpec, assemble
+from graspd_core.hands.tree import JointSpec, LinkSpec, assemble, refuse_crowds
 
 _KINDS: dict[str, JointKind] = {
     "revolute": "revolute",
@@ -46,6 +46,8 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     if root.tag != "robot":
         raise wrong(path, root, f"the root element is <{root.tag}>, a URDF has <robot>")
     links, joints = root.findall("link"), root.findall("joint")
+    shapes = sum(len(link.findall(tag)) for link in links for tag in ("collision", "visual"))
+    refuse_crowds(path, len(links), len(joints), shapes)
     for element in (*links, *joints):
         if not element.get("name"):
             raise wrong(path, element, f"a <{element.tag}> has no name")

@@ -105,9 +105,8 @@ class Annealing:
 
     def step(self, problem: Problem, state: ChainState, index: int) -> ChainState:
         temperature = cooling(index / max(self.steps, 1))
-        drawn = torch.rand(
-            len(state.x), 7 + len(self.low), generator=torch.Generator().manual_seed(self.seed * 1_000_003 + index)
-        ).to(state.x)
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + index) % 2**63)
+        drawn = torch.rand(len(state.x), 7 + len(self.low), generator=generator).to(state.x)
         tried = self.neighbour(state.x, jump(drawn[:, 1:], temperature))
         energy = self.energy(problem, tried)
         # From a start that collides every legal state is welcome.

@@ -28,8 +28,8 @@ _FINAL_RATE = 0.05
 class AdamState:
     """Iterate, moments and best iterate of every start, as rows of one matrix (translation, quaternion, joints).
 
-    The translation is that of `pivot`, the point of the hand that a step of the quaternion leaves where it is: about the
-    origin of a base frame far from the palm, a small turn would throw the fingers off the object.
+    The translation is that of `pivot`, the point of the hand that a step of the quaternion leaves where it is: about
+    the origin of a base frame far from the palm, a small turn would throw the fingers off the object.
     """
 
     pivot: Float[Tensor, "batch 3"]

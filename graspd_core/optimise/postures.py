@@ -161,7 +161,7 @@ def squeeze(
 def joint_torques(
     problem: Problem, poses: Poses, touches: Touches, forces: Float[Tensor, "batch slots 3"]
 ) -> Float[Tensor, "batch joints"]:
-    """τ = JᵀF [N·m], of sliding joints [N], as the gradient of Σ F·x(q) over the hand's material points at the contacts."""
+    """τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
     rotation = rotation_from_quaternion(poses.quaternion)
     x = (touches.position - poses.translation[:, None]) @ rotation
     joints = poses.joints.detach().requires_grad_(True)

@@ -23,7 +23,9 @@ _POOL = 4
 def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int, seed: int, standoff: float) -> Poses:
     """`count` seeded starts with the palm `standoff` [m] off the surface; those that touch only where all do."""
     generator = torch.Generator().manual_seed(seed)
-    points, normals = (torch.as_tensor(x) for x in surface_samples(scene.object.mesh, _POOL * count, seed))
+    # Samples come in the order of the mesh's faces: unshuffled, the first that are clear would all lie on one side.
+    order = torch.randperm(_POOL * count, generator=generator)
+    points, normals = (torch.as_tensor(x)[order] for x in surface_samples(scene.object.mesh, _POOL * count, seed))
     roll = math.pi * (2 * torch.rand(len(points), generator=generator, dtype=torch.float64) - 1)
     rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -normals)
     rotation = rotation_from_axis_angle(normals, roll) @ rotation

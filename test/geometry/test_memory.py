@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -32,3 +34,24 @@ def test_where_the_c_library_has_no_such_thing_nothing_happens(monkeypatch: pyte
     before = resident()
     give_memory_back()
     assert abs(resident() - before) < 50
+
+
+def test_threads_share_two_arenas_once_they_are_told_to():
+    code = (
+        "import threading, ctypes, sys\n"
+        "from graspd_core.geometry.memory import share_arenas\n"
+        "if sys.argv[1] == 'shared': share_arenas()\n"
+        "wait = threading.Barrier(9)\n"
+        "def work():\n"
+        "    kept = ctypes.create_string_buffer(50_000)\n"
+        "    wait.wait(); wait.wait()\n"
+        "threads = [threading.Thread(target=work) for _ in range(8)]\n"
+        "[t.start() for t in threads]; wait.wait()\n"
+        "ctypes.CDLL(None).malloc_stats(); wait.wait()\n"
+    )
+
+    def arenas(kind: str) -> int:
+        done = subprocess.run([sys.executable, "-c", code, kind], capture_output=True, text=True, check=True)
+        return done.stderr.count("Arena ")
+
+    assert arenas("shared") <= 2 < arenas("each its own")

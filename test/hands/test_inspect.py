@@ -53,6 +53,20 @@ def test_the_written_description_loads_as_the_same_hand(name: str, tmp_path: Pat
     assert again.warnings == ()
 
 
+def test_awkward_names_and_tiny_limits_are_written_so_that_they_are_read(tmp_path: Path) -> None:
+    text = (config_dir() / "hands" / "parallel_gripper.urdf").read_text()
+    base = load_hand("parallel_gripper", candidates=10)
+    (tmp_path / "a #1.urdf").write_text(text.replace(f'"{base.base_link}"', '"7: up"'))
+    hand = load_hand(tmp_path / "a #1.urdf", candidates=10)
+    lower = hand.lower + 1e-5
+    hand = dataclasses.replace(hand, lower=lower, open_posture=lower, closed_posture=lower)
+    path = tmp_path / "again.yaml"
+    path.write_text(as_yaml(report(hand), "a #1.urdf"))
+    again = load_hand(path, candidates=10)
+    assert again.base_link == "7: up"
+    assert again.open_posture.tolist() == hand.lower.tolist()
+
+
 def test_the_picture_shows_hand_candidates_and_palm(hand: HandModel) -> None:
     image = hand_picture(hand).astype(int)
     height, width, _ = image.shape

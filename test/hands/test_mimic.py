@@ -95,6 +95,16 @@ def test_limits_of_the_wrong_sign_are_given_up_with_a_warning(tmp_path: Path) ->
     assert "'second'" in hand.warnings[0]
 
 
+def test_a_follower_whose_limits_are_given_up_is_driven_no_faster(tmp_path: Path) -> None:
+    wrong = robot(
+        joint("first", "base", "a", limit=LIMIT.format(0, 0.8, 1, 1)),
+        joint("second", "a", "b", mimic=follows("first", multiplier=-1), limit=LIMIT.format(0, 0.8, 1, 0.25)),
+        joint("third", "a", "c", kind="fixed"),
+        joint("still", "base", "d", kind="fixed"),
+    )
+    assert read_urdf(write(tmp_path, wrong)).velocity.tolist() == [0.25]
+
+
 @pytest.mark.parametrize(
     ("mimic", "message"),
     [

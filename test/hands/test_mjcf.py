@@ -52,6 +52,16 @@ def test_a_base_that_turns_hangs_in_the_world(folder: Path, mjcf: str) -> None:
     np.testing.assert_allclose(link_poses(hand, np.zeros(5))[1][hand.link_index["palm"]], [1, 2, 3])
 
 
+def test_defaults_in_several_sections_and_for_other_actuators_hold(folder: Path, mjcf: str) -> None:
+    apart = mjcf.replace('<geom type="capsule"/>', '<geom type="capsule"/></default><default>', 1)
+    apart = apart.replace("</default>\n<asset>", '<general forcerange="-2 2"/></default>\n<asset>', 1)
+    apart = apart.replace(' forcerange="-2 2" kp', " kp", 1)
+    whole, hand = _read(folder, mjcf), _read(folder, apart)
+    assert [p.kind for p in hand.primitives] == [p.kind for p in whole.primitives]
+    assert hand.effort.tolist() == [2.0, np.inf, np.inf, 6.0]
+    assert whole.effort.tolist() == [2.0, np.inf, np.inf, 15.0]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -75,6 +85,8 @@ def test_a_base_that_turns_hangs_in_the_world(folder: Path, mjcf: str) -> None:
         ('fromto="0 0 0 0 0 .05"', 'fromto="0 0 0 0 0 0"', "only a capsule or cylinder of some length"),
         ('name="b2"', 'name="a2"', "link 'a2' is defined twice"),
         ('mass=".01"', 'mass="-1"', "body 'tip': weighs -1 kg"),
+        ('gear="3"', 'gear="3 e"', "<motor gear='3 e'>: expected 2 finite number"),
+        ("</worldbody>", "<site><body/></site>" * 301 + "</worldbody>", "307 links; a hand has at most 300"),
     ],
 )
 def test_what_is_not_read_is_named(folder: Path, mjcf: str, old: str, new: str, message: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,44 @@ def test_what_cannot_be_used_is_named(tmp_path: Path, old: str, new: str, messag
         _read(tmp_path, text)
     assert str(caught.value).startswith(str(tmp_path / "tiny.urdf"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("before", ["", "<?xml version='1.0'?>\n", "<!-- a\nb --><?xml version='1.0'?>\n\n", "\n \n"])
+def test_errors_name_the_line_of_the_file(tmp_path: Path, before: str) -> None:
+    line = before.count("\n") + 2
+    with pytest.raises(HandError, match=rf"tiny.urdf:{line}: joint 'hinge' has a zero axis"):
+        _read(tmp_path, before + _changed(("<joint", "\n<joint"), ('"0 1 0"', '"0 0 0"')))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<!--" * 100_000,
+        "<?xml " * 100_000,
+        "<?xml encoding='punycode'?>" + "a" * 100_000 + "-" + "a" * 400_000,
+    ],
+    ids=["comments", "headers", "encoding"],
+)
+def test_a_file_made_to_take_long_is_refused_soon(tmp_path: Path, text: str) -> None:
+    began = time.process_time()
+    with pytest.raises(HandError, match="not well-formed"):
+        _read(tmp_path, text)
+    assert time.process_time() - began < 5.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("<link/>" * 301, "301 links"), ("<joint/>" * 301, "301 joints"),
+     (f"<link>{'<visual/>' * 2001}</link>", "2001 collision and visual shapes")],
+)  # fmt: skip
+def test_a_crowd_is_refused_before_it_is_looked_at(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(HandError, match=f"tiny.urdf: {message}; a hand has at most"):
+        _read(tmp_path, f"<robot>{text}</robot>")
+
+
+def test_a_file_without_end_is_refused() -> None:
+    with pytest.raises(HandError, match="larger than 32 MiB"):
+        read_hand_file(Path("/dev/zero"))
 
 
 def test_other_formats_are_named(tmp_path: Path) -> None:

@@ -123,6 +123,13 @@ def test_the_energy_is_distance_and_facing_and_refuses_collisions(hand, problem_
     assert annealing.energy(problem, inside).item() == math.inf
 
 
+def test_every_valid_seed_will_do(hand, scenes, problem_of):
+    problem = problem_of("box", DOUBLE)
+    annealing = make_annealing(problem, hand, replace(SETTINGS, steps=2), 2**63 - 1)
+    state = annealing.init(problem, draw_starts(scenes["box"], hand, 2, 0, "cpu", DOUBLE))
+    assert torch.isfinite(annealing.step(problem, state, 1).x).all()
+
+
 def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, problem_of):
     problem = problem_of("box", DOUBLE)
     annealing = make_annealing(problem, hand, replace(SETTINGS, steps=120), 0)

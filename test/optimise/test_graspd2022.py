@@ -185,6 +185,13 @@ def test_published_starts_face_the_surface_from_ten_centimetres(problem, scenes,
     assert (sample_sdf(problem.sdf, placed.points)[0] > 0).all()
 
 
+def test_published_starts_come_from_all_sides(problem_of, scenes, hand):
+    starts = published_starts(problem_of("sphere", torch.float64), scenes["sphere"], hand, 64, 0, 0.3)
+    facing = rotation_from_quaternion(starts.quaternion) @ torch.as_tensor(hand.palm_normal)
+    # The mean of 64 uniform directions is about an eighth long; that of a quarter of the sphere is three quarters.
+    assert facing.mean(0).norm() < 0.35
+
+
 def run(config, problem, starts, solver_of, **hooks) -> tuple[Tensor, Tensor]:
     solution = minimise(solver_of(config), problem, starts, Hooks(**hooks))
     return pack(solution.poses), solution.loss
