@@ -38,7 +38,8 @@ demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and 
 BENCH := $(RUN)/graspd bench --processes 2
 
 bench: setup  ## all methods and presets on all shapes: README's chart and tables anew (an hour and more; resumable)
-	$(BENCH) --suite main --suite ladder --out results/bench --chart docs/figures/bench --readme README.md --readme docs/bench.md
+	$(BENCH) --suite main --suite ladder --suite hands --out results/bench --chart docs/figures/bench \
+		--readme README.md --readme docs/bench.md --readme docs/hands.md
 
 bench-quick: setup  ## a small part of it, in minutes, to results/bench-quick
 	$(BENCH) --quick --out results/bench-quick --chart results/bench-quick/chart

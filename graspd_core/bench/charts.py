@@ -12,7 +12,7 @@ import numpy as np
 from graspd_core.bench.charts_ladder import draw_ladder
 from graspd_core.bench.charts_style import COLOURS, FRONT, MARKERS, figure, place_labels, save
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import METHOD_NAMES, is_rung, parent_of, short_name
+from graspd_core.bench.names import METHOD_NAMES, is_preset, is_rung, parent_of, short_name
 from graspd_core.bench.pareto import pareto_front
 from graspd_core.bench.store import Record
 
@@ -64,7 +64,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     """
     found = rows(records)
     ladder = [row for row in found if is_rung(row.name)]
-    presets = by_name(row for row in found if not is_rung(row.name))
+    presets = by_name(row for row in found if is_preset(row.name))
     drawn = {
         "speed": draw_speed(presets, path, "cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),
         "verified": draw_speed(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -66,19 +66,22 @@ class Spread:
 def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
     """A row for every name and object, in the order of the records. Cells that raised are left out."""
     groups: dict[tuple[str, str], list[Record]] = {}
+    # Where nothing was found there is no trace of the trials: those of the other records are meant, and the first.
+    ran = {TRIAL_FIGURES[0]}
     for record in records:
         if record["kind"] == kind and not record["error"]:
             groups.setdefault((record["name"], record["object"]), []).append(record)
-    return [_row(group) for group in groups.values()]
+            ran.update(trial for grasp in record["grasps"] for trial in TRIAL_FIGURES if trial in grasp)
+    return [_row(group, ran) for group in groups.values()]
 
 
-def _row(group: Sequence[Record]) -> Row:
+def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
     asked, held = sum(r["asked"] for r in group), sum(r["held"] for r in group)
     grasps = [grasp for r in group for grasp in r["grasps"]]
     values: dict[str, float | None] = {name: _median(map(read, grasps)) for name, read in GRASP_FIGURES.items()}
     for trial in TRIAL_FIGURES:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
-        tried = not grasps or any(outcome is not None for outcome in outcomes)
+        tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
         values[trial] = sum(outcome or 0.0 for outcome in outcomes) / asked if tried else None
     # Planned runs have one total; raw ones count what a plan would have spent, the best of trials only.
     spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 # The first that fits a name tells its parent; a parent has none.
 _ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
 METHOD_NAMES = {
@@ -15,6 +17,21 @@ METHOD_NAMES = {
 def parent_of(name: str) -> str | None:
     """The preset that `name` is an ablation of; None for one of its own."""
     return next((parent for prefix, parent in _ABLATIONS if name.startswith(prefix)), None)
+
+
+def hand_row(hand: str) -> str:
+    """The name of the cells by which hands are compared."""
+    return f"hand:{Path(hand).stem}"
+
+
+def is_hand(name: str) -> bool:
+    """Whether a name is of cells by which hands are compared, `hand:leap_right` say."""
+    return name.startswith("hand:")
+
+
+def is_preset(name: str) -> bool:
+    """Whether a name is of a preset: neither a rung of a ladder nor a hand."""
+    return not is_rung(name) and not is_hand(name)
 
 
 def is_rung(name: str) -> bool:

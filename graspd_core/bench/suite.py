@@ -14,17 +14,20 @@ from typing import Any
 
 from graspd_core.bench.cells.cell import Cell, Kind
 from graspd_core.bench.cells.trials import TRIALS, USUAL
+from graspd_core.bench.names import hand_row
 from graspd_core.config import PlanConfig, load_preset, preset_names
 from graspd_core.errors import ConfigError, MeshError
 from graspd_core.geometry.mesh import MESH_ENDINGS, content_hash
 from graspd_core.geometry.shapes import SHAPES, make_shape
-from graspd_core.hands.library import load_hand
+from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.paths import config_dir
 
 # Grasps of a raw cell by method: the slow ones are asked for fewer.
 COUNTS: Mapping[str, int] = {"closed_form": 16, "graspd2022": 8, "annealing": 8, "random_closure": 16}
 # Verified grasps that a planned cell asks for, and the batch that pace is taken at.
 VERIFIED, BATCH = 8, 32
+# Grasps of a raw cell by which hands are compared.
+HAND_COUNT = 8
 # Presets that people plan with.
 PLANNED = ("fast", "balanced", "accurate")
 # What `balanced` is compared with: the same effort in every round.
@@ -143,7 +146,23 @@ def ladder_suite(request: Request) -> tuple[Cell, ...]:
     return tuple(cells)
 
 
-SUITES: dict[str, Callable[[Request], tuple[Cell, ...]]] = {"main": main_suite, "ladder": ladder_suite}
+def hands_suite(request: Request) -> tuple[Cell, ...]:
+    """Every hand in the box with one preset."""
+    objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
+    base, count = load_preset(_LADDER_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
+    makers = {name: _Maker(dataclasses.replace(request, hand=name)) for name in hand_names()}
+    cells: list[Cell] = []
+    for thing in objects:
+        for name, make in makers.items():
+            cells += make("raw", hand_row(name), base, thing, count, request.trials or _LADDER_TRIALS)
+    return tuple(cells)
+
+
+SUITES: dict[str, Callable[[Request], tuple[Cell, ...]]] = {
+    "main": main_suite,
+    "ladder": ladder_suite,
+    "hands": hands_suite,
+}
 
 
 def rung_name(ladder: str, changes: Mapping[str, int]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import is_rung
+from graspd_core.bench.names import is_hand, is_preset
 from graspd_core.bench.store import Record
 from graspd_core.errors import ConfigError
 from graspd_core.io import save_text
@@ -34,23 +34,42 @@ _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "
 
 def summary_table(records: Sequence[Record]) -> str:
     """A row a preset: means over its objects, of raw grasps."""
-    found = by_name(row for row in rows(records) if not is_rung(row.name))
+    return _summary("preset", by_name(row for row in rows(records) if is_preset(row.name)))
+
+
+def hands_table(records: Sequence[Record]) -> str:
+    """A row a hand: likewise, all with the same preset; and the object on which fewest held."""
+    found = by_name(row for row in rows(records) if is_hand(row.name))
+    worst = [min(group, key=lambda row: row.held / row.asked) for group in found.values()]
+    hands = {name.removeprefix("hand:"): group for name, group in found.items()}
+    return _summary("hand", hands, ("fewest held", [f"{row.object} {row.held}/{row.asked}" for row in worst]))
+
+
+def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, list[str]] | None = None) -> str:
+    """A row a name, with a last column if there is one to add; nothing where there are no names."""
+    if not found:
+        return ""
     columns = [column for column in _COLUMNS if column[1] in _SUMMARY and _known(found, column[1])]
     body = [
         [f"`{name}`", *(_mean(group, figure, form) for _, figure, form in columns)] for name, group in found.items()
     ]
-    return _table(["preset", *(heading for heading, _, _ in columns)], body)
+    headings = [kind, *(heading for heading, _, _ in columns)]
+    if last is not None:
+        headings.append(last[0])
+        body = [[*line, cell] for line, cell in zip(body, last[1], strict=True)]
+    return _table(headings, body)
 
 
 def object_tables(records: Sequence[Record]) -> str:
     """A table a preset: medians over each object's grasps, and their means."""
     blocks = []
-    for name, group in by_name(row for row in rows(records) if not is_rung(row.name)).items():
+    for name, group in by_name(row for row in rows(records) if is_preset(row.name)).items():
         columns = [column for column in _COLUMNS if _known({name: group}, column[1])]
         body = [
-            [row.object, f"{row.held}/{row.asked}", *(_form(row.values[f], form) for _, f, form in columns[1:])]
+            [row.object, *(_form(row.values[f], form) if f != "standard" else f"{row.held}/{row.asked}"
+                           for _, f, form in columns)]
             for row in group
-        ]
+        ]  # fmt: skip
         body.append(["**mean**", *(_mean(group, figure, form) for _, figure, form in columns)])
         blocks.append(f"`{name}`:\n\n{_table(['object', *(heading for heading, _, _ in columns)], body)}")
     return "\n\n".join(blocks)
@@ -98,6 +117,7 @@ def sections(records: Sequence[Record], charts: Mapping[str, Path], document: Pa
         ),
         "bench-planned": "\n\n".join(filter(None, (_picture(charts, "planned", document), planned, pace))),
         "bench-ladder": _picture(charts, "ladder", document),
+        "bench-hands": hands_table(records),
         "bench-objects": object_tables(records),
     }
 
@@ -111,7 +131,18 @@ def about(records: Sequence[Record]) -> str:
     return (
         f"{len(records)} cells, {len(objects)} objects, seeds {', '.join(map(str, seeds))}; hand "
         f"{', '.join(sorted({r['hand'] for r in records}))}; {seconds / 60:.0f} CPU minutes on {'; '.join(machines)}; "
-        f"code {', '.join(codes)}."
+        f"code {', '.join(codes)}.{_missing(records)}"
+    )
+
+
+def _missing(records: Sequence[Record]) -> str:
+    """What the means leave out: cells that raised, and objects that some presets have not been tried on."""
+    raised = sum(bool(r["error"]) for r in records)
+    found = by_name(row for row in rows(records) if is_preset(row.name))
+    objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
+    fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]
+    return (f" {raised} cells raised and are in no figure." if raised else "") + (
+        f" Means are over {len(objects)} objects, but {', '.join(fewer)} only." if fewer else ""
     )
 
 

@@ -17,7 +17,7 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
     parser = commands.add_parser("bench", help="measure presets and methods on objects; tables and charts")
     parser.set_defaults(run=run)
-    parser.add_argument("--suite", action="append", default=None, metavar="NAME", help="main (default), ladder")
+    parser.add_argument("--suite", action="append", default=None, metavar="NAME", help="main (default), ladder, hands")
     parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all in the box")
     parser.add_argument(
         "--objects", nargs="+", default=(), metavar="OBJECT", help="shape:NAME, meshes or folders; default: all shapes"
@@ -94,7 +94,7 @@ def _report(options: argparse.Namespace, records: list[dict[str, Any]], old: lis
         charts = draw_charts(records, options.chart)
     for document in options.readme:
         tables.fill(document, tables.sections(records, charts, document))
-    print(tables.summary_table(records))
+    print("\n\n".join(filter(None, (tables.summary_table(records), tables.hands_table(records)))))
     if planned := tables.planned_table(records):
         print(f"\n{planned}")
     if old is not None:

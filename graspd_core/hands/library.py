@@ -76,9 +76,8 @@ def _find(name_or_path: str | Path) -> Path:
             raise HandError(f"{path}: no such file")
         return path
     if text not in hand_names():
-        raise HandError(
-            f"unknown hand {text!r}; known: {', '.join(hand_names())}, or the path of a .yaml or .urdf file"
-        )
+        files = "the path of a .yaml, .urdf, .xml (URDF or MJCF) or .pkl (MANO) file"
+        raise HandError(f"unknown hand {text!r}; known: {', '.join(hand_names())}, or {files}")
     return config_dir() / "hands" / f"{text}.yaml"
 
 

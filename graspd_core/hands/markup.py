@@ -98,6 +98,8 @@ def _parsed(path: Path, text: str) -> Element:
             element.owner = f"{tag} {attributes['name']!r}"
         elif stack:
             element.owner = stack[-1].owner
+        if tag in _OWNERS and not attributes.get("name", "").isprintable():
+            raise wrong(path, element, "has a name with a line end, or another character that cannot be printed")
         if len(stack) >= _DEEPEST:
             raise wrong(path, element, f"<{tag}> is nested more than {_DEEPEST} deep")
         (stack[-1] if stack else top).append(element)

@@ -18,7 +18,7 @@ from graspd_core.hands.elements import read_numbers, read_position
 from graspd_core.hands.markup import read_xml, wrong
 from graspd_core.hands.mimic import Coupling, resolved_couplings
 from graspd_core.hands.mjcf_geoms import read_geom
-from graspd_core.hands.mjcf_values import Settings, read_axis, read_pose, read_settings, with_defaults
+from graspd_core.hands.mjcf_values import Settings, read_axis, read_pose, read_range, read_settings, with_defaults
 from graspd_core.hands.model import HandModel, JointKind, Primitive
 from graspd_core.hands.tree import JointSpec, LinkSpec, assemble, axis_rotation, refuse_crowds
 
@@ -143,13 +143,13 @@ def _joint(
     else:
         translation = translation - rotation @ axis * reference
     lower, upper = -np.inf, np.inf
-    limited = joint.get("limited", "auto")
-    if limited == "true" or (limited == "auto" and settings.limits_by_range and "range" in joint.attrib):
-        lower, upper = (read_numbers(path, joint, "range", 2, "0 0") * unit).tolist()
+    ends = read_range(settings, joint, "range", "limited")
+    if ends is not None:
+        lower, upper = (ends * unit).tolist()
         if lower > upper:
             raise wrong(path, joint, f"has lower {lower:g} above upper {upper:g}")
-    force = np.abs(read_numbers(path, joint, "actuatorfrcrange", 2, "0 0")).max()
-    effort = float(force) if force > 0 else np.inf
+    forces = read_range(settings, joint, "actuatorfrcrange", "actuatorfrclimited")
+    effort = np.inf if forces is None else float(np.abs(forces).max())
     return JointSpec(label, parent, child, kind, rotation, translation, axis, lower, upper, effort)
 
 
@@ -210,10 +210,11 @@ def _efforts(settings: Settings, root: ET.Element) -> dict[str, float]:
     for section in root.findall("actuator"):
         for given in section:
             element = with_defaults(settings, given, "main")
-            key = "forcerange" if "forcerange" in element.attrib or element.tag != "motor" else "ctrlrange"
-            force = np.abs(read_numbers(settings.path, element, key, 2, "0 0")).max()
+            what = "force" if "forcerange" in element.attrib or element.tag != "motor" else "ctrl"
+            forces = read_range(settings, element, f"{what}range", f"{what}limited")
+            force = 0.0 if forces is None else float(np.abs(forces).max())
             count = len(element.get("gear", "").split()) or 1
             gear = float(np.abs(read_numbers(settings.path, element, "gear", count, "1"))[0])
             if "joint" in element.attrib and force > 0 and gear > 0:
-                efforts[str(element.get("joint"))] = float(force) * gear
+                efforts[str(element.get("joint"))] = force * gear
     return efforts

@@ -159,6 +159,14 @@ def read_rotation(settings: Settings, element: ET.Element) -> Float[np.ndarray, 
     return turn_z_to(_direction(settings, element, "zaxis", 3))
 
 
+def read_range(settings: Settings, element: ET.Element, key: str, flag: str) -> Float[np.ndarray, "2"] | None:
+    """The two ends of a range, None where it does not hold: `flag` says so, or leaves it to the compiler's settings."""
+    ends = read_numbers(settings.path, element, key, 2, "0 0")
+    limited = element.get(flag, "auto")
+    by_itself = limited == "auto" and settings.limits_by_range and ends[0] != ends[1]
+    return ends if limited == "true" or by_itself else None
+
+
 def read_axis(settings: Settings, joint: ET.Element) -> Float[np.ndarray, "3"]:
     """A joint's unit axis in its body's frame."""
     return _direction(settings, joint, "axis", 3) if "axis" in joint.attrib else np.array([0.0, 0.0, 1.0])

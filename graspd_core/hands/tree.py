@@ -125,6 +125,10 @@ def assemble(
     coupled = {joint.name: (joint.lower, joint.upper, joint.velocity) for joint in moving if joint.name in couplings}
     lower, upper, velocity, given_up = narrowed(lower, upper, velocity, mimics, coupled)
     lower, upper, made_finite = _finite(path, actuated, lower, upper)
+    for mimic in mimics:
+        slide = abs(mimic.multiplier) * float(upper[mimic.joint] - lower[mimic.joint])
+        if kinds[mimic.link] == "prismatic" and slide > _LONGEST_SLIDE:
+            raise _too_long(path, mimic.name, slide)
     middle = 0.5 * (lower + upper)
     specs = [by_name[link] for link in order]
     hand = HandModel(
@@ -235,16 +239,19 @@ def _finite(
     lower, upper, warnings = lower.copy(), upper.copy(), []
     for i, joint in enumerate(joints):
         if joint.kind == "prismatic" and not upper[i] - lower[i] <= _LONGEST_SLIDE:
-            raise HandError(
-                f"{path}: joint {joint.name!r} slides by {upper[i] - lower[i]:g} m; a hand's slides are limited, "
-                f"to {_LONGEST_SLIDE:g} m at most"
-            )
+            raise _too_long(path, joint.name, float(upper[i] - lower[i]))
         if joint.kind == "revolute" and not upper[i] - lower[i] <= _WIDEST:
             # One turn: the one from -π to π, moved no farther than the limits ask for.
             lower[i] = min(max(-np.pi, lower[i]), upper[i] - 2 * np.pi)
             upper[i] = lower[i] + 2 * np.pi
             warnings.append(f"joint {joint.name!r} turns without end: kept to [{lower[i]:.3g}, {upper[i]:.3g}] rad")
     return lower, upper, tuple(warnings)
+
+
+def _too_long(path: Path, joint: str, slide: float) -> HandError:
+    return HandError(
+        f"{path}: joint {joint!r} slides by {slide:g} m; a hand's slides are limited, to {_LONGEST_SLIDE:g} m at most"
+    )
 
 
 def _with_still_joints_welded(hand: HandModel) -> HandModel:

@@ -46,11 +46,32 @@ def test_a_grasp_that_was_not_found_counts_as_failed(record):
     assert row.values["first_wall"] == 8.0
 
 
-def test_a_method_that_found_nothing_has_failed_every_trial(record):
+def test_a_method_that_found_nothing_has_held_nothing(record):
     (row,) = rows([record(given=0, held=0, grasps=[], first_verified=None)])
-    assert row.values["standard"] == row.values["hard"] == 0.0
+    assert row.values["standard"] == 0.0
     assert row.values["sd_cm"] is None
     assert row.values["cpu_per_verified"] is None
+
+
+def test_only_trials_that_were_run_have_been_failed(record):
+    _, row = rows([record(), record(thing="mug", given=0, held=0, grasps=[])])
+    assert row.values["standard"] == row.values["hard"] == 0.0
+    assert row.values["noisy"] is None
+
+
+def test_without_the_standard_trial_nothing_is_said_of_it(record):
+    hard = [{"hard": {"passed": True}}, {"hard": {"passed": False}}]
+    objects = tables.object_tables([record(asked=2, given=2, held=0, grasps=hard)])
+    assert "| object | held, hard | CPU s per grasp |" in objects
+    assert "| box | 50% | 1 |" in objects
+
+
+def test_what_the_means_leave_out_is_said(record):
+    full = [record(), record(thing="mug"), record("fast"), record("fast", thing="mug")]
+    assert tables.about(full).endswith("code 0.1.0+abc.")
+    assert "`fast` of 1 only" in tables.about(full[:3])
+    raised = tables.about([*full[:3], record("fast", thing="mug", error="died")])
+    assert raised.endswith("1 cells raised and are in no figure. Means are over 2 objects, but `fast` of 1 only.")
 
 
 def test_seeds_are_pooled_and_cells_that_raised_left_out(record):
@@ -82,6 +103,25 @@ def test_the_tables_are_these(record, planned):
     assert "| mug | 3/4 | 50% | 0.20 | 1.50 | 20.0 | – |" not in objects, "columns without figures are left out"
     assert "| mug | 3/4 | 50% | 0.20 | 1.50 | 20.0 | 8 | 0.5 | 1.67 |" in objects
     assert objects.count("| **mean** |") == 2
+
+
+def test_hands_have_a_table_of_their_own_and_the_worst_object_of_each(record):
+    records = [
+        record("hand:leap_right", "box"),
+        record("hand:leap_right", "mug", held=1),
+        record("hand:parallel_gripper", "box", held=4),
+        record("balanced", "box"),
+    ]
+    table = tables.hands_table(records).splitlines()
+    assert [line.split(" | ")[0] for line in table] == [
+        "| hand",
+        "|---|---|---|---|---|---|---|---|---|",
+        "| `leap_right`",
+        "| `parallel_gripper`",
+    ]
+    assert [line.split(" | ")[-1] for line in table[2:]] == ["mug 1/4 |", "box 4/4 |"]
+    assert "hand:" not in tables.summary_table(records)
+    assert tables.summary_table(records[:3]) == ""
 
 
 def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):

@@ -62,6 +62,12 @@ def test_defaults_in_several_sections_and_for_other_actuators_hold(folder: Path,
     assert whole.effort.tolist() == [2.0, np.inf, np.inf, 15.0]
 
 
+def test_ranges_that_do_not_hold_limit_nothing(folder: Path, mjcf: str) -> None:
+    hand = _read(folder, mjcf.replace("forcerange", 'forcelimited="false" forcerange').replace('"-5 60"', '"3 3"'))
+    assert hand.effort.tolist() == [np.inf, np.inf, np.inf, 15.0]
+    assert any("joint 'j2' turns without end" in text for text in hand.warnings)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -133,6 +133,7 @@ def test_axes_are_normalised_and_inertials_optional(tmp_path: Path) -> None:
         ('<child link="finger"/>', "", "joint 'hinge' has no <child link"),
         ('name="finger"', 'name="palm"', "link 'palm' is defined twice|child link 'finger', which the file does not"),
         ('name="finger"', 'name=""', "a <link> has no name"),
+        ('name="finger"', 'name="fin&#10;ger"', r"tiny.urdf:1: link 'fin\\nger' has a name with a line end"),
         ('xyz="0 0 0.03"', 'xyz="0 0 30"', r"joint 'hinge': <origin xyz='0 0 30'>: more than 10 m away"),
         ("<box", "<blob", "link 'palm': unknown collision shape <blob>; known: box, sphere, cylinder, capsule, mesh"),
         ('size="0.02 0.02 0.04"', 'size="20 20 40"', "link 'palm': <box size='20 20 40'>: larger than 2 m"),
