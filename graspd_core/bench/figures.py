@@ -18,6 +18,9 @@ GRASP_FIGURES: dict[str, Callable[[dict[str, Any]], float | None]] = {
     "penetration_mm": lambda grasp: _metric(grasp, "penetration", 1e3),
     "self_penetration_mm": lambda grasp: _metric(grasp, "self_penetration", 1e3),
     "contact_area_cm2": lambda grasp: _metric(grasp, "contact_area", 1e4),
+    "contact_area_5mm_cm2": lambda grasp: _metric(grasp, "contact_area_5mm", 1e4),
+    "contact_area_10mm_cm2": lambda grasp: _metric(grasp, "contact_area_10mm", 1e4),
+    "area_per_volume": lambda grasp: _area_per_volume(grasp),
     "intersection_cm3": lambda grasp: _metric(grasp, "intersection_volume", 1e6),
     "links": lambda grasp: _metric(grasp, "contact_links", 1.0),
     "epsilon": lambda grasp: _metric(grasp, "epsilon", 1.0),
@@ -136,3 +139,9 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 def _metric(grasp: dict[str, Any], name: str, factor: float) -> float | None:
     value = (grasp.get("metrics") or {}).get(name)
     return None if value is None else float(value) * factor
+
+
+def _area_per_volume(grasp: dict[str, Any]) -> float | None:
+    """CA/IV [cm²/cm³]; None where nothing is shared."""
+    area, shared = _metric(grasp, "contact_area", 1e4), _metric(grasp, "intersection_volume", 1e6)
+    return area / shared if area is not None and shared else None

@@ -22,9 +22,13 @@ _COLUMNS = (
     ("penetration mm", "penetration_mm", "{:.2f}"),
     ("self-penetration mm", "self_penetration_mm", "{:.2f}"),
     ("contact area cm²", "contact_area_cm2", "{:.1f}"),
+    ("at 5 mm", "contact_area_5mm_cm2", "{:.1f}"),
+    ("at 10 mm", "contact_area_10mm_cm2", "{:.1f}"),
     ("IV cm³", "intersection_cm3", "{:.2f}"),
+    ("CA/IV 1/cm", "area_per_volume", "{:.0f}"),
     ("links", "links", "{:.0f}"),
     ("ε", "epsilon", "{:.3f}"),
+    ("volume", "volume", "{:.3f}"),
     ("CPU s per grasp", "cpu_per_grasp", "{:.3g}"),
     ("CPU s per verified", "cpu_per_verified", "{:.3g}"),
 )

@@ -55,6 +55,8 @@ def run_inspect(options: argparse.Namespace) -> int:
             check_writable(path)
     if options.picture is not None and options.picture.suffix.lower() != ".png":
         raise ConfigError(f"--picture {options.picture}: a .png file is written")
+    if options.yaml is not None and Path(options.hand).suffix == ".pkl":
+        raise ConfigError(f"--yaml {options.yaml}: a description names a URDF or MJCF file, not a MANO file")
     hand = load_hand(options.hand, candidates=options.candidates)
     found = report(hand)
     print(as_text(found))

@@ -105,6 +105,16 @@ def test_the_tables_are_these(record, planned):
     assert objects.count("| **mean** |") == 2
 
 
+def test_area_over_volume_is_none_where_nothing_is_shared(record):
+    def shared(volume: float) -> list[dict]:
+        return [{"metrics": {"contact_area": 2e-3, "contact_area_5mm": 4e-3, "intersection_volume": volume}}]
+
+    some, none = rows([record(grasps=shared(4e-7)), record(thing="mug", grasps=shared(0.0))])
+    assert some.values["area_per_volume"] == pytest.approx(50.0)
+    assert some.values["contact_area_5mm_cm2"] == pytest.approx(40.0)
+    assert none.values["area_per_volume"] is None
+
+
 def test_hands_have_a_table_of_their_own_and_the_worst_object_of_each(record):
     records = [
         record("hand:leap_right", "box"),

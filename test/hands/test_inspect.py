@@ -108,6 +108,7 @@ def test_the_command_inspects_a_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     [
         (["nowhere.urdf"], "nowhere.urdf: no such file"),
         (["allegro_right", "--picture", "hand.jpg"], "hand.jpg: a .png file is written"),
+        (["MANO_RIGHT.pkl", "--yaml", "hand.yaml"], "hand.yaml: a description names a URDF or MJCF file, not a MANO"),
     ],
 )
 def test_the_command_refuses_in_one_line(

@@ -105,6 +105,15 @@ def test_a_follower_whose_limits_are_given_up_is_driven_no_faster(tmp_path: Path
     assert read_urdf(write(tmp_path, wrong)).velocity.tolist() == [0.25]
 
 
+def test_a_follower_in_another_unit_is_refused(tmp_path: Path) -> None:
+    slide = joint(
+        "rail", "base", "d", kind="prismatic", mimic=follows("first", multiplier=50), limit=LIMIT.format(-50, 50, 1, 9)
+    )
+    millimetres = robot(joint("first", "base", "a"), slide, joint("b", "a", "b"), joint("c", "a", "c"))
+    with pytest.raises(HandError, match=r"linkage.urdf: joint 'rail' slides by 100 m; .* to 2 m at most"):
+        read_urdf(write(tmp_path, millimetres))
+
+
 @pytest.mark.parametrize(
     ("mimic", "message"),
     [
