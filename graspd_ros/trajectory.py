@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_core.errors import ConfigError
-from graspd_core.pipeline import HandModel, all_joint_names, all_joint_positions
+from graspd_core.pipeline import HandModel
 from graspd_core.types import Grasp, Posture
 from graspd_ros.convert import pose_of
 
@@ -50,13 +50,14 @@ class Pace:
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
     """Pregrasp, grasp and squeeze, for a controller that starts on receipt (the stamp is zero) from any posture.
 
-    It names all movable joints, those too that follow others. Positions are within the joint limits. The last point is
-    a target that presses: joints stop short of it.
+    It names the joints that a controller drives: one that follows another has no command of its own, and controllers
+    refuse joints that they do not know. Positions are within the joint limits. The last point is a target that presses:
+    joints stop short of it.
     """
     times = stage_times(grasp, hand, pace)
     return JointTrajectory(
         header=Header(frame_id=hand.base_link),
-        joint_names=list(all_joint_names(hand)),
+        joint_names=list(hand.joint_names),
         points=[_point(posture, hand, at) for posture, at in zip(_postures(grasp), times, strict=True)],
     )
 
@@ -102,7 +103,7 @@ def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
 
 def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint:
     # Rounding may put a joint that rests on its limit a hair beyond it, which controllers refuse.
-    positions = all_joint_positions(hand, np.clip(posture.joint_positions, hand.lower, hand.upper))
+    positions = np.clip(posture.joint_positions, hand.lower, hand.upper)
     # Whole nanoseconds, rounded up: never faster than allowed.
     seconds, nanoseconds = divmod(math.ceil(at * 1e9), 1_000_000_000)
     return JointTrajectoryPoint(

@@ -93,7 +93,7 @@ def read_mano(path: Path) -> ManoData:
 def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     """An entry as float64 of a shape in which None is any positive number."""
     if key not in content:
-        known = ", ".join(sorted(str(name) for name in content)[:20])
+        known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
         raise HandError(f"{path}: {key} is missing; the file has {known}")
     try:
         array = numbers(content[key]).astype(np.float64)

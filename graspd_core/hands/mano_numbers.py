@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.hands.mano_pickle import Array, Dtype, Inert, Leaf, Select, Sparse, SparseRows
+from graspd_core.hands.mano_pickle import Array, Dtype, Encoded, Inert, Leaf, Select, Sparse, SparseRows
 
 # The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
 _MAX_DENSE, _MAX_DEPTH = 2**22, 8
-# Kinds of numbers that an array may hold: booleans, integers, floats.
-_NUMERIC = "biuf"
+# Types of numbers that an array may hold: booleans, integers, floats.
+_NUMERIC = {"b1", *(kind + size for kind in "iu" for size in "1248"), "f2", "f4", "f8"}
+# More axes than any array has.
+_MOST_AXES = 8
 
 
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
@@ -32,11 +34,25 @@ def numbers(value: Any, depth: int = 0) -> np.ndarray:
         return numbers(_entry(value, "x"), depth + 1)
     if isinstance(value, Select):
         return _selected(value, depth + 1)
-    if isinstance(value, (bool, int, float)):
-        return np.asarray(value)
-    if isinstance(value, (list, tuple)) and all(isinstance(x, (bool, int, float)) for x in value):
+    if _is_number(value) or (isinstance(value, (list, tuple)) and all(map(_is_number, value))):
         return np.asarray(value)
     raise ValueError(f"holds {type(value).__name__} where numbers are expected")
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value of Python is a number that numpy has a type for."""
+    return isinstance(value, float) or (isinstance(value, int) and -(2**63) <= value < 2**63)
+
+
+def _shown(value: object) -> str:
+    """A value for an error. What is not text is not written out: lists in lists can be endless."""
+    return repr(value[:40]) if isinstance(value, str) else f"a {type(value).__name__}"
+
+
+def _is_shape(value: object) -> bool:
+    return (
+        isinstance(value, tuple) and len(value) <= _MOST_AXES and all(type(n) is int and 0 <= n < 2**40 for n in value)
+    )
 
 
 def _array(value: Array) -> np.ndarray:
@@ -45,8 +61,10 @@ def _array(value: Array) -> np.ndarray:
         raise ValueError("holds an array without content")
     _, shape, dtype, fortran, raw = state
     kind = _dtype(dtype)
+    if isinstance(raw, Encoded) and raw.arguments[1:] in ((), ("latin1",), ("latin-1",)):
+        raw = raw.arguments[0] if raw.arguments else None
     raw = raw.encode("latin1") if isinstance(raw, str) else raw
-    if not isinstance(raw, bytes) or not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
+    if not isinstance(raw, bytes) or not _is_shape(shape):
         raise ValueError("holds an array whose content is no block of numbers")
     flat = np.frombuffer(raw, dtype=kind)
     # Checked in Python's integers, which cannot overflow.
@@ -60,20 +78,23 @@ def _array(value: Array) -> np.ndarray:
 
 def _dtype(value: Any) -> np.dtype:
     code = value.arguments[0] if isinstance(value, Dtype) and value.arguments else None
-    if not isinstance(code, str) or len(code) > 3 or code[:1] not in _NUMERIC or not code[1:].isdigit():
-        raise ValueError(f"holds an array of {code!r}, which is no type of numbers")
+    if not isinstance(code, str) or code not in _NUMERIC:
+        raise ValueError(f"holds an array of {_shown(code)}, which is no type of numbers")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
     if order not in ("<", ">", "|", "="):
-        raise ValueError(f"holds an array in byte order {order!r}")
+        raise ValueError(f"holds an array in byte order {_shown(order)}")
     return np.dtype(("<" if order in ("|", "=") else order) + code)
 
 
 def _dense(value: Sparse, depth: int) -> np.ndarray:
     data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
-    state = value.state
-    shape = state.get("_shape", state.get("shape"))
-    if not isinstance(shape, tuple) or len(shape) != 2 or not all(type(n) is int and n > 0 for n in shape):
-        raise ValueError(f"holds a sparse matrix of shape {shape!r}")
+    if indices.dtype.kind not in "iu" or starts.dtype.kind not in "iu":
+        raise ValueError("holds a sparse matrix whose indices are no integers")
+    # Signed: of unsigned ones the difference is never negative, and may be huge.
+    indices, starts = indices.astype(np.int64), starts.astype(np.int64)
+    shape = value.state.get("_shape", value.state.get("shape"))
+    if not _is_shape(shape) or len(shape) != 2 or 0 in shape:
+        raise ValueError("holds a sparse matrix of shape other than two numbers")
     if shape[0] * shape[1] > _MAX_DENSE:
         raise ValueError(f"holds a sparse matrix of shape {shape!r}, larger than any of MANO's")
     major, minor = shape if isinstance(value, SparseRows) else shape[::-1]

@@ -3,7 +3,9 @@
 A pickle is a program: it names classes and functions, and calls them. Here every name that MANO's format uses stands
 for an inert stand-in of this module, from which the numbers are read afterwards; neither numpy, scipy nor chumpy is
 called by the file, and every other name is refused. What bounds time and memory: the size of the file, a memo that is
-a dictionary (the C reader allocates as many slots as a file says), and no opcode that reserves memory beforehand.
+a dictionary (the C reader allocates as many slots as a file says), no opcode that reserves memory beforehand, few
+arguments to a call, and keys that are text or small numbers: to hash a tuple of tuples takes time without bound, or
+more stack than there is.
 
 Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
 """
@@ -20,6 +22,8 @@ from graspd_core.errors import HandError
 
 # The licensed file has 3.8 MB.
 MAX_BYTES = 64 * 2**20
+# The most arguments of any call that the format needs is four. Each call copies its arguments.
+_MOST_ARGUMENTS = 8
 # Opcodes that reach outside the file or reserve memory before they read.
 _REFUSED_OPCODES = (
     pickle.PERSID, pickle.BINPERSID, pickle.EXT1, pickle.EXT2, pickle.EXT4,
@@ -78,15 +82,12 @@ class Select(Inert):
     """`chumpy.reordering.Select`: `a` flattened, taken at `idxs`, in `preferred_shape`."""
 
 
+class Encoded(Inert):
+    """`_codecs.encode`, by which Python 3 writes bytes into old protocols: called with text and "latin1"."""
+
+
 class Ignored(Inert):
     """Something that carries no number."""
-
-
-def _latin1(text: object, encoding: object = "latin1") -> bytes:
-    """`_codecs.encode`, by which Python 3 writes bytes into old protocols."""
-    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError("an encoding other than latin1")
-    return text.encode("latin1")
 
 
 def _rebuild(made: object, *_: object) -> object:
@@ -131,16 +132,69 @@ ADMITTED: dict[tuple[str, str], Any] = {
     ("chumpy", "Ch"): Leaf,
     ("chumpy.reordering", "Select"): Select,
     **{(module, "_reconstructor"): _Function("_reconstructor", _rebuild) for module in ("copy_reg", "copyreg")},
-    ("_codecs", "encode"): _Function("encode", _latin1),
+    ("_codecs", "encode"): Encoded,
     **{(module, name): Ignored for module in ("__builtin__", "builtins") for name in ("object", "set", "frozenset")},
 }
+
+
+def _is_plain(key: object) -> bool:
+    """Whether a dictionary may have this key: hashed in a step, and no collisions by choice."""
+    return isinstance(key, (str, bytes)) or (isinstance(key, int) and 0 <= key < 2**32)
 
 
 class _Reader(pickle._Unpickler):
     """The stand-ins for what a file names; a name outside `ADMITTED` is refused."""
 
+    # What the base class has, though its stubs do not say so.
+    stack: list[Any]
+    memo: dict[int, Any]
+    readline: Any
+
+    def _call(self) -> None:
+        """REDUCE and NEWOBJ: a call, or an object of a class."""
+        arguments = self.stack.pop()
+        if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
+            raise pickle.UnpicklingError(f"a call with other than at most {_MOST_ARGUMENTS} arguments")
+        self.stack[-1] = self.stack[-1](*arguments)
+
+    def _check_key(self) -> None:
+        if not _is_plain(self.stack[-2]):
+            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
+        pickle._Unpickler.load_setitem(self)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _check_keys(self) -> None:
+        if not all(map(_is_plain, self.stack[::2])):
+            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
+
+    def _set_items(self) -> None:
+        self._check_keys()
+        pickle._Unpickler.load_setitems(self)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _dictionary(self) -> None:
+        self._check_keys()
+        pickle._Unpickler.load_dict(self)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _put(self) -> None:
+        """PUT: the one opcode that names a place in the memo by a number of any length."""
+        place = int(self.readline()[:-1])
+        if not _is_plain(place):
+            raise pickle.UnpicklingError("a place in the memo that no file needs")
+        self.memo[place] = self.stack[-1]
+
     dispatch: ClassVar[dict[int, Any]] = {
         code: act for code, act in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
+    }
+    dispatch |= {
+        pickle.REDUCE[0]: _call,
+        pickle.NEWOBJ[0]: _call,
+        pickle.SETITEM[0]: _check_key,
+        pickle.SETITEMS[0]: _set_items,
+        pickle.DICT[0]: _dictionary,
+        pickle.PUT[0]: _put,
+        # Sets carry no numbers: kept as lists, nothing in them is hashed.
+        pickle.EMPTY_SET[0]: dispatch[pickle.EMPTY_LIST[0]],
+        pickle.ADDITEMS[0]: dispatch[pickle.APPENDS[0]],
+        pickle.FROZENSET[0]: dispatch[pickle.LIST[0]],
     }
 
     def find_class(self, module: str, name: str) -> Any:
@@ -148,7 +202,8 @@ class _Reader(pickle._Unpickler):
         try:
             return ADMITTED[module, name]
         except KeyError:
-            raise _RefusedError(f"{module}.{name}") from None
+            shown = f"{module}.{name}"[:200]
+            raise _RefusedError(shown if shown.isprintable() else ascii(shown)) from None
 
 
 class _RefusedError(Exception):

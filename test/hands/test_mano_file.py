@@ -121,6 +121,16 @@ def test_a_malicious_file_is_refused_and_runs_nothing(model: dict[str, Any], tmp
         b"PK\x03\x04 a zip file",
         b"\x80\x63.",
         b"I1\n" * 3,
+        b"\x80\x02})" + b"2\x86" * 200 + b"Ns.",  # a key whose hash takes 2^200 steps
+        b"\x80\x02})" + b"\x85" * 500_000 + b"Ns.",  # one whose hash takes more stack than there is
+        b"\x80\x02(" + b")" + b"2\x86" * 200 + b"Nd.",  # the same in the three other ways to write a key
+        b"\x80\x02}()" + b"2\x86" * 200 + b"Nu.",
+        b"\x80\x04\x8f()" + b"2\x86" * 200 + b"\x90.",
+        b"\x80\x04()" + b"2\x86" * 200 + b"\x91.",
+        b"Np" + str(2**61 - 1).encode() + b"\n.",  # places in the memo that have one hash
+        b"\x80\x02\x8a\x09" + (2**61 - 1).to_bytes(9, "little") + b"p0\n}(g0\nNu.",
+        b"\x80\x02cnumpy\ndtype\nq\x00(" + b"N" * 1000 + b"tR.",  # arguments that every call copies
+        b"cmodule\x1b[2J\nname\n.",  # a name that clears the screen
     ],
 )
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
@@ -193,3 +203,47 @@ def test_expressions_and_matrices_that_do_not_fit_are_refused(tmp_path: Path) ->
         path.write_bytes(pickle.dumps(broken, protocol=2))
         with pytest.raises(ValueError, match=message):
             numbers(read_pickle(path))
+
+
+def array(code: bytes, raw: bytes, shape: bytes = b"K\x01\x85") -> bytes:
+    """An array in protocol 2, of a type by its code."""
+    text = b"X" + len(code).to_bytes(4, "little") + code
+    content = b"T" + len(raw).to_bytes(4, "little") + raw
+    head = b"cnumpy.core.multiarray\n_reconstruct\n)R(K\x01"
+    return head + shape + b"cnumpy\ndtype\n" + text + b"\x85R\x89" + content + b"tb"
+
+
+def sparse(starts: bytes, indices: bytes = b"i4") -> bytes:
+    """A matrix of two columns and three entries."""
+    parts = {"data": array(b"f8", bytes(24), b"K\x03\x85"), "indices": array(indices, bytes(12), b"K\x03\x85"),
+             "indptr": starts, "_shape": b"K\x02K\x02\x86"}  # fmt: skip
+    state = b"".join(b"X" + len(k).to_bytes(4, "little") + k.encode() + v for k, v in parts.items())
+    return b"cscipy.sparse.csc\ncsc_matrix\n)R}(" + state + b"ub"
+
+
+# Lists in lists: two hundred bytes that take 2^60 characters to write out.
+LISTS = b"]" + b"".join(b"q" + bytes([i]) + b"0](h" + bytes([i]) + b"h" + bytes([i]) + b"e" for i in range(60))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        array(b"f3", bytes(8)),
+        array("f\u00b2".encode(), bytes(8)),
+        array(b"O8", bytes(8)),
+        array(b"f8", bytes(8), b"(" + b"K\x01" * 40 + b"t"),
+        array(b"f8", bytes(8)).replace(b"X\x02\x00\x00\x00f8", LISTS),
+        b"\x8b\xc8\x00\x00\x00" + b"\x7f" * 200,
+        b"(K\x01\x8b\xc8\x00\x00\x00" + b"\x7f" * 200 + b"l",
+        sparse(array(b"u4", np.array([0, 5, 3], np.uint32).tobytes(), b"K\x03\x85")),
+        sparse(array(b"i4", np.array([0, 3, 3], np.int32).tobytes(), b"K\x03\x85"), indices=b"f4"),
+        sparse(array(b"f4", np.array([0, 3, 3], np.float32).tobytes(), b"K\x03\x85")),
+        sparse(array(b"i4", np.array([0, 3, 3], np.int32).tobytes(), b"K\x03\x85")).replace(b"K\x02K\x02\x86", LISTS),
+    ],
+)
+def test_numbers_that_are_none_are_refused_in_one_short_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "odd.pkl"
+    path.write_bytes(b"\x80\x02}X\x0a\x00\x00\x00v_template" + content + b"s.")
+    with pytest.raises(HandError, match=r"odd.pkl: v_template: ") as caught:
+        read_mano(path)
+    assert len(str(caught.value)) < 400
