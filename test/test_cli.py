@@ -49,7 +49,7 @@ BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "words.npz": (lambda path: path.write_bytes(b"PK nothing"), "words.npz"),
 }
 BAD_OPTIONS: list[tuple[list[str], str]] = [
-    (["--hand", "claw"], "unknown hand 'claw'; known: allegro_right"),
+    (["--hand", "claw"], "unknown hand 'claw'; known: allegro_left, allegro_right"),
     (["--hand", "missing.yaml"], "missing.yaml: no such file"),
     (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
     (["-n", "0"], "count: 0 grasps; valid: 1 to 1024"),

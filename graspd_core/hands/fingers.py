@@ -67,6 +67,7 @@ def find_fingers(hand: HandModel) -> Fingers:
     rotations, translations = link_poses(hand, straight_joints(hand))
     rng = np.random.default_rng(0)
     points, roots = [], []
+    middle = translations[hand.link_group == palm].mean(0)
     for chain in chains:
         root = translations[chain[chain.index(palm) - 1]]
         tip = chain[0]
@@ -76,13 +77,24 @@ def find_fingers(hand: HandModel) -> Fingers:
                 link = primitive.link
                 cloud.append(surface_points(primitive, 200, rng)[0] @ rotations[link].T + translations[link])
         reached = np.concatenate(cloud) if len(cloud) > 1 else translations[[tip]]
-        distance = np.linalg.norm(reached - root, axis=1)
-        points.append(reached[distance >= np.quantile(distance, 0.85)].mean(0))
+        points.append(_far_end(reached, root, middle))
         roots.append(root)
     links, tips = np.array([chain[0] for chain in chains]), np.array(points)
     local = np.einsum("tji,tj->ti", rotations[links], tips - translations[links])
     mates, bend = _mates(hand, local, links, units(tips - np.array(roots), 1e-6), wrist)
     return Fingers(local, links, np.array(roots), tips, palm, np.array(wrist, dtype=int), mates, bend)
+
+
+def _far_end(
+    reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """The middle of the points farthest from a finger's root; where that lies amid them, farthest from the palm's."""
+    for origin in (root, middle):
+        distance = np.linalg.norm(reached - origin, axis=1)
+        end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
+        if np.linalg.norm(end - root) > 0.5 * np.linalg.norm(reached - root, axis=1).max():
+            break
+    return end
 
 
 def _chain(group: int, above: dict[int, int]) -> list[int]:

@@ -160,11 +160,13 @@ def _outward(hand: HandModel, fingers: Fingers, away: Float[np.ndarray, "tips 3"
     """Which way each finger opens in the palm's plane, given where its tip lies from the ball.
 
     Fingers that bend together straighten together, square to the row of their knuckles, and the thumb goes the other
-    way; a gripper's fingers go apart.
+    way; a gripper's fingers go apart, each to the side that it stands on.
     """
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     if not fingers.mates.any():
-        return units(away @ plane, 1e-6)
+        # Not to the side that its tip was found on: fingers may have room to pass through each other.
+        aside = units((fingers.roots - fingers.roots.mean(0)) @ plane, 1e-3)
+        return np.where(aside.any(1, keepdims=True), aside, units(away @ plane, 1e-6))
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:
         row = knuckle_row(fingers)
