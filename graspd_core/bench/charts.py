@@ -49,12 +49,13 @@ _LEAST = 0.01
 
 @dataclass(frozen=True)
 class Point:
-    """One preset on one panel: middle and quartiles over objects on both axes."""
+    """One preset on one panel: middle and quartiles over objects on both axes, and whether any grasp of it held."""
 
     name: str
     method: str
     x: tuple[float, float, float]
     y: tuple[float, float, float]
+    held: bool
 
 
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
@@ -121,7 +122,8 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
         if x and y and middle is not None:
             heights = (y.low, y.mean if panel.mean else y.median, y.high)
             low, mid, high = (max(height * panel.factor, _LEAST if panel.log else 0.0) for height in heights)
-            points.append(Point(name, group[0].method, (x.low, middle, x.high), (low, mid, high)))
+            held = any(row.held for row in group)
+            points.append(Point(name, group[0].method, (x.low, middle, x.high), (low, mid, high), held))
     return points
 
 
@@ -135,7 +137,8 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
         axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
         filling = "white" if parent else colour
         axis.plot(x, y, MARKERS[p.method], color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
-    spots = np.array(list(place.values()))
+    # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
+    spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
     axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
     axis.set_xscale("log")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -164,10 +165,10 @@ def fill(document: Path, texts: Mapping[str, str]) -> list[str]:
         raise ConfigError(f"{document}: {error.strerror or error}") from None
     filled = []
     for name, content in texts.items():
-        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-        if content and begin in text and end in text.split(begin, 1)[1]:
-            before, rest = text.split(begin, 1)
-            text = f"{before}{begin}\n{content}\n{end}{rest.split(end, 1)[1]}"
+        # On lines of their own: a document may also speak of its markers.
+        section = re.compile(rf"^(<!-- {name}:begin -->\n).*?^(<!-- {name}:end -->)$", re.DOTALL | re.MULTILINE)
+        if content and section.search(text):
+            text = section.sub(lambda found, new=content: f"{found[1]}{new}\n{found[2]}", text, count=1)
             filled.append(name)
     if not filled:
         raise ConfigError(f"{document}: has none of the sections {', '.join(texts)}; valid: <!-- bench:begin --> …")

@@ -136,13 +136,15 @@ def test_hands_have_a_table_of_their_own_and_the_worst_object_of_each(record):
 
 def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     document = tmp_path / "page.md"
+    spoken_of = "fills `<!-- bench:begin -->` and others"
     document.write_text(
-        "before\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
+        f"{spoken_of}\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
     )
     chart = tmp_path / "figures" / "bench.png"
     assert tables.fill(document, tables.sections([record()], {"speed": chart}, document)) == ["bench"]
     text = document.read_text()
-    assert text.startswith("before\n<!-- bench:begin -->\n![Speed against accuracy](figures/bench.png)\n\n| preset |")
+    picture = "![Speed against accuracy](figures/bench.png)"
+    assert text.startswith(f"{spoken_of}\n<!-- bench:begin -->\n{picture}\n\n| preset |")
     assert "\n\n1 cells, 1 objects, seeds 0; hand allegro_right; 0 CPU minutes on 2 cores; code 0.1.0+abc.\n" in text
     assert text.endswith("\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n")
     assert "old" not in text
