@@ -52,7 +52,7 @@ def test_the_key_does_not_depend_on_what_is_not_looked_at():
 
 
 def test_a_file_name_is_for_the_eye_and_safe():
-    name = cell_file(replace(CELL, name="steps=180", source="/tmp/odd name?.obj"))
+    name = cell_file(replace(CELL, name="steps=180", source="scans/odd name?.obj"))
     assert name.startswith("raw-steps=180-odd_name_-seed0-")
     assert name.endswith(".json")
 
