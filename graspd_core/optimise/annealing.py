@@ -21,9 +21,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from graspd_core.config import AnnealingConfig, PlanConfig
+from graspd_core.config import AnnealingConfig
 from graspd_core.contact.wrench import disturbance_directions, wrench_support
-from graspd_core.geometry.scene import Scene
 from graspd_core.geometry.sdf import sample_sdf
 from graspd_core.hands.kinematics import place as place_in_base
 from graspd_core.hands.kinematics import placement
@@ -31,11 +30,10 @@ from graspd_core.hands.model import HandModel
 from graspd_core.hands.proxies import proxy_spheres
 from graspd_core.optimise.closing import link_gaps, make_closing, sphere_overlap
 from graspd_core.optimise.eigengrasps import inner_contacts, posture_space
-from graspd_core.optimise.initial import draw_starts
 from graspd_core.optimise.obstacles import obstacle_gaps
 from graspd_core.optimise.postures import Touches, find_touches
 from graspd_core.optimise.problem import Placed, Problem, place
-from graspd_core.optimise.search import Found, problem_of
+from graspd_core.optimise.search import Found, Task, problem_of, starts_of
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.se3 import transform_points
 
@@ -237,32 +235,21 @@ def sampled_epsilon(
     return support.reshape(batch, slots, -1).amax(1).amin(-1)
 
 
-def search_annealing(
-    scene: Scene,
-    hand: HandModel,
-    *,
-    count: int,
-    seed: int,
-    config: PlanConfig,
-    hooks: Hooks,
-    device: str,
-    dtype: torch.dtype,
-) -> Found:
+def search_annealing(task: Task) -> Found:
     """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
-    settings = config.annealing
-    problem = problem_of(scene, hand, config, seed=seed, device=device, dtype=dtype)
-    annealing = make_annealing(problem, hand, settings, seed)
-    chains = max(_FEWEST_CHAINS, round(count * settings.chains_per_grasp))
-    starts = draw_starts(scene, hand, chains, seed, device, dtype)
+    settings, hooks = task.config.annealing, task.hooks
+    problem = problem_of(task)
+    annealing = make_annealing(problem, task.hand, settings, task.seed)
+    starts = starts_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
     annealed = minimise(annealing, problem, starts, hooks)
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
     if annealed.interrupted == "cancelled" or len(legal) == 0:
         return Found(problem, annealed.poses[legal], annealed.interrupted)
     # What the deadline cut short is closed all the same: open fingers would be no grasps.
-    closing = make_closing(problem, hand, settings.close_steps)
+    closing = make_closing(problem, task.hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
-    touches = find_touches(problem, closed.poses, config.postures.touch_reach)
-    directions = disturbance_directions(settings.directions, seed).to(problem.lower)
+    touches = find_touches(problem, closed.poses, task.config.postures.touch_reach)
+    directions = disturbance_directions(settings.directions, task.seed).to(problem.lower)
     epsilon = sampled_epsilon(problem, touches, directions)
-    kept = min(len(epsilon), max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
+    kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
     return Found(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)

@@ -17,23 +17,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.config import Graspd2022Config, PlanConfig
+from graspd_core.config import Graspd2022Config
 from graspd_core.contact.forces import contact_forces
 from graspd_core.contact.rollout import FreeBody, make_body
-from graspd_core.geometry.scene import Scene
 from graspd_core.geometry.sdf import sample_sdf
 from graspd_core.hands.kinematics import place as place_in_base
-from graspd_core.hands.model import HandModel
 from graspd_core.optimise import losses
 from graspd_core.optimise.closed_form import evaluate_distance, pack, unpack
 from graspd_core.optimise.desired import actual, into_cone, motion_left, physics
-from graspd_core.optimise.initial import draw_starts
 from graspd_core.optimise.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.optimise.obstacles import obstacle_gaps
 from graspd_core.optimise.problem import OBSTACLE_MARGIN, PointSet, Problem, place
 from graspd_core.optimise.published_starts import published_starts
-from graspd_core.optimise.search import Found, problem_of
-from graspd_core.optimise.solver import Hooks, Poses, minimise
+from graspd_core.optimise.search import Found, Task, problem_of, starts_of
+from graspd_core.optimise.solver import Poses, minimise
 
 # L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
 _ALL_MOTION = 60.0
@@ -235,28 +232,17 @@ def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
     return torch.where(finite.view(-1, *[1] * (gradient.dim() - 1)), gradient, torch.zeros_like(gradient))
 
 
-def search_graspd2022(
-    scene: Scene,
-    hand: HandModel,
-    *,
-    count: int,
-    seed: int,
-    config: PlanConfig,
-    hooks: Hooks,
-    device: str,
-    dtype: torch.dtype,
-) -> Found:
+def search_graspd2022(task: Task) -> Found:
     """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
-    settings = config.graspd2022
-    problem = problem_of(scene, hand, config, seed=seed, device=device, dtype=dtype)
-    drawn = max(1, round(count * settings.starts_per_grasp))
+    settings, thing = task.config.graspd2022, task.scene.object
+    problem = problem_of(task)
+    drawn = max(1, round(task.count * settings.starts_per_grasp))
     if settings.starts == "published":
-        starts = published_starts(problem, scene, hand, drawn, seed, settings.standoff)
+        starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.standoff)
     else:
-        starts = draw_starts(scene, hand, drawn, seed, device, dtype)
-    thing = scene.object
-    body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, device, dtype)
-    solution = minimise(Graspd2022(settings, body), problem, starts, hooks)
+        starts = starts_of(task, drawn)
+    body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
+    solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]
     inside = replace(poses, joints=poses.joints.clamp(problem.lower, problem.upper))
     return Found(problem, inside, solution.interrupted)

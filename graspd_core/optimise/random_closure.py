@@ -11,49 +11,37 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from graspd_core.config import PlanConfig
-from graspd_core.geometry.scene import Scene
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.model import HandModel
 from graspd_core.optimise.closing import Closing, link_gaps, make_closing
 from graspd_core.optimise.obstacles import hand_reach, obstacle_gaps
 from graspd_core.optimise.problem import Problem
-from graspd_core.optimise.search import Found, problem_of
-from graspd_core.optimise.solver import Hooks, Poses, minimise
+from graspd_core.optimise.search import Found, Task, problem_of
+from graspd_core.optimise.solver import Poses, minimise
 from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
 
 # The advance ends this far from the object, or after so many steps of the nearest distance each [m].
 _TOUCHING, _ADVANCES = 0.0003, 60
 
 
-def search_random_closure(
-    scene: Scene,
-    hand: HandModel,
-    *,
-    count: int,
-    seed: int,
-    config: PlanConfig,
-    hooks: Hooks,
-    device: str,
-    dtype: torch.dtype,
-) -> Found:
+def search_random_closure(task: Task) -> Found:
     """Closed hands from random sides, `count` tries a round until as many touch; a round cut short gives none."""
-    settings = config.random_closure
-    problem = problem_of(scene, hand, config, seed=seed, device=device, dtype=dtype)
+    settings, hand, count = task.config.random_closure, task.hand, task.count
+    problem = problem_of(task)
     closing = make_closing(problem, hand, settings.close_steps)
     least = min(settings.touching, int(hand.link_group.max()) + 1)
-    tries = draw_approaches(problem, hand, count * settings.rounds, seed)
-    kept, interrupted = tries[torch.arange(0, device=device)], ""
-    for rows in torch.arange(len(tries.joints), device=device).split(count):
+    tries = draw_approaches(problem, hand, count * settings.rounds, task.seed)
+    kept, interrupted = tries[torch.arange(0, device=task.device)], ""
+    for rows in torch.arange(len(tries.joints), device=task.device).split(count):
         if interrupted or len(kept.joints) >= count:
             break
-        solution = minimise(closing, problem, advance(problem, closing, hand, tries[rows]), hooks)
+        solution = minimise(closing, problem, advance(problem, closing, hand, tries[rows]), task.hooks)
         interrupted = solution.interrupted
         if not interrupted:
-            groups = touching_groups(problem, closing, hand, solution.poses, config.postures.touch_reach)
+            groups = touching_groups(problem, closing, hand, solution.poses, task.config.postures.touch_reach)
             good = (groups >= least) & clear_of_obstacles(problem, solution.poses)
             kept = join(kept, solution.poses[good])
-    return Found(problem, kept[torch.arange(min(count, len(kept.joints)), device=device)], interrupted)
+    return Found(problem, kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
 
 
 def join(a: Poses, b: Poses) -> Poses:

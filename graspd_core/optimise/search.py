@@ -1,15 +1,16 @@
-"""What every search for poses shares: its signature, its result, and the problem that results are ranked in."""
+"""What every search for poses shares: its task, its result, the starts, and the problem that results are ranked in."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 
 from graspd_core.config import PlanConfig
 from graspd_core.geometry.scene import Scene
 from graspd_core.hands.model import HandModel
+from graspd_core.optimise.initial import draw_starts
 from graspd_core.optimise.problem import Problem, build_problem
 from graspd_core.optimise.solver import Hooks, Poses
 
@@ -29,39 +30,50 @@ class Found:
     interrupted: str = ""
 
 
-class Search(Protocol):
-    """How poses are found; one for every `config.Method`."""
+@dataclass(frozen=True)
+class Task:
+    """What is searched for, and with what means.
 
-    def __call__(
-        self,
-        scene: Scene,
-        hand: HandModel,
-        *,
-        count: int,
-        seed: int,
-        config: PlanConfig,
-        hooks: Hooks,
-        device: str,
-        dtype: torch.dtype,
-    ) -> Found:
-        """Poses for `count` grasps; numerical trouble is a pose that is not there, never an exception."""
-        ...
+    Attributes:
+        scene, hand: what is to be grasped by what.
+        count: grasps asked for.
+        seed: of everything that is drawn.
+        config: settings of all methods.
+        hooks: how the run is followed and ended.
+        device, dtype: of the tensors.
+    """
+
+    scene: Scene
+    hand: HandModel
+    count: int
+    seed: int
+    config: PlanConfig
+    hooks: Hooks
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
 
 
-def problem_of(
-    scene: Scene, hand: HandModel, config: PlanConfig, *, seed: int, device: str, dtype: torch.dtype
-) -> Problem:
+# How poses are found; one for every `config.Method`. Numerical trouble is a pose that is not there, never an exception.
+Search = Callable[[Task], Found]
+
+
+def problem_of(task: Task) -> Problem:
     """The problem by the closed form's settings, in which every method's poses are made into grasps and ranked."""
-    settings = config.closed_form
+    settings = task.config.closed_form
     return build_problem(
-        scene,
-        hand,
+        task.scene,
+        task.hand,
         candidates=settings.candidates,
         features=settings.features,
         directions=settings.directions,
-        friction=min(settings.friction, scene.object.friction),
-        seed=seed,
-        device=device,
-        dtype=dtype,
+        friction=min(settings.friction, task.scene.object.friction),
+        seed=task.seed,
+        device=task.device,
+        dtype=task.dtype,
         trust_floor=settings.trust_floor,
     )
+
+
+def starts_of(task: Task, count: int) -> Poses:
+    """`count` seeded starts on the object's hull."""
+    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype)

@@ -17,7 +17,6 @@ from graspd_core.hands.overlap import deepest_overlap
 from graspd_core.optimise.annealing import search_annealing
 from graspd_core.optimise.closed_form import ClosedForm
 from graspd_core.optimise.graspd2022 import search_graspd2022
-from graspd_core.optimise.initial import draw_starts
 from graspd_core.optimise.obstacles import intrusion
 from graspd_core.optimise.postures import (
     Squeeze,
@@ -30,7 +29,7 @@ from graspd_core.optimise.postures import (
 )
 from graspd_core.optimise.problem import Problem
 from graspd_core.optimise.random_closure import search_random_closure
-from graspd_core.optimise.search import Found, Search, problem_of
+from graspd_core.optimise.search import Found, Search, Task, problem_of, starts_of
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.types import Contact, Grasp, Posture
 
@@ -50,25 +49,14 @@ class Candidates:
     interrupted: str
 
 
-def search_closed_form(
-    scene: Scene,
-    hand: HandModel,
-    *,
-    count: int,
-    seed: int,
-    config: PlanConfig,
-    hooks: Hooks,
-    device: str,
-    dtype: torch.dtype,
-) -> Found:
+def search_closed_form(task: Task) -> Found:
     """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
-    settings = config.closed_form
-    problem = problem_of(scene, hand, config, seed=seed, device=device, dtype=dtype)
-    factor = 1.0 if problem.obstacles is None else settings.obstacle_factor
-    drawn = max(_FEWEST_STARTS, round(count * settings.starts_per_grasp * factor))
-    starts = draw_starts(scene, hand, drawn, seed, device, dtype)
-    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp * factor)))
-    solution = minimise(solver, problem, starts, hooks)
+    settings = task.config.closed_form
+    problem = problem_of(task)
+    count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
+    starts = starts_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
+    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
+    solution = minimise(solver, problem, starts, task.hooks)
     return Found(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
 
 
@@ -92,8 +80,7 @@ def synthesise(
     dtype: torch.dtype = torch.float32,
 ) -> Candidates:
     """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless."""
-    search = SEARCHES[config.method]
-    found = search(scene, hand, count=count, seed=seed, config=config, hooks=hooks, device=device, dtype=dtype)
+    found = SEARCHES[config.method](Task(scene, hand, count, seed, config, hooks, device, dtype))
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
     return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)

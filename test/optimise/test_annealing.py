@@ -26,7 +26,7 @@ from graspd_core.optimise.closing import finger_of
 from graspd_core.optimise.eigengrasps import inner_contacts, posture_space
 from graspd_core.optimise.initial import draw_starts
 from graspd_core.optimise.postures import Touches, hand_distance
-from graspd_core.optimise.search import Found
+from graspd_core.optimise.search import Found, Task
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
@@ -150,7 +150,7 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
 
 def search(scene, hand, *, seed: int = 0, hooks: Hooks | None = None) -> Found:
     hooks = Hooks() if hooks is None else hooks
-    return search_annealing(scene, hand, count=4, seed=seed, config=CONFIG, hooks=hooks, device="cpu", dtype=DOUBLE)
+    return search_annealing(Task(scene, hand, 4, seed, CONFIG, hooks, dtype=DOUBLE))
 
 
 def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
@@ -171,7 +171,7 @@ def test_chains_that_never_leave_a_collision_give_nothing(scenes, hand):
     # The support ends a metre above the object: in two steps no hand gets out of it.
     buried = replace(scenes["sphere"], support=Plane(np.array([0.0, 0.0, 1.0]), 1.0))
     short = replace(CONFIG, annealing=replace(SETTINGS, steps=2))
-    found = search_annealing(buried, hand, count=2, seed=0, config=short, hooks=Hooks(), device="cpu", dtype=DOUBLE)
+    found = search_annealing(Task(buried, hand, 2, 0, short, Hooks(), dtype=DOUBLE))
     assert (found.interrupted, len(found.poses.joints)) == ("", 0)
 
 

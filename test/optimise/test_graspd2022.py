@@ -21,6 +21,7 @@ from graspd_core.optimise.graspd2022 import Graspd2022, search_graspd2022
 from graspd_core.optimise.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.optimise.problem import place
 from graspd_core.optimise.published_starts import published_starts
+from graspd_core.optimise.search import Task
 from graspd_core.optimise.solver import Hooks, Poses, minimise
 from graspd_core.optimise.synthesis import SEARCHES
 from graspd_core.se3 import rotation_from_quaternion
@@ -267,13 +268,13 @@ def test_a_start_that_is_not_a_number_never_wins_and_harms_none(problem, starts,
 
 def test_the_search_obeys_limits_and_stop(hand, scenes):
     config = replace(PlanConfig(), graspd2022=SHORT)
-    options = {"seed": 1, "config": config, "device": "cpu", "dtype": torch.float32}
-    found = search_graspd2022(scenes["sphere"], hand, count=2, hooks=Hooks(), **options)
+    task = Task(scenes["sphere"], hand, 2, 1, config, Hooks())
+    found = search_graspd2022(task)
     assert len(found.poses.translation) == 2
     assert (found.poses.joints >= found.problem.lower).all()
     assert (found.poses.joints <= found.problem.upper).all()
     polls = iter([False, True])
-    stopped = search_graspd2022(scenes["sphere"], hand, count=2, hooks=Hooks(stop=polls.__next__), **options)
+    stopped = search_graspd2022(replace(task, hooks=Hooks(stop=polls.__next__)))
     assert stopped.interrupted == "cancelled"
     assert SEARCHES["graspd2022"] is search_graspd2022
 

@@ -15,7 +15,7 @@ from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.optimise.closing import link_gaps, make_closing
 from graspd_core.optimise.obstacles import obstacle_gaps
 from graspd_core.optimise.random_closure import advance, draw_approaches, search_random_closure, touching_groups
-from graspd_core.optimise.search import Found
+from graspd_core.optimise.search import Found, Task
 from graspd_core.optimise.solver import Hooks
 from graspd_core.optimise.synthesis import synthesise
 from graspd_core.se3 import rotation_from_quaternion
@@ -31,9 +31,7 @@ CONFIG = PlanConfig(
 
 def search(scene, hand, *, count: int = 4, seed: int = 0, hooks: Hooks | None = None, config=CONFIG) -> Found:
     hooks = Hooks() if hooks is None else hooks
-    return search_random_closure(
-        scene, hand, count=count, seed=seed, config=config, hooks=hooks, device="cpu", dtype=DOUBLE
-    )
+    return search_random_closure(Task(scene, hand, count, seed, config, hooks, dtype=DOUBLE))
 
 
 def test_what_it_finds_touches_with_enough_links_and_sinks_nowhere(scenes, hand):
