@@ -94,7 +94,7 @@ def cells_of(suites: Sequence[str], request: Request) -> tuple[Cell, ...]:
     """
     for name in suites:
         if name not in SUITES:
-            raise ConfigError(f"unknown suite {name!r}; valid suites: {', '.join(SUITES)}")
+            raise ConfigError(f"unknown suite {name!r}; valid suites: {', '.join(SUITES)}, stress")
     for name in request.trials:
         if name not in TRIALS:
             raise ConfigError(f"unknown trial {name!r}; valid trials: {', '.join(TRIALS)}")

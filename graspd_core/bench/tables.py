@@ -62,7 +62,7 @@ def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, lis
     if last is not None:
         headings.append(last[0])
         body = [[*line, cell] for line, cell in zip(body, last[1], strict=True)]
-    return _table(headings, body)
+    return markdown_table(headings, body)
 
 
 def object_tables(records: Sequence[Record]) -> str:
@@ -76,7 +76,7 @@ def object_tables(records: Sequence[Record]) -> str:
             for row in group
         ]  # fmt: skip
         body.append(["**mean**", *(_mean(group, figure, form) for _, figure, form in columns)])
-        blocks.append(f"`{name}`:\n\n{_table(['object', *(heading for heading, _, _ in columns)], body)}")
+        blocks.append(f"`{name}`:\n\n{markdown_table(['object', *(heading for heading, _, _ in columns)], body)}")
     return "\n\n".join(blocks)
 
 
@@ -93,7 +93,7 @@ def planned_table(records: Sequence[Record]) -> str:
             f"{max(row.values['peak_mb'] or 0.0 for row in group):.0f}",
         ])  # fmt: skip
     headings = ["preset", "verified", "first verified CPU s, median (worst)", "first verified s", "CPU s per verified"]
-    return _table([*headings, "rounds", "peak MB"], body) if body else ""
+    return markdown_table([*headings, "rounds", "peak MB"], body) if body else ""
 
 
 def pace_table(records: Sequence[Record]) -> str:
@@ -110,7 +110,7 @@ def pace_table(records: Sequence[Record]) -> str:
         elif r["kind"] == "start":
             what = f"first verified grasp of a fresh process without a cache, `{r['name']}`, {r['object']}"
             body.append([what, f"{r['wall']['total']:.1f} s, {r['cpu']['total']:.1f} CPU s"])
-    return _table(["speed and size", ""], body) if body else ""
+    return markdown_table(["speed and size", ""], body) if body else ""
 
 
 def sections(records: Sequence[Record], charts: Mapping[str, Path], document: Path) -> dict[str, str]:
@@ -200,6 +200,7 @@ def _form(value: float | None, form: str) -> str:
     return "–" if value is None else form.format(value)
 
 
-def _table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown; cells must not have bars of their own."""
     lines = [headings, ["---"] * len(headings), *body]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from graspd_core.cli import stress
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
 from graspd_core.errors import ConfigError
 
@@ -17,10 +18,15 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
     parser = commands.add_parser("bench", help="measure presets and methods on objects; tables and charts")
     parser.set_defaults(run=run)
-    parser.add_argument("--suite", action="append", default=None, metavar="NAME", help="main (default), ladder, hands")
+    parser.add_argument(
+        "--suite", action="append", default=None, metavar="NAME", help="main (default), ladder, hands; or stress"
+    )
     parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all in the box")
     parser.add_argument(
         "--objects", nargs="+", default=(), metavar="OBJECT", help="shape:NAME, meshes or folders; default: all shapes"
+    )
+    parser.add_argument(
+        "--cases", nargs="+", default=(), metavar="CASE", help="of stress: names, families; default: all"
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=(0,), metavar="N")
     parser.add_argument("--count", type=int, default=None, help="grasps of a raw cell (default: by method)")
@@ -48,6 +54,10 @@ def run(options: argparse.Namespace) -> int:
 
     if options.processes < 1:
         raise ConfigError(f"processes: {options.processes}; at least 1")
+    if options.suite == ["stress"]:
+        return stress.run(options)
+    if options.cases or "stress" in (options.suite or ()):
+        raise ConfigError("suite: stress is run by itself, and it alone has cases; valid: --suite stress [--cases …]")
     request = Request(
         presets=tuple(options.presets),
         objects=tuple(options.objects),

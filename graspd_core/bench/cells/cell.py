@@ -16,7 +16,7 @@ from graspd_core.config import METHODS, PlanConfig
 
 Kind = Literal["raw", "verified", "pace", "start"]
 
-# Parts of the package that no figure of a cell depends on; of the benchmark itself, only the cells count.
+# Parts of the package that no figure of a cell depends on; of the benchmark itself, one folder counts.
 _BESIDE = ("cli", "bags", "doctor.py", "html.py", "bench")
 
 
@@ -80,14 +80,17 @@ def cell_file(cell: Cell) -> str:
     return f"{'-'.join(re.sub(r'[^A-Za-z0-9_.=]+', '_', word) for word in words)}-{cell_key(cell)[:12]}.json"
 
 
-@lru_cache(maxsize=1)
-def code_version() -> str:
-    """The package's version and a hash of the sources that figures depend on: all but command line, charts and bags."""
+@lru_cache
+def code_version(bench: str = "cells") -> str:
+    """The package's version and a hash of the sources that figures depend on: all but command line, charts and bags.
+
+    Of the benchmark itself only the folder `bench` counts.
+    """
     root = Path(__file__).parents[2]
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         inside = path.relative_to(root)
-        if inside.parts[0] not in _BESIDE or inside.parts[:2] == ("bench", "cells"):
+        if inside.parts[0] not in _BESIDE or inside.parts[:2] == ("bench", bench):
             digest.update(f"{inside.as_posix()}\n".encode() + path.read_bytes())
     try:
         released = version("graspd")

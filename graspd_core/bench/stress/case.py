@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from graspd_core.geometry.scene import Scene
+from graspd_core.types import TriangleMesh
 
 Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
 
@@ -15,7 +16,7 @@ Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
 GRASP = "grasp"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """One thing that breaks methods.
 
@@ -31,6 +32,7 @@ class Case:
         loading: seconds that loading may take.
         memory: most that the process may use at its peak, the libraries' own included [MB].
         options: further arguments of `plan_grasps`.
+        truth: the true object, in the scene's frame, where the scene is only what cameras saw of it.
     """
 
     name: str
@@ -44,3 +46,4 @@ class Case:
     loading: float = 15.0
     memory: float = 2000.0
     options: dict[str, Any] = field(default_factory=dict)
+    truth: Callable[[], TriangleMesh] | None = None

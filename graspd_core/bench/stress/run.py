@@ -11,11 +11,10 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,10 @@ import numpy as np
 from graspd_core.bench.stress.case import GRASP, Case
 from graspd_core.errors import GraspdError
 from graspd_core.geometry.scene import Scene, object_parts
-from graspd_core.types import GraspResult, Verdict
+from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
 
 # What a deadline may be overrun by [s].
 GRACE = 0.5
-# Beyond loading and planning, before the process is called hung [s].
-_PATIENCE = 60.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +44,7 @@ class Ending:
         verified: how many of them held.
         again: how many of those held in the second trial.
         finite: no number of the result is NaN or infinite.
+        true: how many verified grasps hold on the true object; None where the case knows no truth.
     """
 
     case: str
@@ -59,6 +57,7 @@ class Ending:
     verified: int = 0
     again: int = 0
     finite: bool = True
+    true: int | None = None
 
 
 def faults(case: Case, ending: Ending) -> tuple[str, ...]:
@@ -81,21 +80,6 @@ def faults(case: Case, ending: Ending) -> tuple[str, ...]:
     return tuple(wrong)
 
 
-def run_elsewhere(case: Case, preset: str = "balanced") -> Ending:
-    """Run a case in a fresh process."""
-    limit = case.loading + case.deadline + _PATIENCE
-    command = [sys.executable, "-m", "graspd_core.bench.stress.run", case.name, "--preset", preset]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
-    except subprocess.TimeoutExpired:
-        return Ending(case.name, "hang", f"no end after {limit:.0f} s", planning=limit)
-    try:
-        return Ending(**json.loads(done.stdout.splitlines()[-1]))
-    except (IndexError, ValueError, TypeError):
-        last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
-        return Ending(case.name, "crash", last[0])
-
-
 def run_case(case: Case, preset: str = "balanced") -> Ending:
     """Run a case in this process."""
     from graspd_core.pipeline import load_hand, plan_grasps
@@ -106,7 +90,8 @@ def run_case(case: Case, preset: str = "balanced") -> Ending:
         try:
             scene = case.scene(Path(folder))
         except GraspdError as error:
-            return Ending(case.name, type(error).__name__, str(error), time.perf_counter() - began, memory=_peak())
+            told = str(error).replace(f"{folder}/", "")
+            return Ending(case.name, type(error).__name__, told, time.perf_counter() - began, memory=_peak())
         loaded = time.perf_counter()
         options = {"count": 2, "deadline": case.deadline, "preset": preset} | case.options
         result = plan_grasps(scene, hand, **options)
@@ -115,7 +100,7 @@ def run_case(case: Case, preset: str = "balanced") -> Ending:
         return Ending(
             case.name,
             GRASP if verified else result.outcome.name,
-            "; ".join([result.outcome.value, *scene.object.warnings]),
+            _told(result, folder),
             loaded - began,
             planned - loaded,
             _peak(),
@@ -123,7 +108,14 @@ def run_case(case: Case, preset: str = "balanced") -> Ending:
             len(verified),
             _hold_again(result, scene, hand, Path(folder) / "grasps.json", preset) if verified else 0,
             _finite(result),
+            None if case.truth is None else _hold_truly(verified, scene, hand, case.truth()),
         )
+
+
+def _told(result: GraspResult, folder: str) -> str:
+    """What the user reads of a result; files by their names alone."""
+    told = (result.outcome.value, result.message, *result.warnings)
+    return "; ".join(filter(None, told)).replace(f"{folder}/", "")
 
 
 def _hold_again(result: GraspResult, scene: Scene, hand: Any, path: Path, preset: str) -> int:
@@ -138,6 +130,18 @@ def _hold_again(result: GraspResult, scene: Scene, hand: Any, path: Path, preset
     protocol = at_friction(PROTOCOLS["standard"], scene.object.friction)
     world = build_world(hand, scene.object, object_parts(scene.object), protocol)
     return sum(hold_trial(world, grasp, protocol).passed for grasp in kept if grasp.verdict is Verdict.VERIFIED)
+
+
+def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: TriangleMesh) -> int:
+    """How many verified grasps hold on the true object, of the mass and friction that were planned with."""
+    from graspd_core.geometry.scene import build_scene
+    from graspd_core.verify.trial import hold_trial
+    from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+
+    true = build_scene(truth, source="truth", mass=scene.object.mass, friction=scene.object.friction).object
+    protocol = at_friction(PROTOCOLS["standard"], true.friction)
+    world = build_world(hand, true, object_parts(true), protocol)
+    return sum(hold_trial(world, grasp, protocol).passed for grasp in verified)
 
 
 def _finite(result: GraspResult) -> bool:
@@ -162,17 +166,6 @@ def _finite(result: GraspResult) -> bool:
 
 def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def run_all(
-    cases: tuple[Case, ...], preset: str, told: Callable[[Case, Ending], None] = lambda case, ending: None
-) -> tuple[Ending, ...]:
-    """Every case, one after the other."""
-    endings = []
-    for case in cases:
-        endings.append(run_elsewhere(case, preset))
-        told(case, endings[-1])
-    return tuple(endings)
 
 
 def main() -> int:

@@ -1,0 +1,137 @@
+"""Stress cases in processes of their own, each ending kept on disk as soon as it is there."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO
+
+from graspd_core.bench.stress.case import Case
+from graspd_core.bench.stress.cases import CASES
+from graspd_core.bench.stress.run import Ending
+from graspd_core.errors import ConfigError
+from graspd_core.io import save_text
+
+FORMAT, VERSION = "graspd/stress", 1
+
+# Beyond loading and planning, before a process is called hung, and how often processes are looked at [s].
+_PATIENCE, _POLL = 60.0, 0.05
+
+
+def cases_of(names: Sequence[str]) -> tuple[Case, ...]:
+    """Cases by their names or families, all of them for no name. Raises ConfigError: there is no such case."""
+    families = sorted({case.family for case in CASES.values()})
+    if unknown := [name for name in names if name not in CASES and name not in families]:
+        raise ConfigError(f"unknown case {unknown[0]!r}; valid: {', '.join(families)}, {', '.join(sorted(CASES))}")
+    return tuple(case for case in CASES.values() if not names or case.name in names or case.family in names)
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Where endings are kept, and what they must have come from to count.
+
+    Attributes:
+        folder: of the files.
+        preset: that the cases are planned with.
+        code: version of the code; None takes those of any.
+    """
+
+    folder: Path
+    preset: str
+    code: str | None
+
+    def path(self, case: Case) -> Path:
+        """The file of one case."""
+        return self.folder / f"stress-{Path(self.preset).stem}-{case.name}.json"
+
+    def write(self, ending: Ending, case: Case) -> None:
+        """Keep an ending; its file appears whole or not at all."""
+        kept = {"format": FORMAT, "version": VERSION, "code": self.code, "preset": self.preset}
+        save_text(self.path(case), json.dumps({**kept, "ending": asdict(ending)}, indent=1) + "\n")
+
+    def read(self, case: Case) -> Ending | None:
+        """The ending of a case, None where there is none of this code and preset."""
+        try:
+            kept = json.loads(self.path(case).read_text(encoding="utf-8"))
+            good = kept["preset"] == self.preset and (self.code is None or kept["code"] == self.code)
+            return Ending(**kept["ending"]) if good else None
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+
+
+def run_cases(
+    cases: Sequence[Case], shelf: Shelf, processes: int, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[Case, Ending]]:
+    """Run cases, `processes` at a time, and yield each as it ends; its ending is on disk by then.
+
+    Ends early, its processes killed, once `stop` is true. A process that dies or hangs is an ending like any other.
+    """
+    waiting = deque(cases)
+    running: list[_Running] = []
+    try:
+        while (waiting or running) and not stop():
+            while waiting and len(running) < processes:
+                running.append(_Running(waiting.popleft(), shelf.preset))
+            ended = [one for one in running if one.over()]
+            running = [one for one in running if one not in ended]
+            for one in ended:
+                ending = one.ending()
+                shelf.write(ending, one.case)
+                yield one.case, ending
+            time.sleep(0.0 if ended else _POLL)
+    finally:
+        for one in running:
+            one.kill()
+
+
+class _Running:
+    """One case in its process."""
+
+    def __init__(self, case: Case, preset: str) -> None:
+        self.case = case
+        self._patience = case.loading + case.deadline + _PATIENCE
+        self._end = time.perf_counter() + self._patience
+        command = [sys.executable, "-m", "graspd_core.bench.stress.run", case.name, "--preset", preset]
+        self._streams = out, err = _scratch(), _scratch()
+        # A group of its own: a Ctrl-C is the parent's, who decides what it means.
+        self._process = subprocess.Popen(command, stdout=out, stderr=err, start_new_session=True)
+
+    def over(self) -> bool:
+        return self._process.poll() is not None or time.perf_counter() > self._end
+
+    def kill(self) -> None:
+        """End it, and let go of what it wrote."""
+        self._process.kill()
+        self._process.wait()
+        for stream in self._streams:
+            stream.close()
+
+    def ending(self) -> Ending:
+        """What it came to; it is over afterwards."""
+        ended = self._process.poll() is not None
+        out, err = (_lines(stream) for stream in self._streams)
+        self.kill()
+        if not ended:
+            return Ending(self.case.name, "hang", f"no end after {self._patience:.0f} s", planning=self._patience)
+        try:
+            return Ending(**json.loads(out[-1]))
+        except (IndexError, ValueError, TypeError):
+            told = err[-1] if err else f"exit status {self._process.returncode}"
+            return Ending(self.case.name, "crash", told)
+
+
+def _scratch() -> IO[str]:
+    """A file without a name, gone with its last reader."""
+    return tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+
+
+def _lines(stream: IO[str]) -> list[str]:
+    stream.seek(0)
+    return stream.read().strip().splitlines()

@@ -1,0 +1,101 @@
+"""The stress suite: cases in processes of their own, endings that outlive a kill, and a table that hides no fault."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from graspd_core.bench.stress import suite
+from graspd_core.bench.stress.case import GRASP
+from graspd_core.bench.stress.cases import CASES
+from graspd_core.bench.stress.run import Ending
+from graspd_core.bench.stress.suite import Shelf, cases_of, run_cases
+from graspd_core.bench.stress.table import stress_table, summary
+from graspd_core.cli import main
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
+from graspd_core.errors import ConfigError
+
+BOX, NAN = CASES["open-box"], CASES["nan-vertices"]
+GRASPED = Ending("open-box", GRASP, "open | closed", 0.5, 2.4, 400.0, 3, 2, 2)
+
+
+def test_a_case_ends_in_a_process_of_its_own_and_a_death_is_an_ending(tmp_path: Path):
+    shelf = Shelf(tmp_path, "fast", "here")
+    nobody = replace(NAN, name="not-a-case")
+    endings = {case.name: ending for case, ending in run_cases([NAN, nobody], shelf, processes=2)}
+    assert endings["nan-vertices"].ending == "MeshError"
+    assert "nan-vertices.obj: 3 of " in endings["nan-vertices"].message
+    assert endings["not-a-case"].ending == "crash"
+    assert "not-a-case" in endings["not-a-case"].message
+    assert shelf.read(NAN) == endings["nan-vertices"]
+
+
+def test_a_process_that_does_not_end_is_killed_and_called_hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(suite, "_PATIENCE", 0.0)
+    hasty = replace(BOX, loading=0.1, deadline=0.1)
+    ((_, ending),) = run_cases([hasty], Shelf(tmp_path, "fast", "here"), processes=1)
+    assert ending.ending == "hang"
+
+
+def test_nothing_is_begun_once_stopped(tmp_path: Path):
+    assert list(run_cases([NAN], Shelf(tmp_path, "fast", "here"), 1, stop=lambda: True)) == []
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_ending_counts_for_its_code_and_preset_alone(tmp_path: Path):
+    Shelf(tmp_path, "fast", "here").write(GRASPED, BOX)
+    assert Shelf(tmp_path, "fast", "here").read(BOX) == GRASPED
+    assert Shelf(tmp_path, "fast", None).read(BOX) == GRASPED
+    assert Shelf(tmp_path, "fast", "there").read(BOX) is None
+    assert Shelf(tmp_path, "balanced", "here").read(BOX) is None
+    Shelf(tmp_path, "fast", "here").path(BOX).write_text('{"preset": "fast", "code": "here", "ending": {"odd": 1}}')
+    assert Shelf(tmp_path, "fast", "here").read(BOX) is None
+
+
+def test_cases_are_chosen_by_name_and_family():
+    assert cases_of(()) == tuple(CASES.values())
+    assert {case.name for case in cases_of(["hand", "empty"])} >= {"empty", "too-wide"}
+    with pytest.raises(ConfigError, match="unknown case 'broken'; valid: cloud, hand, mesh, numbers, physics, all-at"):
+        cases_of(["broken"])
+
+
+def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
+    wrong = Ending("nan-vertices", GRASP, "", 0.1, 30.0, 300.0, 2, 1, 0)
+    told = summary({BOX: GRASPED, NAN: wrong})
+    assert told.startswith("2 cases, 3 faults. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
+    assert "2 of 3 verified grasps hold in a second trial." in told
+    for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified grasps fail"):
+        assert f"* `nan-vertices`: {fault}" in told
+    table = stress_table({BOX: GRASPED, NAN: wrong})
+    assert f"| `open-box` | {BOX.about} | grasp | 0.5 | 2.4 | 400 | 2/3 | 2 | – | open \\| closed |" in table
+    assert "**grasp**" in table
+
+
+def test_the_command_reports_kept_endings_and_fills_a_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    Shelf(tmp_path, "balanced", "here").write(GRASPED, BOX)
+    page = tmp_path / "page.md"
+    page.write_text("<!-- stress:begin -->\nbygone\n<!-- stress:end -->\n")
+    command = ["bench", "--suite", "stress", "--no-run", "--out", str(tmp_path), "--readme", str(page)]
+    assert main(command) == EXIT_OK
+    assert "1 cases, 0 faults." in capsys.readouterr().out
+    assert "open-box" in page.read_text()
+    assert "bygone" not in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--suite", "stress", "--suite", "main"], "stress is run by itself"),
+        (["--cases", "empty"], "stress is run by itself"),
+        (["--suite", "stress", "--cases", "broken"], "unknown case 'broken'; valid: "),
+        (["--suite", "stress", "--presets", "fast", "balanced"], "one at a time"),
+        (["--suite", "stress", "--presets", "best"], "unknown preset 'best'"),
+    ],
+)
+def test_bad_options_are_named_in_one_line(options: list[str], culprit: str, capsys: pytest.CaptureFixture[str]):
+    assert main(["bench", *options]) == EXIT_BAD_INPUT
+    err = capsys.readouterr().err
+    assert culprit in err
+    assert err.count("\n") == 1
