@@ -136,8 +136,6 @@ def _start_penetration(run: _Run) -> float:
 
 def _move(run: _Run, start: Posture, end: Posture) -> str:
     """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
-    import pybullet
-
     steps = round(run.protocol.stage_time / TIMESTEP)
     # The shorter way round for the base: wxyz and its negative are the same rotation.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
@@ -146,11 +144,8 @@ def _move(run: _Run, start: Posture, end: Posture) -> str:
         quaternion = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
         _put_base(run, (1 - a) * start.position + a * end.position, quaternion / np.linalg.norm(quaternion))
         _drive(run, (1 - a) * start.joint_positions + a * end.joint_positions)
-        pybullet.stepSimulation(physicsClientId=run.client)
-        if step % _CHECK_EVERY == 0:
-            reason = _breach(run)
-            if reason:
-                return reason
+        if reason := _step(run, step):
+            return reason
     return ""
 
 
@@ -163,12 +158,17 @@ def _pull(run: _Run, posture: Posture, direction: Float[np.ndarray, "3"]) -> str
         _drive(run, posture.joint_positions)
         position, _ = pybullet.getBasePositionAndOrientation(run.body, physicsClientId=run.client)
         pybullet.applyExternalForce(run.body, -1, force, position, pybullet.WORLD_FRAME, physicsClientId=run.client)
-        pybullet.stepSimulation(physicsClientId=run.client)
-        if step % _CHECK_EVERY == 0:
-            reason = _breach(run)
-            if reason:
-                return reason
+        if reason := _step(run, step):
+            return reason
     return ""
+
+
+def _step(run: _Run, step: int) -> str:
+    """One step of the simulation; every so often, why the trial is over, empty if it is not."""
+    import pybullet
+
+    pybullet.stepSimulation(physicsClientId=run.client)
+    return "" if step % _CHECK_EVERY else _breach(run)
 
 
 def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:

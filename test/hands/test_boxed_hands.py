@@ -86,6 +86,13 @@ def test_masses_are_given(hand: HandModel) -> None:
     assert 0.1 < hand.link_mass.sum() < 5.0
 
 
+def test_inertias_are_those_of_solid_bodies(hand: HandModel) -> None:
+    for inertia in hand.link_inertia:
+        a, b, c = np.linalg.eigvalsh(inertia)
+        assert a > 0
+        assert a + b >= c
+
+
 @pytest.mark.slow
 def test_a_box_is_grasped(hand: HandModel) -> None:
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="balanced")

@@ -9,32 +9,8 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.meshes import primitive_mesh
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.overlap import link_overlaps
-from graspd_core.hands.surface import dense_samples
 
 TIPS = ("fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip")
-# Origins of the fingertip links in palm_lower [m] at a share of the joint range (None: zero, clipped to the limits),
-# from the published description through pytorch-kinematics.
-GOLDEN = {
-    None: [
-        [0.08210, 0.02266, -0.01952],
-        [0.08210, -0.02279, -0.01952],
-        [0.08210, -0.06824, -0.01952],
-        [-0.08240, 0.07666, -0.00692],
-    ],
-    0.5: [
-        [0.02002, 0.02266, -0.09861],
-        [0.02002, -0.02279, -0.09861],
-        [0.02002, -0.06824, -0.09861],
-        [-0.06132, 0.04303, -0.08248],
-    ],
-    0.75: [
-        [-0.04410, 0.00822, -0.08477],
-        [-0.04410, -0.03723, -0.08477],
-        [-0.04410, -0.08268, -0.08477],
-        [-0.07388, -0.04030, -0.07664],
-    ],
-}
 # Extents of the maker's meshes in their link frames [m]: lower corner, upper corner.
 FINGER = {
     "mcp_joint": ([-0.0430, -0.0080, -0.0028], [0.0100, 0.0625, 0.0330]),
@@ -58,13 +34,6 @@ def hand() -> HandModel:
     return load_hand("leap_right")
 
 
-@pytest.mark.parametrize("share", GOLDEN)
-def test_golden_fingertips(hand: HandModel, share: float | None) -> None:
-    q = np.clip(0, hand.lower, hand.upper) if share is None else hand.lower + share * (hand.upper - hand.lower)
-    tips = link_poses(hand, q)[1][[hand.link_index[name] for name in TIPS]]
-    np.testing.assert_allclose(tips, GOLDEN[share], atol=1e-5)  # the golden values have five decimals
-
-
 def test_joints_keep_the_order_of_the_tree(hand: HandModel) -> None:
     """Names are bare numbers that do not rise along a finger; sorting them would permute the joints."""
     assert hand.joint_names == tuple(map(str, [1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11, 12, 13, 14, 15]))
@@ -76,13 +45,6 @@ def test_joints_keep_the_order_of_the_tree(hand: HandModel) -> None:
     assert hand.open_posture[0] == 0.2
 
 
-def test_inertias_are_those_of_solid_bodies(hand: HandModel) -> None:
-    for inertia in hand.link_inertia:
-        a, b, c = np.linalg.eigvalsh(inertia)
-        assert a > 0
-        assert a + b >= c
-
-
 @pytest.mark.parametrize("name", EXTENTS)
 def test_primitives_cover_the_true_extents(hand: HandModel, name: str) -> None:
     meshes = [primitive_mesh(p).vertices for p in hand.primitives_of[hand.link_index[name]]]
@@ -91,15 +53,6 @@ def test_primitives_cover_the_true_extents(hand: HandModel, name: str) -> None:
     # 0.12 mm: the extents are rounded to 0.1 mm, fingers differ by as much, and the tip's dome has inscribed facets.
     np.testing.assert_allclose(vertices.min(0), lower, atol=1.2e-4)
     np.testing.assert_allclose(vertices.max(0), upper, atol=1.2e-4)
-
-
-@pytest.mark.parametrize("posture", ["open_posture", "closed_posture"])
-def test_postures_are_within_limits_and_free_of_self_collision(hand: HandModel, posture: str) -> None:
-    q = getattr(hand, posture)
-    assert ((hand.lower <= q) & (q <= hand.upper)).all()
-    points, links, _ = dense_samples(hand, count=6000, seed=11)
-    overlap = np.where(hand.adjacent, 0.0, link_overlaps(hand, q[None], points, links)[0])
-    assert overlap.max() == 0.0
 
 
 def test_thumb_opposes_the_fingers_when_open(hand: HandModel) -> None:
