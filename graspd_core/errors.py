@@ -1,5 +1,20 @@
 """Wrong use raises one of these; failing to find a grasp is an `Outcome`, never an exception."""
 
+import reprlib
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxset = 3, 6, 6, 6, 6
+_SHORT.maxstring = _SHORT.maxother = 120
+
+
+def shown(value: object) -> str:
+    """A value for a message, short whatever it holds: by its aliases one page of YAML can stand for gigabytes."""
+    try:
+        return _SHORT.repr(value)
+    # An integer of more than 4300 digits has no decimal form.
+    except ValueError:
+        return f"a huge {type(value).__name__}"
+
 
 class GraspdError(Exception):
     """Base of every error graspd raises on purpose: one line that names the culprit and the valid choices."""
@@ -35,6 +50,10 @@ class FormatError(GraspdError):
 
 class TransformError(GraspdError):
     """Where one frame stands in another is not known, not at that time, or makes no sense."""
+
+
+class ResourceError(GraspdError):
+    """The machine has too little memory for what was asked."""
 
 
 class SimulatorError(GraspdError):

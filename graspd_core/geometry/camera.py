@@ -22,6 +22,8 @@ _Numbers = Sequence[float | int]
 # Newton's method on a smooth lens doubles its digits each round: five suffice, extreme lenses take a few more.
 _ROUNDS = 20
 _CLOSE = 1e-10
+# Of a focal length and of any other number of a calibration [pixels]: beyond them rays are no longer numbers.
+_SHORTEST, _LARGEST = 1e-2, 1e7
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class PinholeCamera:
         if self.width < 1 or self.height < 1:
             raise CloudError(f"camera: an image of {self.width} x {self.height} pixels; both must be 1 or more")
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not (np.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
+        if not (all(abs(number) <= _LARGEST for number in numbers) and min(self.fx, self.fy) >= _SHORTEST):
             raise CloudError(f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration")
         if len(self.distortion) > 8:
             raise CloudError(f"camera: {len(self.distortion)} distortion coefficients; at most 8 are understood")

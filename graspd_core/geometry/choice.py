@@ -103,7 +103,8 @@ def seen(scene: ThinScene, label: Int[np.ndarray, "voxels"]) -> str:
     if many == 0:
         return "nothing stands anywhere in the scene"
     places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, LISTED))]
-    return f"{many} things are seen, the largest about {', '.join(places)} m"
+    told = f"{many} things are seen, the largest" if many > 1 else "one thing is seen,"
+    return f"{told} about {', '.join(places)} m"
 
 
 def _nearest(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from graspd_core.errors import CloudError
 
@@ -13,6 +13,8 @@ FEWEST_POINTS = 50
 MOST_POINTS = 20_000
 # Points this many times the cloud's size away from its middle are no part of it.
 FARTHEST = 1e3
+# No camera measures what is this near to itself [m]; drivers that have no depth send that.
+AT_CAMERA = 1e-5
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,12 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
     points += position
     forward = None if cloud.forward is None else rotation @ cloud.forward
     return PointCloud(points, rotation @ cloud.viewpoint + position, forward)
+
+
+def measured(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
+    """Which points were measured: finite, and not what drivers fill gaps with: zeros, or the camera's place."""
+    filled = (points == 0).all(1) | (np.abs(points - viewpoint) < AT_CAMERA).all(1)
+    return np.isfinite(points).all(1) & ~filled
 
 
 def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> PointCloud:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,10 +12,15 @@ from graspd_core.errors import CloudError
 from graspd_core.geometry.camera import camera_from_calibration
 from graspd_core.geometry.cloud import PointCloud
 from graspd_core.geometry.depth import cloud_from_depth, depth_in_metres
+from graspd_core.geometry.point_files import read_pcd_points, read_ply_points
 
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
 _RIGID = 1e-4
+# What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
+_MOST_UNPACKED = 2**31
+# The most points that a byte of a file can hold, compressed as densely as pcd's method can.
+_MOST_POINTS_A_BYTE = 10
 
 
 def is_cloud_file(path: str | Path) -> bool:
@@ -51,7 +54,7 @@ def load_views(path: str | Path) -> tuple[PointCloud, ...]:
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
     if ending not in ("npy", "npz"):
-        return (PointCloud(_read_open3d(path), _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)),)
+        return (PointCloud(_read_points(path, ending), _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)),)
     arrays = _read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
@@ -77,8 +80,10 @@ def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
     if not np.isfinite(viewpoint).all():
         raise CloudError("'viewpoint' is NaN or infinite")
     if forward is not None:
-        if forward.shape != (3,) or not 0 < np.linalg.norm(forward) < np.inf:
+        largest = np.abs(forward).max(initial=0.0)
+        if forward.shape != (3,) or not 0 < largest < np.inf:
             raise CloudError("'forward' is no direction; 3 finite numbers are needed, not all zero")
+        forward = forward / largest
         forward = forward / np.linalg.norm(forward)
     return PointCloud(points, viewpoint, forward)
 
@@ -112,15 +117,17 @@ def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
 
 def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
     if image.dtype.kind in "iu":
-        return depth_in_metres(image.clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
+        return depth_in_metres(image.astype(float).clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
     if image.dtype.kind == "f":
-        return depth_in_metres(image.astype(np.float32), "32FC1")
+        # What is too far for a number of 32 bits is infinitely far, which means no depth.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return depth_in_metres(image.astype(np.float32), "32FC1")
     raise CloudError(f"{name!r} holds {image.dtype}; integers (mm) or floats (m) are needed")
 
 
 def _rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
-    pose = pose.astype(float)
-    turn = pose[:3, :3]
+    pose = _numbers({name: pose}, name)
+    turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
     square = np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
     if not (np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1))):
         raise CloudError(
@@ -130,10 +137,11 @@ def _rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    try:
+    if arrays[name].dtype.kind not in "biuf":
+        raise CloudError(f"{name!r} not readable as numbers: it holds {str(arrays[name].dtype)[:80]}")
+    # A NaN of any kind stays one: numpy would warn of those that signal.
+    with np.errstate(invalid="ignore", over="ignore"):
         return arrays[name].astype(float)
-    except ValueError as error:
-        raise CloudError(f"{name!r} not readable as numbers ({error})") from None
 
 
 def _read_numpy(path: Path) -> dict[str, np.ndarray]:
@@ -144,10 +152,14 @@ def _read_numpy(path: Path) -> dict[str, np.ndarray]:
             stored = np.load(file, allow_pickle=False)
             if isinstance(stored, np.ndarray):
                 return {"points": stored}
+            unpacked = sum(entry.file_size for entry in stored.zip.infolist())
+            if unpacked > _MOST_UNPACKED:
+                raise ValueError(f"{unpacked} bytes when unpacked; at most {_MOST_UNPACKED} are taken")
             return {name: stored[name] for name in stored.files}
-    # A spoilt archive shows as any of these: numpy lets the errors of its zip reader through.
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise CloudError(f"{path}: not readable as numbers ({str(error).splitlines()[0]})") from error
+    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals;
+    # one whose header promises more than there is as a lack of memory.
+    except Exception as error:
+        raise CloudError(f"{path}: not readable as numbers ({_first_line(error)})") from error
 
 
 def _ply_has_faces(path: Path) -> bool:
@@ -171,12 +183,49 @@ def _pcd_viewpoint(path: Path) -> Float[np.ndarray, "3"]:
     return place
 
 
-def _read_open3d(path: Path) -> np.ndarray:
+def _read_points(path: Path, ending: str) -> Float[np.ndarray, "n 3"]:
+    points = None
+    try:
+        if ending == "ply":
+            points = read_ply_points(path)
+        elif ending == "pcd":
+            points = read_pcd_points(path)
+    except (ValueError, TypeError, OSError) as error:
+        raise CloudError(f"{path}: not a readable {ending} cloud ({_first_line(error)})") from error
+    points = _read_open3d(path) if points is None else points
+    if len(points) == 0:
+        raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
+    return points
+
+
+def _read_open3d(path: Path) -> Float[np.ndarray, "n 3"]:
     import open3d as o3d
 
+    _refuse_empty_promise(path)
     # Open3D prints its complaints and returns nothing; the error below says it once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
-    if len(cloud.points) == 0:
-        raise CloudError(f"{path}: empty, or not a readable {path.suffix.lstrip('.')} cloud")
-    return np.array(cloud.points)
+        try:
+            cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+        except (MemoryError, RuntimeError) as error:
+            raise CloudError(f"{path}: not a readable cloud ({_first_line(error)})") from error
+    return np.array(cloud.points).reshape(-1, 3)
+
+
+def _refuse_empty_promise(path: Path) -> None:
+    """Raise CloudError where a header promises more points, or larger ones, than the file can hold.
+
+    Open3D makes room for them before it looks: of a file of a hundred bytes a machine runs out of memory.
+    """
+    with path.open("rb") as file:
+        header = file.read(4096)
+    size = path.stat().st_size
+    for line in header.replace(b"\r", b"\n").splitlines():
+        words = line.split()
+        if words[:1] in ([b"POINTS"], [b"WIDTH"], [b"HEIGHT"], [b"COUNT"], [b"SIZE"]):
+            promised = max((abs(int(word)) for word in words[1:] if word.lstrip(b"+-").isdigit()), default=0)
+            if promised > _MOST_POINTS_A_BYTE * size:
+                raise CloudError(f"{path}: its header promises {promised} points or bytes, in a file of {size} bytes")
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__

@@ -178,8 +178,7 @@ def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
 
 def _distance(sdf: GridSDF, points: Points) -> Float[np.ndarray, "_"]:
     """φ alone, which is all that is asked here and a quarter of `sample_sdf`'s work."""
-    half = 0.5 * (sdf.field.shape[1] - 1) * sdf.spacing
-    unit = (torch.as_tensor(points, dtype=sdf.field.dtype) - sdf.origin) / half - 1
+    unit = (torch.as_tensor(points, dtype=sdf.field.dtype) - sdf.origin) / sdf.half - 1
     field = sdf.field[None, :1].permute(0, 1, 4, 3, 2)
     return grid_sample(field, unit[None, None, None], align_corners=True, padding_mode="border").flatten().numpy()
 

@@ -17,6 +17,8 @@ from jaxtyping import Float, Int
 from graspd_core.types import TriangleMesh
 
 _MOST_NODES = 4000
+# A page of nodes can show a geometry many times over.
+_MOST_FACES = 20_000_000
 _FACES = ("triangles", "polylist", "polygons")
 
 
@@ -28,12 +30,25 @@ def read_dae(path: Path) -> TriangleMesh:
         OSError: it cannot be read.
     """
     data = path.read_bytes()
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise ValueError("a document type declaration is refused")
     try:
-        root = ET.fromstring(data)
-    except ET.ParseError as error:
+        root = ET.fromstring(data, parser=ET.XMLParser(target=_Builder()))
+        # What is too large for a float or an integer is found below, where numbers and indices are checked.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _joined(root)
+    except (ET.ParseError, LookupError) as error:
         raise ValueError(f"not well-formed XML: {error}") from error
+    except OverflowError as error:
+        raise ValueError(f"a number is too large: {error}") from error
+
+
+class _Builder(ET.TreeBuilder):
+    """Builds the tree, and refuses what could define entities, in whichever encoding it is written."""
+
+    def doctype(self, *_: object) -> None:
+        raise ValueError("a document type declaration is refused")
+
+
+def _joined(root: ET.Element) -> TriangleMesh:
     for element in root.iter():
         element.tag = str(element.tag).rpartition("}")[2]
     if root.tag != "COLLADA":
@@ -45,7 +60,15 @@ def read_dae(path: Path) -> TriangleMesh:
         placed = _instances(root.findall("library_visual_scenes/visual_scene/node"), named)
     else:
         placed = [(np.eye(4), geometry) for geometry in root.findall("library_geometries/geometry")]
-    parts = [_surface(geometry, pose, named) for pose, geometry in placed]
+    surfaces: dict[ET.Element, tuple[np.ndarray, np.ndarray]] = {}
+    parts, count = [], 0
+    for pose, geometry in placed:
+        if geometry not in surfaces:
+            surfaces[geometry] = _surface(geometry, named)
+        count += max(map(len, surfaces[geometry]))
+        if count > _MOST_FACES:
+            raise ValueError(f"shows more than {_MOST_FACES} faces or vertices")
+        parts.append(_placed(*surfaces[geometry], pose))
     vertices = np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in parts)]) * scale
     starts = np.cumsum([0, *(len(corners) for corners, _ in parts)])
     faces = [part + start for (_, part), start in zip(parts, starts, strict=False)]
@@ -100,9 +123,11 @@ def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
 
 
 def _surface(
-    geometry: ET.Element, pose: np.ndarray, named: dict[str, ET.Element]
+    geometry: ET.Element, named: dict[str, ET.Element]
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Vertices and faces of a geometry in its own frame; parts that share vertices share them here too."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    known: dict[ET.Element, tuple[int, int]] = {}
     for element in geometry.iterfind("mesh/*"):
         if element.tag not in _FACES:
             continue
@@ -111,7 +136,12 @@ def _surface(
         corner = next((entry for entry in inputs if entry.get("semantic") == "VERTEX"), None)
         if corner is None:
             raise ValueError(f"<{element.tag}> has no VERTEX input")
-        positions = _positions(_target(named, corner.get("source")), named)
+        shared = _target(named, corner.get("source"))
+        if shared not in known:
+            vertices.append(_positions(shared, named))
+            known[shared] = count, len(vertices[-1])
+            count += len(vertices[-1])
+        start, available = known[shared]
         offset = int(corner.get("offset", "0"))
         loops = [np.array((p.text or "").split(), dtype=np.int64)[offset::stride] for p in element.findall("p")]
         indices = np.concatenate([np.zeros(0, dtype=np.int64), *loops])
@@ -121,14 +151,20 @@ def _surface(
             sides = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
         else:
             sides = np.array([len(loop) for loop in loops], dtype=np.int64)
-        if sides.sum() > len(indices) or (len(indices) and not 0 <= indices.min() <= indices.max() < len(positions)):
+        # Each count for itself: the sum of absurd ones could come round to a small number.
+        few = not (sides < 0).any() and (sides <= len(indices)).all() and sides.sum() <= len(indices)
+        if not few or (len(indices) and not 0 <= indices.min() <= indices.max() < available):
             raise ValueError(f"<{element.tag}> names vertices that are not there")
-        faces.append(_fans(indices, sides) + count)
-        vertices.append(positions)
-        count += len(positions)
-    corners = np.concatenate(vertices) @ pose[:3, :3].T + pose[:3, 3]
-    joined = np.concatenate(faces)
-    return corners, joined[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else joined
+        faces.append(_fans(indices, sides) + start)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _placed(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], pose: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """A surface moved by a pose, turned over where that mirrors."""
+    corners = vertices @ pose[:3, :3].T + pose[:3, 3]
+    return corners, faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else faces
 
 
 def _positions(vertices: ET.Element, named: dict[str, ET.Element]) -> Float[np.ndarray, "vertices 3"]:

@@ -30,6 +30,11 @@ class Surface:
     hierarchy: Any
 
 
+def load_library() -> None:
+    """Import Open3D, which takes seconds the first time: where the time is nobody's, not within a deadline."""
+    import open3d  # noqa: F401
+
+
 def make_surface(mesh: TriangleMesh) -> Surface:
     """Prepare a mesh: a few milliseconds."""
     import open3d as o3d

@@ -72,7 +72,9 @@ def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]
     points = np.empty((height, width, 3))
     for axis, (dtype, offset) in enumerate(places):
         strides = (layout.row_step, layout.point_step)
-        points[..., axis] = np.ndarray((height, width), dtype, layout.data, offset, strides)
+        # A NaN of any kind stays one: numpy would warn of those that signal.
+        with np.errstate(invalid="ignore"):
+            points[..., axis] = np.ndarray((height, width), dtype, layout.data, offset, strides)
     return points
 
 

@@ -11,6 +11,7 @@ import torch
 from graspd_core.errors import MeshError
 from graspd_core.geometry.choice import Target
 from graspd_core.geometry.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.geometry.embree import load_library
 from graspd_core.geometry.mesh import MESH_ENDINGS, load_mesh
 from graspd_core.geometry.perceive import scene_from_views
 from graspd_core.geometry.scene import Scene, build_scene, refuse_numbers
@@ -38,7 +39,7 @@ def load_scene(
         mass: [kg]; None takes 300 kg/m³ times the volume.
         friction: Coulomb coefficient between hand and object.
         scale: factor on the file's coordinates to make them metres.
-        resolution: nodes along each axis of the distance grid.
+        resolution: the distance grid has at most the cube of it in nodes.
         target: which of the things in a cloud is meant.
         alone: a cloud shows the object and nothing else.
 
@@ -57,6 +58,8 @@ def load_scene(
         scene = scene_from_views(views, target=target, alone=alone, source=given, device=device, **numbers)
         return replace(scene, object=replace(scene.object, scale=scale))
     mesh = _read_mesh(source, scale)
+    # A distance grid that is remembered needs no Open3D, but the plan does.
+    load_library()
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, **numbers)
 
 

@@ -20,16 +20,11 @@ from graspd_core.geometry.topology import (
     merge_vertices,
     orient,
 )
+from graspd_core.geometry.units import LARGE, LARGEST, SMALL, SMALLEST, unit_advice
 from graspd_core.geometry.winding import winding_inside
 from graspd_core.types import TriangleMesh
 
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
-
-# The largest extent a mesh may have [m]: what lies outside is a mistake of units, not a thing to grasp.
-SMALLEST, LARGEST = 0.002, 2.0
-
-# Units that a file in the wrong ones is likely in, for the guess in the message.
-UNITS = {"mm": ("millimetres", 1e-3), "cm": ("centimetres", 1e-2)}
 
 # Points for the volume of a mesh that is not one closed body: about 1 % of volume, 0.3 s. A Sobol sequence, because a
 # lattice aligned with a wall counts its layers wrong; it is evenest at powers of two.
@@ -64,33 +59,38 @@ def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
 
 
-def check_mesh(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tuple[str, ...]]:
+def check_mesh(mesh: TriangleMesh, source: str, most_faces: int | None = None) -> tuple[TriangleMesh, tuple[str, ...]]:
     """A cleaned mesh and what was found wrong with it, one sentence each.
 
     Merges coincident vertices, drops degenerate and repeated faces, and makes neighbouring faces wind alike.
     Position and scale are left alone.
 
+    Args:
+        most_faces: a mesh of more is simplified to about this many.
+
     Raises:
         MeshError: no usable faces, vertices that are not finite, or an extent outside 2 mm to 2 m.
     """
     _refuse_unusable(mesh, source)
-    _refuse_size(mesh, source)
-    warnings: list[str] = []
-    vertices, faces = merge_vertices(mesh)
-    distinct = drop_degenerate(vertices, faces)
-    if len(distinct) < len(faces):
-        warnings.append(f"{source}: dropped {len(faces) - len(distinct)} faces without area")
-    unique = drop_repeated(distinct)
-    if len(unique) < len(distinct):
-        warnings.append(f"{source}: dropped {len(distinct) - len(unique)} repeated faces")
-    if len(unique) == 0:
-        raise MeshError(f"{source}: no face has an area; a triangle mesh with a surface is needed")
-    if not is_oriented(unique):
-        unique = orient(vertices, unique)
+    warnings = _doubted_size(mesh, source)
+    mesh, dropped, repeated = _distinct(mesh, source)
+    if dropped:
+        warnings.append(f"{source}: dropped {dropped} faces without area")
+    if repeated:
+        warnings.append(f"{source}: dropped {repeated} repeated faces")
+    # Before any question about neighbours: a million faces take seconds for each.
+    given = mesh
+    if most_faces is not None and len(mesh.faces) > most_faces:
+        warnings.append(f"{source}: simplified from {len(mesh.faces)} to {most_faces} faces")
+        mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
+    faces = mesh.faces
+    if not is_oriented(faces):
+        faces = orient(mesh.vertices, faces)
         warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
-    used, compact = np.unique(unique, return_inverse=True)
-    clean = TriangleMesh(vertices[used], compact.reshape(-1, 3))
-    if not is_closed(clean):
+    used, compact = np.unique(faces, return_inverse=True)
+    clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
+    # Simplifying can tear a surface; that is no fault of the input, and the winding number bears it.
+    if not is_closed(clean) and not is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
     return clean, tuple(warnings)
 
@@ -165,6 +165,8 @@ def _read(path: Path):
     # The readers behind trimesh raise whatever their format's parser does, from KeyError to struct.error.
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error, IndexError) and "out of bounds" in reason:
+            reason = f"a face names a vertex that the file does not hold: {reason}"
         raise MeshError(f"{path}: not a readable {path.suffix.lstrip('.')} mesh ({reason})") from error
     return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
 
@@ -189,17 +191,28 @@ def _refuse_unusable(mesh: TriangleMesh, source: str) -> None:
         raise MeshError(f"{source}: faces name vertices outside 0 to {len(mesh.vertices) - 1}")
 
 
-def _refuse_size(mesh: TriangleMesh, source: str) -> None:
-    used = mesh.vertices[np.unique(mesh.faces)]
-    size = float((used.max(0) - used.min(0)).max())
-    if SMALLEST <= size <= LARGEST:
-        return
-    advice = "pass --scale"
-    if size > LARGEST:
-        # A graspable thing is some 15 cm across: the unit that brings it nearest to that is the likeliest.
-        unit = min(UNITS, key=lambda name: abs(np.log(size * UNITS[name][1] / 0.15)))
-        advice = f"if the file is in {UNITS[unit][0]} pass --units {unit}"
-    raise MeshError(f"{source}: {size:.4g} m across, outside {SMALLEST} to {LARGEST} m; {advice}")
+def _doubted_size(mesh: TriangleMesh, source: str) -> list[str]:
+    """A warning where a size is odd, none where it is usual, and MeshError where it is absurd."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    size = float(np.ptp(mesh.vertices[used], axis=0).max())
+    if not SMALLEST <= size <= LARGEST:
+        advice = unit_advice(size) if size > 0 else "its vertices all lie in one point"
+        raise MeshError(f"{source}: {size:.4g} m across, outside {SMALLEST} to {LARGEST} m; {advice}")
+    if SMALL <= size <= LARGE:
+        return []
+    odd = "large" if size > LARGE else "small"
+    return [f"{source}: {size:.3g} m across, {odd} for a hand; if the file is not in metres, {unit_advice(size)}"]
+
+
+def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
+    """Coincident vertices merged and degenerate and repeated faces dropped, and how many of each."""
+    vertices, faces = merge_vertices(mesh)
+    distinct = drop_degenerate(vertices, faces)
+    unique = drop_repeated(distinct)
+    if len(unique) == 0:
+        raise MeshError(f"{source}: no face has an area; a triangle mesh with a surface is needed")
+    return TriangleMesh(vertices, unique), len(faces) - len(distinct), len(distinct) - len(unique)
 
 
 def _moments(

@@ -38,7 +38,7 @@ def scene_from_views(
         mass: [kg]; None takes 300 kg/m³ times the volume.
         friction: Coulomb coefficient between hand and object.
         source: name of the views, for messages.
-        resolution: nodes along each axis of the distance grid.
+        resolution: the distance grid has at most the cube of it in nodes.
 
     Raises:
         CloudError: the views show no usable object; NoObjectError where what was asked for is not in them.

@@ -57,7 +57,8 @@ def join_pieces(
     ]
     owner = list(range(many))
     for a, b in combinations(small, 2):
-        if extent(np.vstack([pieces[a], pieces[b]])) > largest:
+        group = [pieces[k] for k in small if owner[k] in (owner[a], owner[b])]
+        if owner[a] == owner[b] or extent(np.vstack(group)) > largest:
             continue
         reach = UNSUPPORTED if support is None else HANGING if hangs[a] or hangs[b] else link
         one = _apart(pieces[a], pieces[b]) <= reach

@@ -96,10 +96,15 @@ def find_planes(
     for _ in range(most):
         if len(left) < max(50, (smallest / 0.02) ** 2):
             break
-        o3d.utility.random.seed(0)
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
-        guess, close = cloud.segment_plane(COARSE, 3, RANSAC_TRIALS)
-        part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), least)
+        part, close = None, []
+        # A step in a table lies within the wide gate, which then takes both levels for one slope.
+        for gate in (COARSE, min(least, 0.5 * COARSE)):
+            o3d.utility.random.seed(0)
+            guess, close = cloud.segment_plane(gate, 3, RANSAC_TRIALS)
+            part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), least, gate)
+            if part is not None:
+                break
         if part is not None and part.sides[1] >= smallest:
             parts.append(part)
             left = left[~part.inliers[left]]
@@ -115,6 +120,7 @@ def _refine(
     guess: Float[np.ndarray, "4"],
     viewpoint: Float[np.ndarray, "3"],
     least: float,
+    gate: float,
 ) -> FlatPart | None:
     """Weighted least squares over points that the last fit calls near; None where too few are."""
     size = float(np.linalg.norm(guess[:3]))
@@ -122,11 +128,11 @@ def _refine(
         return None
     normal, offset = guess[:3] / size, -float(guess[3]) / size
     near, far = points[left], distance[left] ** 2
-    coarse = gate = COARSE * far.clip(1.0)
+    coarse = width = gate * far.clip(1.0)
     noise = 0.0
     for step in range(4):
         residual = near @ normal - offset
-        inlier = np.abs(residual) < gate
+        inlier = np.abs(residual) < width
         if inlier.sum() < 20:
             return None
         weight = 1.0 / far[inlier].clip(1e-4) ** 2
@@ -138,10 +144,10 @@ def _refine(
         residual = np.abs(near[inlier] @ normal - offset)
         noise = 1.4826 * float(np.median(residual / far[inlier].clip(1e-4)))
         runs_away = DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > WIDENED
-        if runs_away or (step == 0 and np.median(residual / gate[inlier]) > GATHERED):
+        if runs_away or (step == 0 and np.median(residual / width[inlier]) > GATHERED):
             return None
         # Tighter than the tolerance: the feet of what stands on it would tilt it.
-        gate = np.clip(FITTED * noise * far, 0.25 * least, WIDEST)
+        width = np.clip(FITTED * noise * far, 0.25 * least, WIDEST)
     if normal @ viewpoint < offset:
         normal, offset = -normal, -offset
     inliers = np.zeros(len(points), dtype=bool)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.geometry.allround import is_all_round, orient_all_round
-from graspd_core.geometry.cloud import PointCloud, clean_cloud
+from graspd_core.geometry.cloud import PointCloud, clean_cloud, measured
 from graspd_core.geometry.complete import OPEN, complete
 from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.embree import make_surface, surface_distance
@@ -99,13 +99,12 @@ def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
         if not np.isfinite(view.viewpoint).all():
             raise CloudError("cloud: the place of a view's camera (viewpoint) is not finite")
     most = MOST_POINTS // len(views)
-    kept = [view.points[:: 1 + len(view.points) // most].astype(float) for view in views]
+    kept = [_some(view, most) for view in views]
     clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
     tree = KDTree(clean.points)
     near = 3 * float(np.median(tree.query(clean.points, k=2)[0][:, 1]))
     result = []
     for points, view in zip(kept, views, strict=True):
-        points = points[np.isfinite(points).all(1)]
         points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
         # Among a thousand: one place sent often is no surface, and its sight would call all else empty.
         if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > NEIGHBOURS:
@@ -113,6 +112,13 @@ def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
     if not result:
         raise CloudError(f"cloud: none of its {len(views)} views shows more than {NEIGHBOURS} points of the object")
     return result
+
+
+def _some(view: PointCloud, most: int) -> Float[np.ndarray, "n 3"]:
+    """A view's measured points, some `most` of them at most; where none is, all, for the message that says so."""
+    points = view.points[:: 1 + len(view.points) // most].astype(float)
+    good = measured(points, view.viewpoint)
+    return points[good] if good.any() else points
 
 
 def _frame(

@@ -1,8 +1,4 @@
-"""Bodies of revolution: the axis from the normals, and the seen profile turned about it.
-
-The normals of such a body all meet its axis: with p and n a point and its normal, the axis through c along a obeys
-n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001).
-"""
+"""Bodies of revolution: the seen profile turned about the axis, and what closes it."""
 
 from __future__ import annotations
 
@@ -11,27 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.geometry.axis import FEWEST, Axis, fit_axis, half_plane, meeting_direction, settle_axis, turned
 from graspd_core.geometry.directions import perpendicular
 from graspd_core.geometry.evidence import Evidence, weigh
 from graspd_core.geometry.fuse import Surfels
 from graspd_core.geometry.symmetry import UP, WEIGHT
 
-# Normals that pass the axis by more than this share of their direction are of something else: a handle, a spout.
-ASKEW = 0.3
 # Places around the axis that each ring of the profile is judged at, and the share of them that may contradict it.
 TURNS, BROKEN = 24, 0.15
+# Cosine of the tilt below which a body that stands is upright.
+UPRIGHT = 0.985
+# Without a support the first camera looks down on things: up is towards it.
+ACROSS = np.array([1.0, 0.0, 0.0])
 
 
 # Height along the axis and distance from it [m], then the normal's part along and away from it.
 Rows = Float[np.ndarray, "_ 4"]
-
-
-@dataclass(frozen=True)
-class Axis:
-    """A line: a point on it [m] and its unit direction."""
-
-    point: Float[np.ndarray, "3"]
-    direction: Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
@@ -53,63 +44,36 @@ class Revolution:
 
 def find_revolution(surfels: Surfels, evidence: Evidence, step: float) -> Revolution | None:
     """The revolution that shows most: about an upright axis, if the object stands, or one that all normals meet."""
-    direction = _meeting(surfels)
-    directions = [direction]
-    if evidence.standing:
-        directions.append(UP)
-    else:
-        # A ball has all axes: one across the view shows its back.
-        side = np.cross(direction, UP)
-        directions += [np.array([1.0, 0.0, 0.0])] if np.linalg.norm(side) < 0.3 else []
-    found = [revolve(surfels, evidence, fit_axis(surfels, d), step) for d in directions]
+    met = meeting_direction(surfels)
+    # A ball has all axes: one across the view shows its back.
+    axes = [fit_axis(surfels, UP if evidence.standing else ACROSS)]
+    # What nearly stands upright does: the support is known better than any axis.
+    if not evidence.standing or abs(met @ UP) < UPRIGHT:
+        axes.append(settle_axis(surfels, fit_axis(surfels, met), step))
+    found = [revolve(surfels, evidence, axis, step) for axis in axes]
     good = [f for f in found if f is not None]
     return max(good, key=lambda f: f.share + 4 * f.agree * (1 - f.agree) - WEIGHT * f.wrong) if good else None
 
 
-def fit_axis(surfels: Surfels, direction: Float[np.ndarray, "3"]) -> Axis:
-    """The line of that direction that the normals pass nearest to, those that miss it by far left out."""
-    centre = surfels.points.mean(0)
-    points, normals = surfels.points - centre, surfels.normals
-    turning = np.cross(points, normals) @ direction
-    # n·(c × a) = c·(a × n)
-    lever = np.cross(direction, normals)
-    weights = np.ones(len(points))
-    size = float(np.abs(points).max())
-    place = np.zeros(3)
-    for round_ in range(12):
-        system = (lever * weights[:, None]).T @ lever + 1e-3 * np.outer(direction, direction) * len(points)
-        system += 1e-6 * len(points) * np.eye(3)
-        place = -np.linalg.solve(system, lever.T @ (weights * turning))
-        miss = turning + lever @ place
-        scale = max(0.3 * size / 1.6**round_, 0.002)
-        weights = 1.0 / (1.0 + np.square(miss / scale)) ** 2
-    return Axis(centre + place, direction)
-
-
 def revolve(surfels: Surfels, evidence: Evidence, axis: Axis, step: float) -> Revolution | None:
     """The seen profile turned about the axis; rings that the cameras contradict are left out."""
-    offset = surfels.points - axis.point
-    height = offset @ axis.direction
-    outward = offset - np.outer(height, axis.direction)
-    radius = np.linalg.norm(outward, axis=1)
-    outward /= np.maximum(radius, 1e-9)[:, None]
-    along, across = surfels.normals @ axis.direction, (surfels.normals * outward).sum(1)
-    fits = (along**2 + across**2 > 1 - ASKEW**2) & (radius > 0.5 * step)
-    if fits.sum() < 30:
+    _, rows = half_plane(surfels, axis)
+    fits = turned(rows, step)
+    if fits.sum() < FEWEST:
         return None
-    profile = _profile(np.column_stack([height, radius, along, across])[fits], step)
+    profile = _profile(rows[fits], step)
     right = perpendicular(axis.direction)
     up = np.cross(axis.direction, right)
     judged = _ring(profile, axis, right, up, np.full(len(profile), TURNS))
-    rows = np.repeat(np.arange(len(profile)), TURNS)
+    row = np.repeat(np.arange(len(profile)), TURNS)
     confirmed, wrong = weigh(evidence, judged.points, judged.normals)
-    good = np.bincount(rows, wrong) / TURNS < BROKEN
+    good = np.bincount(row, wrong) / TURNS < BROKEN
     if good.sum() < 5:
         return None
     weight = profile[:, 1] / profile[good, 1].sum()
-    kept = good[rows]
-    mean = lambda x: float((x * weight[rows] / TURNS)[kept].sum())  # noqa: E731
-    explained = _explained(profile[good], height, radius, step)
+    kept = good[row]
+    mean = lambda x: float((x * weight[row] / TURNS)[kept].sum())  # noqa: E731
+    explained = _explained(profile[good], rows[:, :2], step)
     closed = np.vstack([profile[good], *_ends(profile[good], axis, right, up, evidence, step)])
     counts = np.maximum(np.ceil(2 * np.pi * closed[:, 1] / step), 3).astype(int)
     return Revolution(axis, _ring(closed, axis, right, up, counts), mean(confirmed), mean(wrong), explained)
@@ -170,25 +134,6 @@ def _both(surfels: Surfels):
     return surfels.points, surfels.normals
 
 
-def _meeting(surfels: Surfels) -> Float[np.ndarray, "3"]:
-    """The direction of the line that all normals meet best, by iterated weights."""
-    centre = surfels.points.mean(0)
-    size = float(np.abs(surfels.points - centre).max())
-    points = (surfels.points - centre) / size
-    lines = np.column_stack([np.cross(points, surfels.normals), surfels.normals])
-    weights = np.ones(len(points))
-    direction = np.zeros(3)
-    for _ in range(10):
-        system = (lines * weights[:, None]).T @ lines / weights.sum()
-        moment = system[3:, 3:] + 1e-4 * np.eye(3)
-        reduced = system[:3, :3] - system[:3, 3:] @ np.linalg.solve(moment, system[3:, :3])
-        direction = np.linalg.eigh(reduced)[1][:, 0]
-        place = -np.linalg.solve(moment, system[3:, :3] @ direction)
-        miss = lines @ np.concatenate([direction, place])
-        weights = 1.0 / (1.0 + np.square(miss / 0.05))
-    return direction
-
-
 def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "m 4"]:
     """Means over cells of height, radius and the side they face."""
     side = np.where(np.abs(rows[:, 2]) > np.abs(rows[:, 3]), 2 + (rows[:, 2] > 0), rows[:, 3] > 0)
@@ -213,9 +158,9 @@ def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
     return Surfels(points, normals)
 
 
-def _explained(profile, height, radius, step: float) -> float:
+def _explained(profile: Rows, places: Float[np.ndarray, "n 2"], step: float) -> float:
     """Share of points that lie on the profile."""
     from scipy.spatial import KDTree
 
-    distance, _ = KDTree(profile[:, :2]).query(np.column_stack([height, radius]))
+    distance, _ = KDTree(profile[:, :2]).query(places)
     return float((distance < 2 * step).mean())

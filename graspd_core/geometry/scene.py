@@ -12,14 +12,15 @@ from jaxtyping import Float
 from graspd_core.errors import MeshError
 from graspd_core.geometry import cache
 from graspd_core.geometry.convex import convex_parts
-from graspd_core.geometry.mesh import check_mesh, content_hash, mass_properties, simplify
+from graspd_core.geometry.mesh import check_mesh, content_hash, mass_properties
 from graspd_core.geometry.own_process import elsewhere
-from graspd_core.geometry.sdf import GridSDF, build_sdf, is_solid
+from graspd_core.geometry.sdf import GridSDF, build_sdf, grid_layout, is_solid
+from graspd_core.geometry.specks import without_specks
 from graspd_core.geometry.trust import trust_grid
 from graspd_core.types import Plane, TriangleMesh
 
-# Faces beyond this add nothing that a 48³ grid or a hand could feel, and cost build time.
-MOST_FACES = 50_000
+# Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.
+MOST_FACES = 25_000
 
 # Mean density of household things [kg/m³], for callers that know no mass: between wood-like solids and hollow ware.
 DENSITY = 300.0
@@ -119,16 +120,17 @@ def build_scene(
         raise MeshError(f"{source}: {len(trust)} values of trust for {len(mesh.vertices)} vertices; valid: one each")
     started = time.perf_counter() if started is None else started
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
-    clean, found = check_mesh(mesh, source)
-    if len(clean.faces) > MOST_FACES:
-        found += (f"{source}: simplified from {len(clean.faces)} to {MOST_FACES} faces",)
-        clean, _ = check_mesh(simplify(clean, MOST_FACES), source)
+    clean, found = check_mesh(mesh, source, MOST_FACES)
+    if trust is None:
+        clean, specks = without_specks(clean)
+        if specks:
+            found += (f"{source}: dropped {specks} tiny pieces that float clear of the rest",)
     model = _object_model(clean, source, mass, friction, scale, warnings + found)
     loaded = time.perf_counter()
     sdf = object_sdf(model, resolution)
     if not is_solid(sdf):
         cell = float(sdf.spacing) * 1000
-        note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; distances are unsigned"
+        note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; it counts as a sheet"
         model = ObjectModel(**{**vars(model), "warnings": (*model.warnings, note)})
     sdf = sdf.to(device, sdf.field.dtype)
     known = None if trust is None else trust_grid(mesh.vertices, trust, sdf)
@@ -137,21 +139,23 @@ def build_scene(
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
-    """The object's signed distance (float32, CPU), remembered by content."""
+    """The object's signed distance (float32, CPU) on at most `resolution`³ nodes, remembered by content."""
 
     def build() -> cache.Arrays:
         sdf = build_sdf(model.mesh, resolution=resolution)
-        return {"field": sdf.field.numpy(), "origin": sdf.origin.numpy(), "spacing": sdf.spacing.numpy()}
+        return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
 
     def valid(arrays: cache.Arrays) -> bool:
-        return {name: array.shape for name, array in arrays.items()} == {
-            "field": (4, resolution, resolution, resolution),
+        shapes = {
+            "field": (4, *grid_layout(model.mesh, resolution).counts),
             "origin": (3,),
             "spacing": (),
+            "half": (3,),
         }
+        return {name: array.shape for name, array in arrays.items()} == shapes
 
     arrays = cache.remember(f"sdf-{model.sha256}-{resolution}", build, valid)
-    return GridSDF(*(torch.as_tensor(arrays[name]) for name in ("field", "origin", "spacing")))
+    return GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()})
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:

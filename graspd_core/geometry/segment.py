@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentConfig
 from graspd_core.errors import CloudError, NoObjectError
+from graspd_core.geometry.border import reaches_border
 from graspd_core.geometry.choice import Target, check_target, choose, seen
 from graspd_core.geometry.cloud import FEWEST_POINTS, PointCloud
 from graspd_core.geometry.clusters import extent, link_length, link_points, renumber
@@ -18,6 +19,9 @@ from graspd_core.geometry.planes import find_planes
 from graspd_core.geometry.support import Ground, find_ground, stands_on, voxels_of
 from graspd_core.geometry.thinning import ThinScene, thin_scene
 from graspd_core.types import Plane
+
+# Scenes nearer than this to their cameras are in another unit than metres [m].
+CLOSEST = 0.02
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ def segment(
     ground = find_ground(scene, parts, eyes, settings)
     label = _things(scene, ground, eyes, settings)
     free = _candidates(scene, label, ground, settings)
-    if not free:
+    marked = target.box is not None or target.mask is not None
+    if not free and not (marked and label.max(initial=-1) >= 0):
         raise NoObjectError(_nothing(scene, label, ground, settings))
     chosen = choose(scene, label, free, target, views, reach=settings.target_reach)
     found = _cut_out(views, scene, chosen, ground)
@@ -71,7 +76,7 @@ def segment(
         raise CloudError(f"cloud: only {total} points show the object; at least {FEWEST_POINTS} are needed")
     support = None if ground.support is None else ground.support.plane
     neighbours = _neighbours(scene, label, chosen, ground, settings)
-    return Segmentation(found, support, neighbours, _doubts(scene, chosen, ground, bool(neighbours), settings))
+    return Segmentation(found, support, neighbours, _doubts(scene, eyes, chosen, ground, bool(neighbours), settings))
 
 
 def _things(
@@ -155,6 +160,7 @@ def _neighbours(
 
 def _doubts(
     scene: ThinScene,
+    eyes: Float[np.ndarray, "views 3"],
     chosen: Bool[np.ndarray, "voxels"],
     ground: Ground,
     crowded: bool,
@@ -166,8 +172,17 @@ def _doubts(
         doubts.append(
             f"cloud: {len(scene.points)} points thinned by {1e3 * scene.size:.1f} mm; finer gaps are not seen"
         )
+    blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
+    if blind:
+        doubts.append(f"cloud: of {len(scene.rows)} views these show nothing near enough: {', '.join(blind)}")
     if ground.support is None and crowded:
         doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken as part")
+    # A thing alone makes the outline itself.
+    surrounded = ground.support is not None or len(ground.background) > 0
+    for k in range(len(scene.rows) if surrounded else 0):
+        part = scene.of_view(k)
+        if reaches_border(scene.points[part], eyes[k], chosen[scene.voxel[part]]):
+            doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
     return tuple(doubts)
@@ -186,11 +201,17 @@ def _cut_off(scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], settings: Seg
 def _nothing(scene: ThinScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentConfig) -> str:
     """What was seen instead of an object."""
     if label.max(initial=-1) >= 0:
+        sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
         told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
-        return f"{told}, and each is larger than largest_object={settings.largest_object:g} m"
+        each = f"{sizes[0]:.2f} m long:" if len(sizes) == 1 else f"the shortest {min(sizes):.2f} m long: each is"
+        limit = f"larger than largest_object={settings.largest_object:g} m"
+        return f"{told}, {each} {limit}; a box or a mask as target says what part is meant"
     flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
     if not flat:
-        return f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        near = float(np.median(scene.mean_distance))
+        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
+        return told + unit if near < CLOSEST else told
     part = flat[0]
     away = float(np.median(scene.mean_distance[part.inliers]))
     return (

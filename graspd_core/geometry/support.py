@@ -28,6 +28,9 @@ FILLED = 0.3
 BAND, FALLING = 4.0, 0.25
 # A part goes on so far beyond what was seen of it [m].
 BESIDE = 0.05
+# A point is on a flat part, and not where the part's plane cuts through a thing, if of the points within so many
+# tolerances at least this share is on the plane too: on a wall that it cuts squarely, four in ten are.
+AROUND, ON_PLANE = 3.0, 0.6
 # Beyond so many clusters the rest is noise.
 MOST_THINGS = 20
 
@@ -53,26 +56,47 @@ def find_ground(
     """Sort the flat parts."""
     parts = [part for part in parts if part.filled > FILLED and not _falls_off(scene, part)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
+    covered = {id(part): _covered(scene, part) for part in large}
     best, most = None, (0, 0)
     for part in parts:
         if (viewpoints @ part.plane.normal <= part.plane.offset).any():
             continue
-        standing = _standing(scene, part, _left(scene, part, [x for x in large if x is not part]), settings)
+        others = [covered[id(x)] for x in large if x is not part]
+        standing = _standing(scene, part, _left(scene, part, others), settings)
         if standing > most:
             best, most = part, standing
     background = tuple(part for part in large if part is not best)
-    return Ground(best, background, _left(scene, best, background))
+    return Ground(best, background, _left(scene, best, [covered[id(part)] for part in background]))
 
 
-def _left(scene: ThinScene, support: FlatPart | None, background: Sequence[FlatPart]) -> Bool[np.ndarray, "voxels"]:
+def _left(
+    scene: ThinScene, support: FlatPart | None, background: Sequence[Bool[np.ndarray, "voxels"]]
+) -> Bool[np.ndarray, "voxels"]:
     """What is above the support and not part of the background."""
     left = np.ones(len(scene.mean), dtype=bool)
     if support is not None:
         left = support.height(scene.mean) > support.tolerance(scene.mean_distance)
-    for part in background:
-        close = np.abs(part.height(scene.mean)) <= part.tolerance(scene.mean_distance)
-        left &= ~(close & part.beneath(scene.mean, BESIDE))
+    for covered in background:
+        left &= ~covered
     return left
+
+
+def _covered(scene: ThinScene, part: FlatPart) -> Bool[np.ndarray, "voxels"]:
+    """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
+    from scipy.spatial import KDTree
+
+    height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
+    band = np.flatnonzero(height <= (1 + AROUND) * tolerance.max())
+    band = band[part.beneath(scene.mean[band], 2 * BESIDE)]
+    on = band[(height[band] <= tolerance[band]) & part.beneath(scene.mean[band], BESIDE)]
+    if len(on) == 0:
+        return np.zeros(len(scene.mean), dtype=bool)
+    near = {"r": AROUND * tolerance[on], "return_length": True}
+    around = KDTree(scene.mean[band]).query_ball_point(scene.mean[on], **near)
+    alike = KDTree(scene.mean[on]).query_ball_point(scene.mean[on], **near)
+    covered = np.zeros(len(scene.mean), dtype=bool)
+    covered[on[alike >= ON_PLANE * around]] = True
+    return covered
 
 
 def _falls_off(scene: ThinScene, part: FlatPart) -> bool:

@@ -27,8 +27,8 @@ def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3
     """The faces with an area (height above 1e-9 of the longest side)."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    longest = np.max([np.linalg.norm(e, axis=1) for e in (b - a, c - b, a - c)], axis=0)
-    return faces[area > 1e-9 * longest**2 + 1e-30]
+    longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
+    return faces[area > 1e-9 * longest + 1e-30]
 
 
 def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:

@@ -36,8 +36,7 @@ def sample_trust(
     grid: Float[Tensor, "x y z"], sdf: GridSDF, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points"]:
     """Trilinear; beyond the grid that of its border. Differentiable in the points."""
-    half = 0.5 * (grid.shape[0] - 1) * sdf.spacing
-    unit = points / half - (sdf.origin / half + 1)
+    unit = points / sdf.half - (sdf.origin / sdf.half + 1)
     # grid_sample takes x for the last axis of its input.
     field = grid.permute(2, 1, 0)[None, None]
     sampled = grid_sample(field, unit.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border")

@@ -5,13 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_core.geometry.axis import fit_axis
 from graspd_core.geometry.cloud import PointCloud
 from graspd_core.geometry.complete import complete, openness, plausible
 from graspd_core.geometry.evidence import Evidence, empty_depth, make_sights, weigh
 from graspd_core.geometry.extrude import extrude, stand
 from graspd_core.geometry.fuse import Surfels, join, merge_views, point_step
 from graspd_core.geometry.mesh import surface_samples
-from graspd_core.geometry.revolve import find_revolution, fit_axis
+from graspd_core.geometry.revolve import find_revolution
 from graspd_core.geometry.shapes import BOX_HALF, CYLINDER_HALF, CYLINDER_RADIUS, SPHERE_RADIUS, make_shape
 from graspd_core.geometry.symmetry import find_centre, find_mirrors, image
 

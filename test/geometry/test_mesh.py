@@ -18,6 +18,7 @@ from graspd_core.geometry.mesh import (
     surface_samples,
 )
 from graspd_core.geometry.shapes import BOX_HALF, make_shape, shape_volume
+from graspd_core.geometry.topology import is_closed
 from graspd_core.types import TriangleMesh
 
 
@@ -64,18 +65,48 @@ def test_bad_files_are_named(tmp_path, make, complaint):
 
 @pytest.mark.parametrize(
     ("factor", "complaint"),
-    [(1000.0, "90 m across.*--units mm"), (100.0, "9 m across.*--units cm"), (1e-3, "9e-05 m across.*--scale")],
+    [
+        (1000.0, "90 m across.*--units mm makes it 90 mm$"),
+        (100.0, "9 m across.*--units cm makes it 90 mm, --units inch makes it 229 mm"),
+        (1 / 0.0254, "3.543 m across.*--units inch makes it 90 mm.*--units cm makes it 35.4 mm"),
+        (1e-3, "9e-05 m across.*--scale 1000 makes it 90 mm"),
+        (0.0, "0 m across.*all lie in one point"),
+    ],
 )
 def test_wrong_units_are_guessed_and_not_applied(factor, complaint):
     with pytest.raises(MeshError, match=complaint):
         check_mesh(scaled(make_shape("box"), factor), "box.obj")
 
 
-@pytest.mark.parametrize("size", [0.005, 1.2])
-def test_small_and_large_things_are_allowed(size):
+@pytest.mark.parametrize(
+    ("size", "doubt"),
+    [
+        (0.005, "small for a hand; if the file is not in metres, --scale 10 makes it 50 mm"),
+        (
+            0.9,
+            "large for a hand; if the file is not in metres, --scale 0.1 makes it 90 mm, --units inch makes it 22.9 mm",
+        ),
+        (0.09, None),
+        (0.45, None),
+        (0.01, None),
+    ],
+)
+def test_small_and_large_things_are_allowed_and_doubted(size, doubt):
     mesh, warnings = check_mesh(scaled(make_shape("box"), size / 0.09), "box")
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(size)
-    assert warnings == ()
+    assert [w.partition("across, ")[2] for w in warnings] == ([doubt] if doubt else [])
+
+
+def test_a_face_without_its_vertex_is_named(tmp_path):
+    with pytest.raises(MeshError, match="a face names a vertex that the file does not hold: index 8 is out of bounds"):
+        load_mesh(write(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"))
+
+
+def test_a_mesh_of_many_faces_is_made_smaller_first():
+    mesh, warnings = check_mesh(make_shape("sphere"), "ball", 1000)
+    assert len(mesh.faces) <= 1020
+    assert warnings == ("ball: simplified from 5120 to 1000 faces",)
+    assert is_closed(mesh)
 
 
 def test_faces_without_area_alone_are_refused():
@@ -167,3 +198,14 @@ def test_samples_lie_on_the_surface_and_are_spread_by_area(seed):
     assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(2000))
     # The two square ends are 2·60·60 of 2·60·60 + 4·60·90 mm²: a quarter.
     assert (past.argmax(1) == 2).mean() == pytest.approx(0.25, abs=0.01)
+
+
+def test_a_tear_made_by_simplifying_is_not_blamed_on_the_mesh():
+    # Boxes that touch along whole sides share edges of four faces: closed, and torn by the simplifier.
+    box = make_shape("box")
+    halves = box.vertices / np.abs(box.vertices).max(0) * 0.02
+    row = np.concatenate([halves + np.array([0.04 * i, 0.0, 0.0]) for i in range(4)])
+    joined = TriangleMesh(row, np.concatenate([box.faces + i * len(halves) for i in range(4)]))
+    mesh, warnings = check_mesh(joined, "row", 600)
+    assert not is_closed(mesh)
+    assert warnings == ("row: simplified from 4096 to 600 faces",)

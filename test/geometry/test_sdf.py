@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from graspd_core.geometry.mesh import check_mesh
 from graspd_core.geometry.primitives import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
-from graspd_core.geometry.sdf import GridSDF, build_sdf, is_solid, sample_sdf
+from graspd_core.geometry.sdf import PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf
 from graspd_core.geometry.shapes import (
     BOX_HALF,
     CAPSULE_HALF,
@@ -55,8 +55,7 @@ def test_grid_is_the_exact_distance_to_a_fraction_of_a_cell(name, seed):
     posed = TriangleMesh(mesh.vertices @ rotation.numpy().T + shift.numpy(), mesh.faces)
     sdf = build_sdf(posed, resolution=32, dtype=torch.float64)
     points = 0.2 * (torch.rand(2000, 3, generator=generator, dtype=torch.float64) - 0.5)
-    grid_half = 15.5 * float(sdf.spacing)
-    inner = points[((points @ rotation.T + shift - sdf.origin - grid_half).abs() < grid_half).all(-1)]
+    inner = points[((points @ rotation.T + shift - sdf.origin - sdf.half).abs() < sdf.half).all(-1)]
     found, normal = sample_sdf(sdf, inner @ rotation.T + shift)
     exact = EXACT[name](inner)
     # At a kink of the distance (crease, axis) all nodes may err by their way to it: half a cell's diagonal.
@@ -105,7 +104,7 @@ def test_derivative_is_the_finite_difference(box, seed, reach):
 @given(seed=st.integers(0, 10_000))
 def test_continuous_across_the_border(box, seed):
     generator = torch.Generator().manual_seed(seed)
-    size = 31 * box.spacing
+    size = 2 * box.half
     points = box.origin + size * torch.rand(64, 3, generator=generator, dtype=torch.float64)
     face = torch.randint(3, (64,), generator=generator)
     points[torch.arange(64), face] = (box.origin + size)[face]
@@ -134,7 +133,7 @@ def test_precisions_agree(box):
 
 
 def test_no_nan_at_nodes_centre_and_border(box):
-    nodes = torch.stack([box.origin, box.origin + 31 * box.spacing, torch.zeros(3).double()]).requires_grad_()
+    nodes = torch.stack([box.origin, box.origin + 2 * box.half, torch.zeros(3).double()]).requires_grad_()
     distance, normal = sample_sdf(box, nodes)
     (distance.sum() + normal.sum()).backward()
     assert nodes.grad is not None
@@ -198,3 +197,37 @@ def test_small_and_large_objects_fill_their_grid(size):
     # The centre lies between eight nodes, each half a cell's diagonal nearer to the surface.
     assert phi(sdf, [(0, 0, 0)])[0] == pytest.approx(-size / 2, abs=float(sdf.spacing))
     assert float(sdf.spacing) < size / 23
+
+
+@given(sides=st.tuples(*[st.floats(0.001, 2.0)] * 3), resolution=st.integers(8, 96))
+def test_cells_are_the_finest_that_cover_any_box(sides, resolution):
+    corners = np.array([(0, 0, 0), sides]) + 5.0
+    mesh = TriangleMesh(np.vstack([corners, corners[:1]]), np.array([[0, 1, 2]]))
+    layout = grid_layout(mesh, resolution)
+    padding = min(PADDING, max(sides) / 2)
+    reach = (np.array(layout.counts) - 1) * layout.spacing
+    assert np.prod(layout.counts) <= resolution**3
+    assert (layout.origin <= corners[0] - padding + 1e-6).all()
+    assert (layout.origin + reach >= corners[1] + padding - 1e-6).all()
+    assert layout.origin + reach / 2 == pytest.approx(corners.mean(0))
+    finer = np.ceil((np.array(sides) + 2 * padding) / (layout.spacing * (1 - 1e-6))) + 1
+    assert finer.prod() > resolution**3
+
+
+def test_a_cube_keeps_as_many_nodes_along_each_axis():
+    sphere = make_shape("sphere")
+    layout = grid_layout(sphere, 48)
+    assert layout.counts == (48, 48, 48)
+    assert layout.spacing == pytest.approx((2 * (SPHERE_RADIUS + PADDING)) / 47)
+
+
+def test_a_rod_is_seen_by_a_grid_of_as_many_nodes():
+    box = make_shape("box")
+    rod = TriangleMesh(box.vertices / np.abs(box.vertices).max(0) * (0.012, 0.012, 0.6), box.faces)
+    sdf = build_sdf(rod)
+    # Cells of a cube about it would be 26 mm wide.
+    assert float(sdf.spacing) < 0.005
+    assert is_solid(sdf)
+    # Halfway along, at its end, and beside it as far as the grid does not reach.
+    assert phi(sdf, [(0.012, 0, 0.1), (0, 0, 0.6)]) == pytest.approx(0.0, abs=0.002)
+    assert phi(sdf, [(0.1, 0.0, 0.3)]) == pytest.approx(0.088, abs=0.001)

@@ -25,11 +25,11 @@ def test_trust_is_that_of_the_nearest_surface():
     assert set(scene.trust.unique().tolist()) == {0.0, 1.0}
     x = torch.tensor([[[0.035, 0.0, 0.0], [-0.035, 0.01, 0.0], [0.5, 0.0, 0.0], [-0.5, 0.0, 0.1]]])
     assert sample_trust(scene.trust, scene.sdf, x).tolist() == [[1.0, 0.0, 1.0, 0.0]]
-    # It rises from one to the other within two cells about the border.
+    # It rises from one to the other within two cells about the border, to the rounding of float32.
     cell = float(scene.sdf.spacing)
     border = torch.stack([torch.linspace(-cell, cell, 21), torch.full((21,), 0.035), torch.zeros(21)], -1)[None]
     values = sample_trust(scene.trust, scene.sdf, border)[0]
-    assert (values.diff() >= 0).all()
+    assert (values.diff() >= -1e-6).all()
     assert values[0] < values[-1]
 
 

@@ -10,6 +10,16 @@ from typing import Any
 import numpy as np
 
 from graspd_core.bench.stress.case import GRASP, Case
+from graspd_core.bench.stress.scenery import (
+    at_the_edge,
+    beside_a_step,
+    black_neighbour,
+    half_out_of_view,
+    thrice,
+    unequal_pair,
+    with_an_arm,
+    zero_filled,
+)
 from graspd_core.geometry.cloud import PointCloud
 from graspd_core.geometry.depth import cloud_from_depth
 from graspd_core.geometry.layout import CloudLayout, points_from_layout
@@ -17,7 +27,8 @@ from graspd_core.geometry.noise import DEFAULT, HIGH
 from graspd_core.geometry.perceive import scene_from_views
 from graspd_core.geometry.scene import Scene
 from graspd_core.geometry.segment import Target
-from graspd_core.geometry.tabletop import CAMERA, depth_views, ring_poses, tabletop, views_of
+from graspd_core.geometry.tabletop import CAMERA, depth_views, moved, ring_poses, tabletop, views_of
+from graspd_core.types import TriangleMesh
 
 _SEED = 11
 _FEW = ("TOO_FEW", "NO_CANDIDATES")
@@ -32,22 +43,35 @@ _SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
 
 def cloud_cases() -> tuple[Case, ...]:
     """Every broken cloud, through `scene_from_views`."""
+    box, mug, cylinder, block = (_true(shape) for shape in ("box", "mug", "cylinder", "l_block"))
     seen = (
-        ("single-view", "one view of a box on a table", lambda: _views("box", 1)),
-        ("single-view-mug", "one view of a mug, its inside unseen", lambda: _views("mug", 1)),
-        ("single-view-bottle", "one view of a bottle", lambda: _views("bottle", 1)),
-        ("noisy-sensor", "three views with three times the usual noise", lambda: _views("l_block", 3, noise=HIGH)),
-        ("flying-pixels", "every edge smeared along its rays", _flying),
-        ("table-bleed", "a ring of table about the foot of a mug taken for mug", _bled),
-        ("dropouts", "nine of ten points lost", lambda: _dropped(_views("box", 3), 0.9)),
-        ("half-nan", "every other point is NaN", lambda: _with_nan(_views("cylinder", 3), 0.5)),
-        ("outliers", "two hundred points anywhere in the room", _outliers),
-        ("repeated-points", "every point five times", _repeated),
-        ("coarse-depth", "depth in steps of 4 mm", _stepped),
-        ("moved-view", "three views of which one stands 4 mm and 1° off", _misplaced),
-        ("mirror-shine", "a hole of 3 cm burnt into the middle of the object", _shiny),
-        ("far-camera", "a box seen from 1.6 m", lambda: _views("box", 3, distance=1.6)),
-        ("tilted-table", "camera coordinates: the table tilts by 40°", _in_camera),
+        ("single-view", "one view of a box on a table", lambda: _views("box", 1), box),
+        ("single-view-mug", "one view of a mug, its inside unseen", lambda: _views("mug", 1), mug),
+        ("single-view-bottle", "one view of a bottle", lambda: _views("bottle", 1), _true("bottle")),
+        (
+            "noisy-sensor",
+            "three views with three times the usual noise",
+            lambda: _views("l_block", 3, noise=HIGH),
+            block,
+        ),
+        ("flying-pixels", "every edge smeared along its rays", _flying, box),
+        ("table-bleed", "a ring of table about the foot of a mug taken for mug", _bled, mug),
+        ("dropouts", "nine of ten points lost", lambda: _dropped(_views("box", 3), 0.9), box),
+        ("half-nan", "every other point is NaN", lambda: _with_nan(_views("cylinder", 3), 0.5), cylinder),
+        ("outliers", "two hundred points anywhere in the room", _outliers, box),
+        ("repeated-points", "every point five times", _repeated, cylinder),
+        ("coarse-depth", "depth in steps of 4 mm", _stepped, box),
+        ("moved-view", "three views of which one stands 4 mm and 1° off", _misplaced, box),
+        ("mirror-shine", "a hole of 3 cm burnt into the middle of the object", _shiny, box),
+        ("far-camera", "a box seen from 1.6 m", lambda: _views("box", 3, distance=1.6), box),
+        ("half-out-of-view", "the image ends in the middle of a box", lambda: half_out_of_view("box"), box),
+        ("black-neighbour", "beside a box something black leaves a hole", lambda: black_neighbour("box"), box),
+        ("table-edge", "a mug at the edge of the table", lambda: at_the_edge("mug"), mug),
+        ("stepped-table", "a table with a step of 3 cm beside a box", lambda: beside_a_step("box"), box),
+        ("arm-in-view", "a forearm beside a cylinder", lambda: with_an_arm("cylinder"), cylinder),
+        ("same-view-thrice", "one message of a mug three times", lambda: thrice("mug"), mug),
+        ("zero-filled", "two points of three are the camera's own place", lambda: zero_filled("box"), box),
+        ("tilted-table", "camera coordinates: the table tilts by 40°", _in_camera, _box_in_camera),
     )
     refused = (
         ("empty", "no point at all", lambda: [_cloud(np.zeros((0, 3)))], ("CloudError",)),
@@ -60,17 +84,26 @@ def cloud_cases() -> tuple[Case, ...]:
         ("white-noise", "points anywhere in a cube of 2 m", _room, ("CloudError", "NoObjectError", *_FEW)),
         ("wrong-units", "a cloud in millimetres", lambda: _scaled(_views("box", 1), 1e3), None),
     )
-    cases = [_case(name, about, make) for name, about, make in seen]
+    cases = [_case(name, about, make, truth=truth) for name, about, make, truth in seen]
     cases += [
         _case(name, about, make, expect or ("CloudError", "NoObjectError"), whole=False)
         for name, about, make, expect in refused
     ]
     return (
         *cases,
-        _case("lone-object", "the object alone, nothing under it", lambda: _alone("cylinder"), alone=True),
-        _case("touching-masked", "two things that touch, one of them masked", _touching, target=_mask),
+        _case(
+            "lone-object", "the object alone, nothing under it", lambda: _alone("cylinder"), alone=True, truth=cylinder
+        ),
+        _case(
+            "touching-masked",
+            "two things that touch, one of them masked",
+            _touching,
+            target=_mask,
+            truth=_true("box", 0.0),
+        ),
         _case("touching", "two things that touch, and no word which", _touching, (GRASP, *_FEW), whole=False),
-        _case("ten-million-points", "ten million points", _many, memory=6000.0, loading=30.0),
+        _case("touching-unequal", "a slab against a box, and no word which", unequal_pair, (GRASP, *_FEW), whole=False),
+        _case("ten-million-points", "ten million points", _many, memory=3000.0, loading=30.0, truth=box),
         _layout("integer-fields", "coordinates as INT16", dtype="<i2", number=3),
         _layout("zero-width", "a message of width zero", width=0),
         _layout("lying-sizes", "a message that holds half of what it says", cut=2),
@@ -90,11 +123,12 @@ def _case(
     alone: bool = False,
     memory: float = 2000.0,
     loading: float = 15.0,
+    truth: Callable[[], TriangleMesh] | None = None,
 ) -> Case:
     def scene(folder: Path) -> Scene:
         return scene_from_views(make(), source=name, alone=alone, target=target() if target else None)
 
-    return Case(name, "cloud", about, scene, expect, whole, memory=memory, loading=loading)
+    return Case(name, "cloud", about, scene, expect, whole, memory=memory, loading=loading, truth=truth)
 
 
 def _layout(
@@ -120,12 +154,17 @@ def _layout(
         layout = CloudLayout(count, 1, step, step * count, dtype.startswith(">"), fields, data)
         return [replace(view, points=points_from_layout(layout))]
 
-    return _case(name, about, views, expect, whole=GRASP in expect)
+    whole = GRASP in expect
+    return _case(name, about, views, expect, whole=whole, truth=_true("box") if whole else None)
 
 
 def _views(shape: str, count: int, *, noise: Any = DEFAULT, distance: float = 0.55) -> Views:
     poses = ring_poses(count, elevation=0.7, azimuth=0.5, distance=distance)
     return views_of(tabletop(shape, yaw=0.3), CAMERA, poses, noise, _SEED)
+
+
+def _true(shape: str, yaw: float = 0.3) -> Callable[[], TriangleMesh]:
+    return lambda: tabletop(shape, yaw=yaw).truth
 
 
 def _cloud(points: np.ndarray) -> PointCloud:
@@ -204,6 +243,10 @@ def _in_camera() -> Views:
     (view,) = _views("box", 1)
     R, t = _POSES[0][:3, :3], _POSES[0][:3, 3]
     return [PointCloud((view.points - t) @ R, np.zeros(3), np.array([0.0, 0.0, 1.0]))]
+
+
+def _box_in_camera() -> TriangleMesh:
+    return moved(_true("box")(), np.linalg.inv(_POSES[0]))
 
 
 def _alone(shape: str) -> Views:
