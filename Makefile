@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench bench-quick bench-rgbd soak clean
+.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps soak fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -48,8 +48,15 @@ bench-rgbd: setup  ## make the table of docs/clouds.md anew: shapes on a table, 
 	$(RUN)/python benchmarks/rgbd.py --readme docs/clouds.md
 	$(if $(FRAMES),$(RUN)/python benchmarks/rgbd.py --frames $(FRAMES))
 
+bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of where methods stop working (resumable)
+	$(RUN)/python benchmarks/maps.py
+
 soak: setup  ## ten minutes of mixed load on the node: memory, latencies, answers
 	$(RUN)/python benchmarks/soak.py --minutes 10
+
+fuzz: setup  ## throw mutated files and messages at the parsers for MINUTES (10), findings to results/fuzz
+	$(RUN)/python benchmarks/fuzz.py --minutes $(or $(MINUTES),10)
+	GRASPD_FUZZ=$(or $(EXAMPLES),5) $(RUN)/python -m pytest -q --timeout 3600 test/fuzz
 
 clean:  ## remove what was made, the environment excepted
 	rm -rf demo results build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

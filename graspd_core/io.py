@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import tempfile
 from importlib import metadata
@@ -11,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from graspd_core.config import PlanConfig
-from graspd_core.errors import ConfigError, FormatError
+from graspd_core.errors import ConfigError, FormatError, shown
 from graspd_core.geometry.scene import ObjectModel
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.types import Contact, Grasp, GraspMetrics, GraspResult, HoldResult, LiftResult, Posture, Verdict
@@ -28,6 +29,7 @@ _METRIC_KEYS = (
     "epsilon",
     "volume",
     "sd_cm",
+    "robustness",
 )
 _LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy", "pytorch-kinematics")
 
@@ -38,7 +40,11 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
         "format": FORMAT,
         "version": VERSION,
         "units": "m, rad, N",
-        "outcome": {"name": result.outcome.name, "message": result.outcome.value, "warnings": list(result.warnings)},
+        "outcome": {
+            "name": result.outcome.name,
+            "message": result.message or result.outcome.value,
+            "warnings": list(result.warnings),
+        },
         "hand": _hand(hand),
         "object": {
             "source": target.source,
@@ -123,12 +129,12 @@ def load_document(path: str | Path) -> dict[str, Any]:
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror or error}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not JSON: {error}") from None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f"{path}: not a {FORMAT} file")
     if document.get("version") != VERSION:
-        raise FormatError(f"{path}: version {document.get('version')!r} is unknown; this reader knows {VERSION}")
+        raise FormatError(f"{path}: version {shown(document.get('version'))} is unknown; this reader knows {VERSION}")
     return document
 
 
@@ -139,49 +145,79 @@ def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     stay in the document: who wants to judge a grasp measures it anew.
 
     Raises:
-        FormatError: a grasp lacks a key, or holds something of the wrong kind there.
+        FormatError: a grasp lacks a key, or holds something there that is of the wrong kind or not finite.
     """
     try:
         hand = document["hand"]
         # Files written before joints could be coupled have no such key.
         coupled = {mimic["joint"] for mimic in hand.get("mimic", ())}
-        actuated = np.array([name not in coupled for name in hand["joint_names"]])
+        actuated = np.array([name not in coupled for name in hand["joint_names"]], dtype=bool)
         return tuple(_grasp_of(values, actuated) for values in document["grasps"])
     except KeyError as error:
-        raise FormatError(f"grasps: a grasp lacks the key {error}") from None
-    except (AttributeError, TypeError, ValueError) as error:
-        raise FormatError(f"grasps: {error}") from None
+        raise FormatError(f"grasps: a grasp lacks the key {shown(error.args[0])}") from None
+    # A number of JSON may be larger than any float.
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise FormatError(f"grasps: {' '.join(str(error).split())[:300]}") from None
 
 
 def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> Grasp:
     def posture(*keys: str) -> Posture:
-        position, quaternion, joints = (np.array(values[key], dtype=float) for key in keys)
-        if joints.shape != actuated.shape:
-            raise ValueError(f"{keys[-1]} has {joints.size} values for {actuated.size} joints")
+        if len(values[keys[2]]) != actuated.size:
+            raise ValueError(f"{keys[2]} has {len(values[keys[2]])} values for {actuated.size} joints")
+        sizes = (3, 4, actuated.size)
+        position, quaternion, joints = (_numbers_of(values, key, n) for key, n in zip(keys, sizes, strict=True))
+        if abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) > 0.01:
+            raise ValueError(f"{keys[1]} is no unit quaternion: {quaternion.tolist()}")
         return Posture(position, quaternion, joints[actuated])
 
     # Files written before there was a lift trial have no such key.
     hold, lift = values["metrics"]["hold"], values["metrics"].get("lift")
-    verdict, reason = Verdict(values["verdict"]), values["reason"]
+    verdict, reason = Verdict(values["verdict"]), str(values["reason"])
     # A lift is tried only with grasps that held, so the reason is that of the last trial.
     verified = verdict is Verdict.VERIFIED
+    held = verified or lift is not None
     return Grasp(
         pregrasp=posture("pregrasp_position", "pregrasp_quaternion_wxyz", "pregrasp_joint_positions"),
         grasp=posture("position", "quaternion_wxyz", "joint_positions"),
         squeeze=posture("position", "quaternion_wxyz", "squeeze_joint_positions"),
-        contacts=tuple(Contact(c["link"], tuple(c["position"]), tuple(c["normal"])) for c in values["contacts"]),
-        score=values["score"],
-        hold=hold and HoldResult(verified or lift is not None, *_moved_of(hold), "" if lift else reason),
+        contacts=tuple(_contact_of(contact) for contact in values["contacts"]),
+        score=float(_numbers_of(values, "score")),
+        hold=None if hold is None else HoldResult(held, *_moved_of(hold), "" if lift else reason),
         verdict=verdict,
         reason=reason,
-        lift=lift and LiftResult(verified, *_moved_of(lift), lift["reach_through_mm"] / 1e3, reason),
+        lift=None if lift is None else _lift_of(lift, verified, reason),
     )
 
 
-def _moved_of(trial: dict[str, float | None]) -> tuple[float, float]:
+def _contact_of(values: dict[str, Any]) -> Contact:
+    position, normal = (_numbers_of(values, key, 3) for key in ("position", "normal"))
+    return Contact(str(values["link"]), _triple(position), _triple(normal))
+
+
+def _numbers_of(values: dict[str, Any], key: str, *shape: int) -> Float[np.ndarray, "..."]:
+    """What a key holds, as finite numbers of a shape. Raises ValueError: it holds something else."""
+    numbers = np.array(values[key], dtype=float)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"{key}: {shown(values[key])}; expected {math.prod(shape)} finite number(s)")
+    return numbers
+
+
+def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _lift_of(trial: dict[str, Any], passed: bool, reason: str) -> LiftResult:
+    return LiftResult(passed, *_moved_of(trial), float(_numbers_of(trial, "reach_through_mm")) / 1e3, reason)
+
+
+def _moved_of(trial: dict[str, Any]) -> tuple[float, float]:
     """Displacement [m] and rotation [rad] of a trial, infinite where they were not finite."""
-    displacement, rotation = (_or_infinite(trial[key]) for key in ("max_displacement_cm", "max_rotation_deg"))
-    return displacement / 100, float(np.deg2rad(rotation))
+    displacement, rotation = (
+        float("inf") if trial[key] is None else float(_numbers_of(trial, key))
+        for key in ("max_displacement_cm", "max_rotation_deg")
+    )
+    return displacement / 100, math.radians(rotation)
 
 
 def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
@@ -217,6 +253,7 @@ def _metrics(metrics: GraspMetrics | None, hold: HoldResult | None, lift: LiftRe
             metrics.epsilon,
             metrics.volume,
             None if metrics.displacement is None else metrics.displacement * 100,
+            metrics.robustness,
         )
         values = dict(zip(_METRIC_KEYS, map(_finite, figures), strict=True))
     return {
@@ -235,10 +272,6 @@ def _moved(trial: HoldResult | LiftResult) -> dict[str, float | None]:
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
-
-
-def _or_infinite(value: float | None) -> float:
-    return float("inf") if value is None else value
 
 
 def _refuse_constant(name: str) -> float:

@@ -20,6 +20,8 @@ SECOND = 1_000_000_000
 HISTORY = 10 * SECOND
 
 _RIGID = 1e-3
+# No two things on Earth are farther apart [m].
+_FARTHEST = 1e8
 
 
 @dataclass
@@ -169,8 +171,10 @@ def _inverse(T_a_b: np.ndarray) -> Float[np.ndarray, "4 4"]:
 
 def _rigid(pose: np.ndarray, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
     turn = pose[:3, :3]
-    square = np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
-    if not (np.isfinite(pose).all() and square):
+    # Compared first: products of numbers that are not finite, or too large, would be warned of.
+    fits = (np.abs(turn) < 2).all() and (np.abs(pose[:3, 3]) <= _FARTHEST).all()
+    square = fits and np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
+    if not square:
         raise TransformError(f"transform {parent} -> {child}: not a rotation and a position in finite numbers")
     return np.array(pose, dtype=float)
 
@@ -180,6 +184,8 @@ def _name(frame: str) -> str:
     name = frame.removeprefix("/")
     if not name:
         raise TransformError("transform: a frame without a name")
+    if not name.isprintable():
+        raise TransformError(f"transform: the frame name {name[:80]!r} has a letter that cannot be printed")
     return name
 
 

@@ -133,6 +133,7 @@ class GraspMetrics:
         displacement: the papers' simulation displacement [m], None where it was not run.
         contact_area_5mm: hand surface within 5 mm of the object [m²], None where nobody measured.
         contact_area_10mm: hand surface within 10 mm of the object [m²], None where nobody measured.
+        robustness: share of hold trials held with the hand out of place, None where nobody asked.
     """
 
     contact_area: float
@@ -145,6 +146,7 @@ class GraspMetrics:
     displacement: float | None = None
     contact_area_5mm: float | None = None
     contact_area_10mm: float | None = None
+    robustness: float | None = None
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ GRASP = {
 }  # fmt: skip
 METRICS = {
     "contact_area_cm2", "intersection_volume_cm3", "penetration_mm", "self_penetration_mm", "epsilon", "volume",
-    "sd_cm", "hold", "lift",
+    "sd_cm", "robustness", "hold", "lift",
 }  # fmt: skip
 
 

@@ -58,6 +58,8 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     # Drivers of cameras without distortion often leave P empty.
     by_projection = rectified and info.p[0] > 0
     matrix = np.array(info.p).reshape(3, 4)[:, :3] if by_projection else np.array(info.k, dtype=float).reshape(3, 3)
+    if not np.isfinite(matrix).all():
+        raise CloudError(f"camera: its {'P' if by_projection else 'K'} has numbers that are not finite")
     roi, bins = info.roi, np.array([max(info.binning_x, 1), max(info.binning_y, 1)])
     shown = matrix.copy()
     shown[:2, 2] -= roi.x_offset, roi.y_offset
@@ -118,6 +120,6 @@ def _pose(transform: Any) -> Float[np.ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3, 3] = move.x, move.y, move.z
     # A driver that leaves the quaternion at zero, or far from unit length, says nothing that could be trusted.
-    usable = abs(np.linalg.norm(quaternion) - 1) < 1e-2
+    usable = np.isfinite(quaternion).all() and abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) < 1e-2
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix() if usable else np.nan
     return pose

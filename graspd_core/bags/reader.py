@@ -218,9 +218,12 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
 
 
 def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
-    """The message; its type as the bag defines it, else as Jazzy does."""
-    kind = connection.msgtype
-    types = reader.typestore if kind in reader.typestore.fielddefs else jazzy_types()
+    """The message; its type as Jazzy defines it, else as the bag does.
+
+    A bag that gives a known type other fields would else make messages that nobody here can read.
+    """
+    kind, known = connection.msgtype, jazzy_types()
+    types = known if kind in known.fielddefs else reader.typestore
     try:
         return types.deserialize_cdr(raw, kind)
     except Exception as error:

@@ -12,6 +12,7 @@ from graspd_core.config.closed_form import ClosedFormConfig, LossWeights
 from graspd_core.config.graspd2022 import Graspd2022Config
 from graspd_core.config.mapping import from_mapping
 from graspd_core.config.postures import PostureConfig
+from graspd_core.config.robust import RobustConfig
 from graspd_core.config.rounds import RoundsConfig
 from graspd_core.config.segment import SegmentConfig
 from graspd_core.errors import ConfigError
@@ -27,6 +28,7 @@ __all__ = [
     "PlanConfig",
     "PostureConfig",
     "RandomClosureConfig",
+    "RobustConfig",
     "RoundsConfig",
     "SegmentConfig",
     "from_mapping",
@@ -45,7 +47,7 @@ class PlanConfig:
     """Everything a run of `plan_grasps` is set by, apart from the scene, the hand and the seed.
 
     Attributes:
-        resolution: cells of the signed distance grid along the object's longest side.
+        resolution: the signed distance grid has at most the cube of it in nodes; a cube has as many along each side.
         method: how poses are searched for; `graspd_core.optimise.synthesis.SEARCHES` has one search for each.
         closed_form: settings of the closed-form relaxation.
         graspd2022: settings of the published Grasp'D.
@@ -53,6 +55,7 @@ class PlanConfig:
         random_closure: settings of the floor.
         postures: pregrasp and squeeze.
         rounds: of optimiser and trial.
+        robust: the order of the verified grasps.
     """
 
     resolution: int = 48
@@ -63,6 +66,7 @@ class PlanConfig:
     random_closure: RandomClosureConfig = field(default_factory=RandomClosureConfig)
     postures: PostureConfig = field(default_factory=PostureConfig)
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
+    robust: RobustConfig = field(default_factory=RobustConfig)
 
 
 def preset_names() -> tuple[str, ...]:
@@ -76,15 +80,15 @@ def load_preset(name: str) -> PlanConfig:
     Raises:
         ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
     """
-    import yaml
+    from graspd_core.config.yaml_text import YamlError, parse_yaml
 
     path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
         raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
     try:
-        values = yaml.safe_load(path.read_text())
+        _, values = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    except (YamlError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
     return from_mapping(PlanConfig, {} if values is None else values, where=path.name)

@@ -9,9 +9,12 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, shown
 
 T = TypeVar("T")
+
+# Beyond this no library takes a whole number.
+_LARGEST_INTEGER = 2**63 - 1
 
 
 def from_mapping(cls: type[T], values: Any, where: str = "config") -> T:
@@ -22,10 +25,10 @@ def from_mapping(cls: type[T], values: Any, where: str = "config") -> T:
     """
     hints = typing.get_type_hints(cls)
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {values!r}")
-    unknown = sorted(set(values) - set(hints), key=str)
+        raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
+    unknown = sorted(map(shown, set(values) - set(hints)))
     if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; valid keys: {', '.join(sorted(hints))}")
+        raise ConfigError(f"{where}: unknown key {unknown[0]}; valid keys: {', '.join(sorted(hints))}")
     return cls(**{key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()})
 
 
@@ -35,7 +38,7 @@ def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:
     origin = typing.get_origin(hint)
     if origin is Literal:
         if value not in typing.get_args(hint):
-            raise ConfigError(f"{where}: {value!r} is not one of {', '.join(map(str, typing.get_args(hint)))}")
+            raise ConfigError(f"{where}: {shown(value)} is not one of {', '.join(map(str, typing.get_args(hint)))}")
         return value
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in typing.get_args(hint):
@@ -43,10 +46,12 @@ def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:
         hint = next(h for h in typing.get_args(hint) if h is not type(None))
     if typing.get_origin(hint) is tuple:
         return _tuple(typing.get_args(hint), value, where)
+    if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+        raise ConfigError(f"{where}: {shown(value)} is too large")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        value = float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {shown(value)}")
     if isinstance(value, int | float) and not (math.isfinite(value) and (signed or value >= 0)):
         raise ConfigError(f"{where}: {value!r} must be a finite number{'' if signed else ', zero or more'}")
     return value
@@ -55,6 +60,6 @@ def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:
 def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     """Places and the like: one value for each hint, of either sign."""
     if not isinstance(value, list | tuple) or len(value) != len(hints):
-        raise ConfigError(f"{where}: expected {len(hints)} values, got {value!r}")
+        raise ConfigError(f"{where}: expected {len(hints)} values, got {shown(value)}")
     pairs = enumerate(zip(hints, value, strict=True))
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)

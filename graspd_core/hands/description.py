@@ -12,11 +12,12 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from graspd_core.errors import HandError
+from graspd_core.config.yaml_text import YamlError, parse_yaml
+from graspd_core.errors import HandError, shown
 from graspd_core.hands.guess import guess_palm, guess_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
-from graspd_core.hands.mount import read_mount
+from graspd_core.hands.mount import is_number, read_mount
 
 _KEYS = ("name", "urdf", "palm", "approach", "effort", "open", "closed", "mount")
 _REQUIRED = ("urdf",)
@@ -67,15 +68,13 @@ def read_description(path: Path) -> HandDescription:
     """
     try:
         text = path.read_text(encoding="utf-8")
-        node, data = yaml.compose(text, Loader=yaml.SafeLoader), yaml.safe_load(text)
+        node, data = parse_yaml(text)
     except OSError as error:
         raise HandError(f"{path}: cannot be read: {error.strerror or error}") from error
-    # A value error is one of text that is not UTF-8, or of a value that only looks like a date.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = mark.line + 1 if mark else 1
-        problem = getattr(error, "problem", None) or type(error).__name__
-        raise HandError(f"{path}:{line}: not well-formed YAML: {problem}") from error
+    except YamlError as error:
+        raise HandError(f"{path}:{error.line}: not well-formed YAML: {error.problem}") from error
+    except UnicodeDecodeError as error:
+        raise HandError(f"{path}:1: not well-formed YAML: {type(error).__name__}") from error
     # Keys that YAML reads as something else than what is written, or that it merges, are looked for in vain.
     lines: dict[str, int] = defaultdict(lambda: 1, _key_lines(node))
     root = _mapping(path, 1, "the file", data)
@@ -84,8 +83,8 @@ def read_description(path: Path) -> HandDescription:
     _check_keys(path, lines, palm, "palm.", _PALM_KEYS, ("center", "normal") if "palm" in root else ())
 
     def vector(key: str, value: Any, *, unit: bool) -> Float[np.ndarray, "3"]:
-        if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value):
-            raise HandError(f"{path}:{lines[key]}: {key}: expected three numbers, got {value!r}")
+        if not isinstance(value, list) or len(value) != 3 or not all(is_number(x) for x in value):
+            raise HandError(f"{path}:{lines[key]}: {key}: expected three numbers, got {shown(value)}")
         array = np.array(value, dtype=np.float64)
         length = float(np.linalg.norm(array))
         if unit and length < 1e-9:
@@ -95,19 +94,22 @@ def read_description(path: Path) -> HandDescription:
     def posture(key: str) -> dict[str, float]:
         values = _mapping(path, lines[key], key, root[key])
         for joint, value in values.items():
-            if not _is_number(value):
-                raise HandError(f"{path}:{lines[f'{key}.{joint}']}: {key}.{joint}: expected a number, got {value!r}")
+            if not is_number(value):
+                line = lines[f"{key}.{joint}"]
+                raise HandError(f"{path}:{line}: {key}.{joint}: expected a number, got {shown(value)}")
         return {joint: float(value) for joint, value in values.items()}
 
     for key, value in (("name", root.get("name", "")), ("urdf", root["urdf"]), ("palm.link", palm.get("link", ""))):
         if not isinstance(value, str):
-            raise HandError(f"{path}:{lines[key]}: {key}: expected text, got {value!r}")
+            raise HandError(f"{path}:{lines[key]}: {key}: expected text, got {shown(value)}")
     effort = root.get("effort")
     if effort is not None:
         effort = posture("effort") if isinstance(effort, dict) else effort
         values = list(effort.values()) if isinstance(effort, dict) else [effort]
-        if not all(_is_number(value) and value > 0 for value in values):
-            raise HandError(f"{path}:{lines['effort']}: effort: expected positive numbers, got {root['effort']!r}")
+        if not all(is_number(value) and value > 0 for value in values):
+            told = shown(root["effort"])
+            raise HandError(f"{path}:{lines['effort']}: effort: expected positive numbers, got {told}")
+        effort = effort if isinstance(effort, dict) else float(effort)
     return HandDescription(
         path=path,
         name=root.get("name", path.stem),
@@ -202,9 +204,9 @@ def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
 
 def _mapping(path: Path, line: int, what: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise HandError(f"{path}:{line}: {what}: expected a mapping of keys to values, got {value!r}")
+        raise HandError(f"{path}:{line}: {what}: expected a mapping of keys to values, got {shown(value)}")
     # Some hands' joints have bare numbers for names.
-    return {str(key): entry for key, entry in value.items()}
+    return {key if isinstance(key, str) else shown(key): entry for key, entry in value.items()}
 
 
 def _check_keys(
@@ -221,7 +223,3 @@ def _check_keys(
     for key in required:
         if key not in data:
             raise HandError(f"{path}:{lines.get(prefix.rstrip('.'), 1)}: {prefix}{key} is missing")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))

@@ -96,7 +96,9 @@ def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | N
         known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
         raise HandError(f"{path}: {key} is missing; the file has {known}")
     try:
-        array = numbers(content[key]).astype(np.float64)
+        # A NaN of any kind is looked for below: numpy would warn of those that signal.
+        with np.errstate(invalid="ignore"):
+            array = numbers(content[key]).astype(np.float64)
     except ValueError as error:
         raise HandError(f"{path}: {key}: {error}") from error
     fits = len(array.shape) == len(shape) and all(

@@ -231,4 +231,5 @@ def read_pickle(path: Path) -> Any:
         ) from None
     # A file that is no pickle fails in whatever way its bytes happen to; the file is the culprit.
     except Exception as error:
-        raise HandError(f"{path}: not a MANO pickle: {type(error).__name__}: {error}".splitlines()[0]) from error
+        told = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise HandError(f"{path}: not a MANO pickle: {told[:200]}") from error

@@ -16,6 +16,8 @@ from graspd_core.errors import HandError
 
 _LARGEST_FILE = 32 * 2**20
 _DEEPEST = 150
+# The largest hand known has some 1000 elements; each takes half a kilobyte, however short it is written.
+_MOST_ELEMENTS, _MOST_ATTRIBUTES = 20_000, 200
 # Elements that errors about their contents name.
 _OWNERS = ("link", "joint", "body", "geom", "mesh")
 
@@ -89,9 +91,12 @@ def _blanked(text: str, start: str, end: str) -> str:
 def _parsed(path: Path, text: str) -> Element:
     top: list[Element] = []
     stack: list[Element] = []
+    count = 0
     parser = expat.ParserCreate(encoding="utf-8")
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
         element = Element(tag, attributes)
         element.line = parser.CurrentLineNumber
         if tag in _OWNERS and "name" in attributes:
@@ -102,6 +107,9 @@ def _parsed(path: Path, text: str) -> Element:
             raise wrong(path, element, "has a name with a line end, or another character that cannot be printed")
         if len(stack) >= _DEEPEST:
             raise wrong(path, element, f"<{tag}> is nested more than {_DEEPEST} deep")
+        if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
+            limits = f"{_MOST_ELEMENTS} elements, nor an element more than {_MOST_ATTRIBUTES} attributes"
+            raise wrong(path, element, f"no hand has more than {limits}")
         (stack[-1] if stack else top).append(element)
         stack.append(element)
 

@@ -15,6 +15,8 @@ from graspd_core.hands.elements import read_numbers
 from graspd_core.hands.model import Mimic
 
 _DEFAULTS = (("multiplier", "1"), ("offset", "0"))
+# No joint of a hand moves so much farther than another, nor starts so far off.
+_LARGEST = 1e6
 
 
 class Coupling(NamedTuple):
@@ -53,7 +55,7 @@ def resolved_couplings(path: Path, direct: Mapping[str, Coupling]) -> dict[str, 
     """Couplings as written, each led back to the actuated joint at the end of its chain.
 
     Raises:
-        HandError: joints follow each other in a circle.
+        HandError: joints follow each other in a circle, or by a number that is no hand's.
     """
     return {name: _resolved(path, name, direct) for name in direct}
 
@@ -70,6 +72,11 @@ def _resolved(path: Path, name: str, direct: Mapping[str, Coupling]) -> Coupling
             further.leader,
             coupling.multiplier * further.multiplier,
             coupling.multiplier * further.offset + coupling.offset,
+        )
+    if not max(abs(coupling.multiplier), abs(coupling.offset)) <= _LARGEST:
+        raise HandError(
+            f"{path}: joint {name!r} mimics {coupling.leader!r} with multiplier {coupling.multiplier:g} and offset "
+            f"{coupling.offset:g}; the largest that is taken is {_LARGEST:g}"
         )
     return coupling
 

@@ -16,6 +16,8 @@ from graspd_core.hands.markup import Element, wrong
 from graspd_core.hands.tree import axis_rotation
 
 _Attributes = Mapping[str, Mapping[str, str]]
+# Each class holds all that the classes above it say.
+_MOST_CLASSES, _MOST_KINDS = 300, 64
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # All write to the same attributes: a class's defaults for one are those for the others.
 _ACTUATORS = (
@@ -89,6 +91,9 @@ def _collect_classes(
         if child.tag != "default":
             own[_kin(child.tag)] = {**own.get(_kin(child.tag), {}), **child.attrib}
     classes[name] = own
+    if len(classes) > _MOST_CLASSES or len(own) > _MOST_KINDS:
+        limits = f"{_MOST_CLASSES} default classes, nor one more than {_MOST_KINDS} kinds of elements"
+        raise wrong(path, element, f"no hand has more than {limits}")
     for child in element.findall("default"):
         if not child.get("class"):
             raise wrong(path, child, "a nested <default> has no class")
@@ -185,7 +190,7 @@ def _direction(settings: Settings, element: ET.Element, key: str, count: int) ->
 
 
 def _unit(settings: Settings, element: ET.Element, key: str, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    length = float(np.linalg.norm(values))
+    length = float(np.linalg.norm(values.clip(-1e10, 1e10)))
     if not 1e-10 < length < 1e10:
         raise wrong(settings.path, element, f"<{element.tag} {key}={element.get(key)!r}>: has no direction")
     return values / length

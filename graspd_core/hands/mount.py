@@ -8,10 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.errors import HandError
+from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import Mount
 
 _DEFAULTS = {"position": [0.0, 0.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+
+# No length, angle or torque of a hand is larger, in any unit.
+_LARGEST = 1e9
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of YAML is a number that a hand can have."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST <= value <= _LARGEST
 
 
 def read_mount(path: Path, lines: Mapping[str, int], value: Any) -> Mount:
@@ -27,18 +35,18 @@ def read_mount(path: Path, lines: Mapping[str, int], value: Any) -> Mount:
     def numbers(key: str) -> tuple[float, ...]:
         given, count = value.get(key, _DEFAULTS[key]), len(_DEFAULTS[key])
         fine = isinstance(given, list) and len(given) == count
-        if not fine or not all(type(x) in (int, float) and np.isfinite(x) for x in given):
-            raise error(f"mount.{key}", f"expected {count} numbers, got {given!r}")
+        if not fine or not all(map(is_number, given)):
+            raise error(f"mount.{key}", f"expected {count} numbers, got {shown(given)}")
         return tuple(float(x) for x in given)
 
     if not isinstance(value, dict):
-        raise error("mount", f"expected a mapping of keys to values, got {value!r}")
-    for key in value:
+        raise error("mount", f"expected a mapping of keys to values, got {shown(value)}")
+    for key in map(str, value):
         if key not in ("parent", *_DEFAULTS):
             raise error(f"mount.{key}", f"unknown key; known: parent, {', '.join(_DEFAULTS)}")
     parent = value.get("parent")
     if not isinstance(parent, str) or not parent:
-        raise error("mount.parent", f"expected the name of the arm's link, got {parent!r}")
+        raise error("mount.parent", f"expected the name of the arm's link, got {shown(parent)}")
     x, y, z = numbers("position")
     quaternion = np.array(numbers("quaternion_wxyz"))
     length = float(np.linalg.norm(quaternion))

@@ -237,10 +237,13 @@ def _finite(
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"], tuple[str, ...]]:
     """Limits that mean something: a joint that turns without end is kept within ±π; what was done about it."""
     lower, upper, warnings = lower.copy(), upper.copy(), []
+    # Limits in use go up to the largest float.
+    with np.errstate(over="ignore"):
+        ranges = upper - lower
     for i, joint in enumerate(joints):
-        if joint.kind == "prismatic" and not upper[i] - lower[i] <= _LONGEST_SLIDE:
-            raise _too_long(path, joint.name, float(upper[i] - lower[i]))
-        if joint.kind == "revolute" and not upper[i] - lower[i] <= _WIDEST:
+        if joint.kind == "prismatic" and not ranges[i] <= _LONGEST_SLIDE:
+            raise _too_long(path, joint.name, float(ranges[i]))
+        if joint.kind == "revolute" and not ranges[i] <= _WIDEST:
             # One turn: the one from -π to π, moved no farther than the limits ask for.
             lower[i] = min(max(-np.pi, lower[i]), upper[i] - 2 * np.pi)
             upper[i] = lower[i] + 2 * np.pi

@@ -118,6 +118,9 @@ class Client:
     def send_request(self, **fields: Any) -> None:
         self._request.publish(GraspRequest(**fields))
 
+    def send_message(self, request: GraspRequest) -> None:
+        self._request.publish(request)
+
     def answer(self, request_id: str, timeout: float) -> GraspArray:
         """Wait for the answer to a request."""
         find = lambda: next((a for a in self.answers if a.request_id == request_id), None)  # noqa: E731

@@ -1,0 +1,296 @@
+"""The parsers that are graspd's own, each as a function of bytes that must end in a value or in one clear error.
+
+A target makes something of its input, or refuses it as documented. Whatever else comes out is a finding: another
+exception, a warning, an error of several lines, a value that is not finite. Used by benchmarks/fuzz.py, which throws
+mutated bytes at them, and by test/fuzz, which throws what was found once.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzz_seeds import (
+    DAES,
+    DESCRIPTIONS,
+    DOCUMENTS,
+    GRIPPER,
+    LAYOUT_HEAD,
+    MJCFS,
+    PRESETS,
+    URDFS,
+    bags,
+    clouds,
+    layouts,
+    messages,
+    pickles,
+)
+
+# The longest message: what is wrong must be found in it.
+LONGEST = 2000
+
+
+@dataclass(frozen=True)
+class Target:
+    """One parser.
+
+    Attributes:
+        name: of the target.
+        run: reads the file that holds the input; returns what it made, or raises one of `refusals`.
+        ending: of the file.
+        seeds: whole inputs to begin with.
+        refusals: the errors that its documentation names.
+        modules: what is instrumented for coverage.
+        words: what to put into inputs now and then.
+        most: the longest input [bytes].
+    """
+
+    name: str
+    run: Callable[[Path], Any]
+    ending: str
+    seeds: Callable[[], list[bytes]]
+    refusals: tuple[type[Exception], ...]
+    modules: tuple[str, ...]
+    words: tuple[str, ...] = ()
+    most: int = 8192
+
+
+def try_input(target: Target, data: bytes, folder: Path) -> str | None:
+    """Why the target refused the input, None where it made something of it; raises where it did neither properly."""
+    path = folder / f"input.{target.ending}"
+    path.write_bytes(data)
+    return outcome(lambda: target.run(path), *target.refusals)[1]
+
+
+def outcome(run: Callable[[], Any], *refusals: type[Exception]) -> tuple[Any, str | None]:
+    """What came of a call: its value, or None and the one line that it was refused with; raises what else it raises."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            return run(), None
+        except refusals as error:
+            told = str(error)
+            if "\n" in told or not told or len(told) > LONGEST:
+                raise AssertionError(f"an error of {len(told)} letters: {told[:200]!r}") from error
+            return None, told
+
+
+def scratch() -> Any:
+    """A folder for inputs, in memory where there is such a place."""
+    return tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
+
+
+def finite(*arrays: Any) -> None:
+    """Raise where a number is not finite."""
+    for array in arrays:
+        if not np.isfinite(np.asarray(array, dtype=float)).all():
+            raise AssertionError(f"not finite: {array!r}"[:300])
+
+
+def _hand(path: Path) -> Any:
+    from graspd_core.hands.library import read_hand_file
+
+    hand = read_hand_file(path)
+    finite(hand.lower, hand.upper, hand.link_offset_rotation, hand.link_offset_translation, hand.joint_axis)
+    finite(hand.link_mass, hand.link_com, hand.link_inertia, hand.link_multiplier, hand.link_shift)
+    for part in hand.primitives:
+        finite(part.rotation, part.translation, part.size)
+    assert (hand.lower < hand.upper).all(), "limits the wrong way round"
+    assert (hand.effort > 0).all(), "an effort of zero"
+    return hand
+
+
+@cache
+def _gripper() -> Any:
+    from graspd_core.hands.library import read_hand_file
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "gripper.urdf"
+        path.write_text(GRIPPER)
+        return read_hand_file(path)
+
+
+def _description(path: Path) -> Any:
+    from graspd_core.hands.description import apply_description, read_description
+
+    hand = apply_description(_gripper(), read_description(path))
+    finite(hand.palm_center, hand.palm_normal, hand.approach, hand.open_posture, hand.closed_posture)
+    return hand
+
+
+def _preset(path: Path) -> Any:
+    from graspd_core.config import load_preset
+
+    return load_preset(str(path))
+
+
+def _document(path: Path) -> Any:
+    from graspd_core.io import grasps_of, load_document
+
+    grasps = grasps_of(load_document(path))
+    for grasp in grasps:
+        for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze):
+            assert posture.position.shape == (3,), posture
+            assert posture.quaternion_wxyz.shape == (4,), posture
+            finite(posture.position, posture.quaternion_wxyz, posture.joint_positions)
+        finite(grasp.score, *(c.position for c in grasp.contacts), *(c.normal for c in grasp.contacts))
+    return grasps
+
+
+def _mano(path: Path) -> Any:
+    from graspd_core.hands.mano_file import read_mano
+
+    return read_mano(path)
+
+
+def _dae(path: Path) -> Any:
+    from graspd_core.geometry.dae import read_dae
+
+    mesh = read_dae(path)
+    assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices), "faces name vertices that are not there"
+    return mesh
+
+
+def _cloud(path: Path) -> Any:
+    from graspd_core.geometry.cloud_files import is_cloud_file, load_views
+
+    data = path.read_bytes()
+    ending = next((e for mark, e in ((b"PK", "npz"), (b"ply", "ply"), (b"#", "pcd")) if data.startswith(mark)), "npy")
+    named = path.rename(path.with_suffix(f".{ending}"))
+    if not is_cloud_file(named):
+        return None
+    views = load_views(named)
+    for view in views:
+        finite(view.viewpoint, *(() if view.forward is None else (view.forward,)))
+        assert view.points.ndim == 2, view.points.shape
+    return views
+
+
+def _layout(path: Path) -> Any:
+    """Width, height, step of a point and of a row, byte order and three fields, then the data."""
+    from graspd_core.geometry.layout import CloudLayout, points_from_layout
+
+    data = path.read_bytes().ljust(LAYOUT_HEAD.size, b"\0")
+    width, height, point, row, big, *places = LAYOUT_HEAD.unpack_from(data)
+    body = data[LAYOUT_HEAD.size :]
+    fields = {name: (places[2 * i], places[2 * i + 1]) for i, name in enumerate("xyz")}
+    points = points_from_layout(CloudLayout(width, height, point, row, bool(big & 1), fields, memoryview(body)))
+    finite(points)
+    return points
+
+
+def _bag(path: Path) -> Any:
+    from graspd_core.bags.reader import bag_topics, read_frames, read_transforms
+    from graspd_core.errors import BagError, CloudError, TransformError
+
+    named = path.rename(path.with_suffix(".db3" if path.read_bytes().startswith(b"SQLite") else ".mcap"))
+    made: list[Any] = []
+    for topic in [topic.name for topic in bag_topics(named)][:4]:
+        try:
+            for frame in read_frames(named, topic=topic, limit=4):
+                made.append(frame.view())
+        except (BagError, CloudError, TransformError) as error:
+            made.append(error)
+    made.append(read_transforms(named))
+    return made
+
+
+def _message(path: Path) -> Any:
+    """A message of one of four types, named by the first byte, as CDR."""
+    from graspd_core.bags.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
+    from graspd_core.bags.reader import CLOUD, IMAGE, INFO, TRANSFORMS, jazzy_types
+    from graspd_core.bags.writer import camera_info_message
+    from graspd_core.errors import FormatError
+    from graspd_core.geometry.camera import PinholeCamera
+    from graspd_core.transforms import TransformBuffer
+
+    data = path.read_bytes() or b"\0"
+    kind = (CLOUD, IMAGE, INFO, TRANSFORMS)[data[0] % 4]
+    try:
+        message = jazzy_types().deserialize_cdr(data[1:], kind)
+    except Exception as error:  # the library's own affair: BagError names it
+        raise FormatError("not a message") from error
+    if kind == CLOUD:
+        return cloud_from_message(message)
+    if kind == TRANSFORMS:
+        return add_transforms(TransformBuffer(), message, static=False)
+    stamp_of(message)
+    camera = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0)
+    if kind == IMAGE:
+        return cloud_from_depth_message(message, camera_info_message(camera, "c", 0))
+    from graspd_core.bags.writer import depth_message
+
+    image = depth_message(np.full((3, 4), 0.5), "c", 0)
+    return cloud_from_depth_message(image, message), cloud_from_depth_message(image, message, rectified=True)
+
+
+def _errors(*names: str) -> tuple[type[Exception], ...]:
+    from graspd_core import errors
+
+    return tuple(getattr(errors, name) for name in names)
+
+
+_HANDS = tuple(f"graspd_core.hands.{n}" for n in ("markup", "tree", "mimic", "elements", "meshfiles", "library"))
+_NUMBERS = ("nan", "inf", "-inf", "1e400", "1e308", "-1e308", "1e-320", "0", "-1", "99999999999999999999", "0x10")
+_YAML = ("&a", "*a", "<<:", "!!binary", "!!set", "2001-99-99", "? ", "[[", "{")
+
+TARGETS: dict[str, Target] = {
+    target.name: target
+    for target in (
+        Target(
+            "urdf", _hand, "urdf", lambda: URDFS, _errors("HandError"),
+            (*_HANDS, "graspd_core.hands.urdf", "graspd_core.hands.collision"),
+            (*_NUMBERS, "<mimic joint=", "<limit lower=", "continuous", "prismatic", "floating", "<mesh filename="),
+        ),
+        Target(
+            "mjcf", _hand, "xml", lambda: MJCFS, _errors("HandError"),
+            (*_HANDS, *(f"graspd_core.hands.mjcf{n}" for n in ("", "_values", "_geoms"))),
+            (*_NUMBERS, "polycoef=", "eulerseq=", "childclass=", "<freejoint/>", "quat=", "xyaxes=", "fromto="),
+        ),
+        Target(
+            "description", _description, "yaml", lambda: DESCRIPTIONS, _errors("HandError"),
+            ("graspd_core.hands.description", "graspd_core.hands.mount"),
+            (*_NUMBERS, *_YAML, "palm:", "!!timestamp", ".nan"),
+        ),
+        Target(
+            "preset", _preset, "yaml", lambda: PRESETS, _errors("ConfigError"),
+            ("graspd_core.config.mapping", "graspd_core.config.yaml_text"),
+            (*_NUMBERS, *_YAML, "closed_form:", ".inf", "null"),
+        ),
+        Target(
+            "document", _document, "json", lambda: DOCUMENTS, _errors("FormatError"), ("graspd_core.io",),
+            (*_NUMBERS, '"grasps"', '"hand"', "null", "true", "[[", '"mimic"', "NaN", '"verified"', '{"hold":'),
+        ),
+        Target(
+            "mano", _mano, "pkl", pickles, _errors("HandError"),
+            tuple(f"graspd_core.hands.mano_{n}" for n in ("file", "numbers", "pickle")),
+            ("cnumpy\nndarray\n", "cnumpy\ndtype\n", "cchumpy.ch\nCh\n", "(", "tR", "}", "\x8a\xff", "\x8d", "2"),
+            16384,
+        ),
+        Target(
+            "dae", _dae, "dae", lambda: DAES, (ValueError,), ("graspd_core.geometry.dae",),
+            (*_NUMBERS, "offset=", "stride=", "<vcount>", "<p>", "<instance_node url=", "<matrix>", "<rotate>"),
+        ),
+        Target(
+            "cloud", _cloud, "npy", clouds, _errors("CloudError"),
+            ("graspd_core.geometry.cloud_files", "graspd_core.geometry.point_files"),
+            (*_NUMBERS, "POINTS ", "WIDTH ", "VIEWPOINT ", "DATA ascii", "element vertex ", "element face 1"),
+        ),
+        Target("layout", _layout, "bin", layouts, _errors("CloudError"), ("graspd_core.geometry.layout",)),
+        Target(
+            "message", _message, "bin", messages, _errors("CloudError", "TransformError", "FormatError"),
+            tuple(f"graspd_core.{n}" for n in ("bags.messages", "geometry.camera", "geometry.depth", "transforms")),
+        ),
+        Target(
+            "bag", _bag, "mcap", bags, _errors("BagError", "CloudError", "TransformError"),
+            ("graspd_core.bags.reader", "graspd_core.bags.messages"), (), 65536,
+        ),
+    )
+}  # fmt: skip

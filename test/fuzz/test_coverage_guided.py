@@ -1,0 +1,57 @@
+"""The coverage-guided fuzzer itself: it runs, learns, and finds what is planted; not where atheris is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("atheris")
+
+FUZZ = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"
+PLANTED = """
+import sys
+sys.path.insert(0, {folder!r})
+import fuzz_targets
+from graspd_core.config import mapping
+
+def eager(cls, values, where):
+    if "method" in values:
+        raise KeyError("planted")
+    return values
+
+import graspd_core.config
+graspd_core.config.from_mapping = eager
+import runpy
+sys.argv = ["fuzz.py", "--child", "preset", "--seconds", "1", "--out", {out!r}]
+runpy.run_path({file!r}, run_name="__main__")
+"""
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, errors="replace", timeout=100)
+
+
+def test_one_second_finds_nothing(tmp_path: Path) -> None:
+    ended = run(str(FUZZ), "--targets", "layout", "--minutes", "0.02", "--out", str(tmp_path))
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    (row,) = (line.split("|")[1:-1] for line in ended.stdout.splitlines() if line.startswith("| layout"))
+    inputs, edges, _, findings = map(int, row[1:])
+    assert inputs > 20, ended.stdout
+    assert edges > 5, ended.stdout
+    assert findings == 0, ended.stdout
+    assert len(list((tmp_path / "corpus" / "layout").iterdir())) > 2
+
+
+def test_what_is_planted_is_found_and_kept(tmp_path: Path) -> None:
+    ended = run("-c", PLANTED.format(folder=str(FUZZ.parent), out=str(tmp_path), file=str(FUZZ)))
+    notes = [path.read_text() for path in (tmp_path / "findings").glob("preset-*.txt")]
+    assert any("KeyError: 'planted'" in note for note in notes), ended.stderr
+
+
+def test_an_unknown_target_is_refused() -> None:
+    ended = run(str(FUZZ), "--targets", "urdg")
+    assert ended.returncode == 2
+    assert "unknown target 'urdg'; choose from urdf, mjcf" in ended.stderr
