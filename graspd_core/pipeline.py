@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -23,31 +19,22 @@ from graspd_core.geometry.memory import give_memory_back, share_arenas
 from graspd_core.geometry.mesh import surface_samples
 from graspd_core.geometry.own_process import elsewhere, work_elsewhere
 from graspd_core.geometry.perceive import scene_from_views
-from graspd_core.geometry.scene import Scene, object_parts
+from graspd_core.geometry.scene import Scene
 from graspd_core.geometry.shapes import make_shape
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel, Mount, all_joint_names, all_joint_positions
 from graspd_core.metrics.judge import make_judge
 from graspd_core.metrics.quality import measure
-from graspd_core.optimise.effort import at_effort
+from graspd_core.optimise.reach import out_of_reach
 from graspd_core.optimise.solver import Hooks
 from graspd_core.optimise.synthesis import synthesise
-from graspd_core.types import (
-    Grasp,
-    GraspResult,
-    Outcome,
-    Progress,
-    ProgressHook,
-    Stage,
-    StopHook,
-    Timing,
-    TriangleMesh,
-    Verdict,
-)
-from graspd_core.verify.lift import lift_trial, retreat_posture
-from graspd_core.verify.trial import hold_trial, judge
-from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+from graspd_core.planning.clock import Run
+from graspd_core.planning.memory import enough_memory
+from graspd_core.planning.rounds import rounds_of
+from graspd_core.planning.trials import by_robustness, open_court, parts_in_background, try_in_order
+from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
+from graspd_core.verify.lift import retreat_posture
 
 __all__ = [
     "HandModel",
@@ -74,16 +61,8 @@ __all__ = [
     "warm_up",
 ]
 
-T = TypeVar("T")
-
-# How often stop and deadline are looked at while waiting for the collision parts [s].
-_POLL = 0.02
-
 # How far apart the seeds of two rounds are.
 _SEED_STEP = 1_000_003
-
-# Objects are cut into convex parts one at a time.
-_CUTTING = threading.Lock()
 
 
 def plan_grasps(
@@ -119,39 +98,46 @@ def plan_grasps(
 
     Raises:
         ConfigError: count, seed, verify, deadline, device or preset is not valid.
+        ResourceError: the machine has too little memory for so many grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
-    run = _Run(scene, time.perf_counter(), deadline, progress or (lambda _: None), stop or (lambda: False))
-    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing.
-    rounds = [] if run.over() else _rounds(scene, config, verify)
-    # The collision parts take about as long as the optimiser: build them beside it.
-    parts = _in_background(lambda: _cut(run)) if rounds and verify != "none" else None
+    run = Run(time.perf_counter(), deadline, progress, stop)
+    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing; and no search
+    # finds what cannot be.
+    message = "" if run.over() else out_of_reach(scene, hand)
+    rounds = [] if run.over() or message else rounds_of(scene, config, verify)
+    parts = parts_in_background(run, scene) if rounds and verify != "none" else None
     hooks = Hooks(
         report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
         # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its postures.
         stop=run.over,
     )
     grasps: tuple[Grasp, ...] = ()
-    first, good, optimising = None, 0, 0.0
+    court = first = None
+    good, optimising = 0, 0.0
     # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
     for attempt, settings in enumerate(rounds):
         began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
-        found = synthesise(scene, hand, count=count - good, seed=seeded, config=settings, hooks=hooks, device=device)
+        wanted = count - good
+        with enough_memory(f"{wanted} grasps at once"):
+            found = synthesise(scene, hand, count=wanted, seed=seeded, config=settings, hooks=hooks, device=device)
         optimising += time.perf_counter() - began
         if parts is None:
             metrics_judge = make_judge(scene.object, hand)
-            new = tuple(replace(g, metrics=measure(metrics_judge, g.grasp)) for g in found.grasps[: count - good])
+            new = tuple(replace(g, metrics=measure(metrics_judge, g.grasp)) for g in found.grasps[:wanted])
         else:
-            protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-            new, passed_at = _verify(run, scene, hand, found.grasps, parts, protocol, count - good, good)
+            if court is None and found.grasps:
+                court = open_court(run, scene, hand, parts, verify)
+            new, passed_at = try_in_order(run, court, found.grasps, wanted, good) if court else ((), None)
             first = first or passed_at
         grasps = tuple(sorted((*grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
         good = sum(g.verdict is not Verdict.FAILED for g in grasps)
         if good >= count or run.over():
             break
+    if court and config.robust.rank:
+        grasps = by_robustness(run, court, grasps, config.robust, seed)
     finished = time.perf_counter()
-    outcome = _outcome(run, bool(grasps), good, count)
     load, sdf = scene.timing
     timing = Timing(
         load=load,
@@ -161,8 +147,9 @@ def plan_grasps(
         first_verified=None if first is None else first - run.began + load + sdf,
         total=finished - run.began + load + sdf,
     )
+    outcome = run.outcome(bool(grasps), good, count)
     run.report(Stage.DONE, 1, 1, 0.0, good)
-    return GraspResult(outcome, grasps, timing, seed, config.method, "", scene.object.warnings, scene.support)
+    return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, scene.support)
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
@@ -191,112 +178,3 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
     scene = elsewhere(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
     plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)
-
-
-def _rounds(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
-    """Settings of every round, each with more effort than the last.
-
-    A cheap first round pays where its failures are found out at little cost: by a hold trial, on an object whose shape
-    is known and that has nothing about it.
-    """
-    rounds = config.rounds
-    cheap = verify != "none" and scene.support is None and not scene.neighbours and scene.trust is None
-    first = rounds.first_effort if cheap else 1.0
-    most = rounds.first_effort * rounds.growth ** (rounds.most - 1)
-    efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
-    return [at_effort(config, effort) for effort in efforts]
-
-
-def _in_background(work: Callable[[], T]) -> Future[T]:
-    """Start work in a thread of its own; nobody waits for it but who asks for its result, and the process's end."""
-    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
-    future = pool.submit(work)
-    pool.shutdown(wait=False)
-    return future
-
-
-def _cut(run: _Run) -> tuple[TriangleMesh, ...]:
-    """The object's convex parts, one object at a time; none where the run was over before its turn came.
-
-    Runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
-    """
-    with _CUTTING:
-        return () if run.known_over() else object_parts(run.scene.object)
-
-
-class _Run:
-    """Clock, hooks and end of one run."""
-
-    def __init__(
-        self, scene: Scene, began: float, deadline: float | None, progress: ProgressHook, stop: StopHook
-    ) -> None:
-        self.scene, self.began, self.progress = scene, began, progress
-        self.end = began + deadline if deadline is not None else float("inf")
-        self.cancelled = False
-        self._stop = stop
-
-    def stop(self) -> bool:
-        self.cancelled = self.cancelled or self._stop()
-        return self.cancelled
-
-    def over(self) -> bool:
-        return self.stop() or self.known_over()
-
-    def known_over(self) -> bool:
-        """As `over`, for other threads: the stop hook is asked by the run's own thread alone."""
-        return self.cancelled or time.perf_counter() >= self.end
-
-    def report(self, stage: Stage, step: int, of: int, best: float, verified: int) -> None:
-        self.progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began))
-
-
-def _verify(
-    run: _Run,
-    scene: Scene,
-    hand: HandModel,
-    candidates: tuple[Grasp, ...],
-    parts: Future[tuple[TriangleMesh, ...]],
-    protocol,
-    count: int,
-    before: int,
-) -> tuple[tuple[Grasp, ...], float | None]:
-    """Try candidates in rank order until `count` held (`before` did already); verified ones first, then the failed."""
-    verified: list[Grasp] = []
-    failed: list[Grasp] = []
-    first = None
-    while candidates and not run.over() and not wait([parts], timeout=_POLL).done:
-        pass
-    if not candidates or run.over():
-        return (), None
-    world = build_world(hand, scene.object, parts.result(), protocol)
-    around = None
-    if scene.support is not None or scene.neighbours:
-        around = build_world(hand, scene.object, parts.result(), protocol, scene.support, scene.neighbours)
-    metrics_judge = make_judge(scene.object, hand)
-    for index, grasp in enumerate(candidates):
-        if len(verified) == count or run.over():
-            break
-        hold = hold_trial(world, grasp, protocol, stop=run.over)
-        lift = lift_trial(around, hand, grasp, protocol, stop=run.over) if around and hold.passed else None
-        passed = hold.passed and (lift is None or lift.passed)
-        if run.over() and not passed:
-            # A trial that was cut short says nothing of the grasp.
-            break
-        tried = judge(replace(grasp, metrics=measure(metrics_judge, grasp.grasp)), hold, lift)
-        if passed:
-            first = first or time.perf_counter()
-            verified.append(tried)
-        else:
-            failed.append(tried)
-        run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified))
-    return (*verified, *failed), first
-
-
-def _outcome(run: _Run, any_found: bool, good: int, count: int) -> Outcome:
-    if good >= count:
-        return Outcome.SUCCEEDED
-    if run.cancelled:
-        return Outcome.CANCELLED
-    if time.perf_counter() >= run.end:
-        return Outcome.DEADLINE
-    return Outcome.TOO_FEW if any_found else Outcome.NO_CANDIDATES

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core import pipeline
 from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
 from graspd_core.geometry import cache
 from graspd_core.pipeline import load_hand, load_scene, plan_grasps
+from graspd_core.planning import trials
 from graspd_core.types import Grasp, GraspResult, LiftResult, Outcome, Plane, Progress, Stage, Verdict
 
 # How late a run may end: one optimiser step on a busy machine, not the seconds that a run takes.
@@ -75,7 +75,7 @@ def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result)
 
 def test_a_grasp_that_holds_but_cannot_be_lifted_is_not_verified(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
     lost = LiftResult(False, 0.06, 0.0, 0.0, "the object moved 6.0 cm while lifting")
-    monkeypatch.setattr(pipeline, "lift_trial", lambda *_, **__: lost)
+    monkeypatch.setattr(trials, "lift_trial", lambda *_, **__: lost)
     table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()))
     tried: list[Progress] = []
     short = plan_grasps(
@@ -182,7 +182,7 @@ def test_collision_parts_of_cancelled_runs_do_not_pile_up(scene, hand, result):
     fresh = replace(scene, object=replace(scene.object, sha256="of nobody else"))
     stop = threading.Event()
     before = set(threading.enumerate())
-    with pipeline._CUTTING:
+    with trials._CUTTING:
         cancelled = plan_grasps(fresh, hand, count=1, progress=lambda _: stop.set(), stop=stop.is_set)
     assert cancelled.outcome is Outcome.CANCELLED
     # The thread that waited for its turn ends at once, and nothing was cut.
@@ -204,7 +204,7 @@ def test_what_held_in_an_earlier_round_stays_told(scene, hand):
 
 def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
-    monkeypatch.setattr(pipeline, "object_parts", lambda _: release.wait(30))
+    monkeypatch.setattr(trials, "object_parts", lambda _: release.wait(30))
     begun = time.perf_counter()
     late = plan_grasps(scene, hand, count=1, preset="fast", deadline=3.0)
     assert time.perf_counter() - begun < 3.0 + LATE

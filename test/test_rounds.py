@@ -10,7 +10,7 @@ import pytest
 from graspd_core.config import PlanConfig, RoundsConfig, load_preset
 from graspd_core.geometry.load import load_scene
 from graspd_core.optimise.effort import at_effort
-from graspd_core.pipeline import _rounds
+from graspd_core.planning.rounds import rounds_of
 from graspd_core.types import Plane
 
 
@@ -24,17 +24,17 @@ def efforts(*values: float) -> list[PlanConfig]:
 
 
 def test_a_known_object_alone_begins_cheaply(scene):
-    assert _rounds(scene, PlanConfig(), "standard") == efforts(0.5, 1.0, 2.0)
+    assert rounds_of(scene, PlanConfig(), "standard") == efforts(0.5, 1.0, 2.0)
 
 
 def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_steps(scene):
     table = replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), -0.045))
-    assert _rounds(scene, PlanConfig(), "none") == efforts(1.0, 2.0, 2.0)
-    assert _rounds(table, PlanConfig(), "standard") == efforts(1.0, 2.0, 2.0)
+    assert rounds_of(scene, PlanConfig(), "none") == efforts(1.0, 2.0, 2.0)
+    assert rounds_of(table, PlanConfig(), "standard") == efforts(1.0, 2.0, 2.0)
 
 
 def test_rounds_are_a_setting(scene):
     steady = PlanConfig(rounds=RoundsConfig(most=2, first_effort=1.0, growth=1.0))
-    assert _rounds(scene, steady, "standard") == [steady, steady]
+    assert rounds_of(scene, steady, "standard") == [steady, steady]
     for name in ("fast", "accurate"):
-        assert _rounds(scene, load_preset(name), "standard")[0] == load_preset(name)
+        assert rounds_of(scene, load_preset(name), "standard")[0] == load_preset(name)

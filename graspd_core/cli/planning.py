@@ -23,6 +23,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     parser.add_argument("--deadline", type=float, default=None, metavar="SEC", help="end with what there is then")
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
+    parser.add_argument("--robust", action="store_true", help="grasps that hold out of place too come first")
     parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
     parser.add_argument("--threads", type=int, default=1, help="torch threads (default 1)")
 
@@ -45,6 +46,8 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     config = load_preset(options.preset)
     if options.method:
         config = dataclasses.replace(config, method=options.method)
+    if options.robust:
+        config = dataclasses.replace(config, robust=dataclasses.replace(config.robust, rank=True))
     return config, request
 
 
@@ -52,7 +55,8 @@ def summary(result: GraspResult, wanted: int) -> str:
     """A few lines for a person."""
     good = good_grasps(result)
     kind = "unverified" if any(g.verdict is Verdict.UNVERIFIED for g in result.grasps) else "verified"
-    lines = [f"{good} of {wanted} grasps ({kind}, {len(result.grasps)} tried): {result.outcome.value}"]
+    ending = result.message or result.outcome.value
+    lines = [f"{good} of {wanted} grasps ({kind}, {len(result.grasps)} tried): {ending}"]
     timing = result.timing
     lines.append(
         f"load {timing.load:.2f} s, sdf {timing.sdf:.2f} s, optimise {timing.optimise:.2f} s, "
@@ -64,6 +68,7 @@ def summary(result: GraspResult, wanted: int) -> str:
             lines.append(
                 f"  #{rank}: {len(grasp.contacts)} contacts, penetration {grasp.metrics.penetration * 1e3:.1f} mm, "
                 f"contact area {grasp.metrics.contact_area * 1e4:.1f} cm², epsilon {grasp.metrics.epsilon:.3f}"
+                + ("" if grasp.metrics.robustness is None else f", holds {grasp.metrics.robustness:.0%} out of place")
             )
     return "\n".join(lines)
 

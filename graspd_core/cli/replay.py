@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
             first = result.timing.first_verified
             print(
                 f"{job.label}: {sum(len(v.points) for v in job.views)} points, {good} of {options.count} grasps "
-                f"({len(result.grasps)} tried): {result.outcome.value}; "
+                f"({len(result.grasps)} tried): {result.message or result.outcome.value}; "
                 + (f"first verified after {first:.2f} s, " if first else "")
                 + f"total {result.timing.total:.2f} s",
                 flush=True,

@@ -22,6 +22,9 @@ from graspd_core.se3 import rotation_from_quaternion
 _BETA1, _BETA2, _ADAM_EPSILON = 0.9, 0.98, 1e-8
 # Share of the step size that is left at the end of the run.
 _FINAL_RATE = 0.05
+# Fewer rows than this are evaluated among copies of the first: products of one to three rows are summed in another
+# order than those of more, and from the last bit of a float32 a start would go another way alone than among others.
+_FEWEST_ROWS = 8
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,10 @@ class ClosedForm:
         polish: bool,
     ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"]]:
         """Loss per start and its gradient; a start whose gradient is not finite stands still."""
-        x = x.detach().requires_grad_(True)
+        rows = len(x)
+        short = max(0, _FEWEST_ROWS - rows)
+        x = torch.cat([x, x[:1].expand(short, -1)]).detach().requires_grad_(True)
+        radius = torch.cat([radius, radius[:1].expand(short)])
         poses = moved_along(unpack(x), -problem.pivot)
         activate = soft_contact if self.config.activation == "soft" else hard_contact
         terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, polish, activate)
@@ -136,7 +142,7 @@ class ClosedForm:
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         finite = torch.isfinite(gradient).all(-1) & torch.isfinite(loss)
         loss = torch.where(finite, loss.detach(), torch.full_like(loss, torch.inf))
-        return loss.detach(), torch.where(finite[:, None], gradient, torch.zeros_like(gradient))
+        return loss[:rows], torch.where(finite[:, None], gradient, torch.zeros_like(gradient))[:rows]
 
 
 def evaluate_distance(problem: Problem, poses: Poses) -> Float[Tensor, "batch"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,8 @@ from graspd_core.verify.trial import hold_trial
 from graspd_core.verify.world import Protocol, World
 
 TRIALS = 8
+# A turn and an offset [m] of the hand.
+PoseError = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 # Errors are uniform up to these: along each axis [m], and about a random axis through the centre of mass [rad].
 OFFSET, TURN = 0.005, float(np.deg2rad(5.0))
 
@@ -34,13 +36,34 @@ def noisy_holds(
     The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same
     errors. A start that the error pushes too deep into the object counts as not held.
     """
-    rng = np.random.default_rng(seed)
-    errors = [pose_error(rng) for _ in range(TRIALS)]
-    moved = [displaced(grasp, *error, world.center_of_mass) for error in errors]
+    moved = [displaced(grasp, *error, world.center_of_mass) for error in pose_errors(seed, TRIALS)]
     return tuple(hold_trial(world, g, protocol, stop=stop) for g in moved)
 
 
-def pose_error(rng: np.random.Generator) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+def noisy_share(
+    world: World,
+    grasp: Grasp,
+    protocol: Protocol,
+    errors: Sequence[PoseError],
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> float | None:
+    """Share of hold trials under the given errors that the grasp passes; None where `stop` ended one of them."""
+    held = 0
+    for error in errors:
+        held += hold_trial(world, displaced(grasp, *error, world.center_of_mass), protocol, stop=stop).passed
+        if stop():
+            return None
+    return held / len(errors)
+
+
+def pose_errors(seed: int | Sequence[int], count: int) -> list[PoseError]:
+    """Seeded errors, one for each trial."""
+    rng = np.random.default_rng(seed)
+    return [pose_error(rng) for _ in range(count)]
+
+
+def pose_error(rng: np.random.Generator) -> PoseError:
     """A random turn and a random offset [m]."""
     axis = rng.normal(size=3)
     angle = torch.tensor(rng.uniform(-TURN, TURN), dtype=torch.float64)

@@ -1,0 +1,99 @@
+"""Objects that a hand cannot hold anywhere are told before any search, in words that a user can act on.
+
+A necessary condition of every grasp, from statics alone: contact forces that cancel cannot all point into one open
+half-space. All contacts of a hand lie within its span of each other; where the surface normals of every such patch of
+the object stay so close together that no force in their friction cones opposes the others, nothing can be held. Rims,
+handles, walls and thin plates have opposing normals next to each other and pass.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.geometry.mesh import surface_samples
+from graspd_core.geometry.scene import Scene
+from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.model import HandModel
+from graspd_core.optimise.problem import fingertip_groups
+
+# The roughest surface that a trial believes in; see `verify.world.at_friction`.
+_MOST_FRICTION = 0.6
+# Points of the surface and, beside them, middles of faces, so that no small handle is missed.
+_SAMPLES = 4000
+# Directions that the object's width is looked at along.
+_DIRECTIONS = 400
+# Steps of the search for a direction that all forces of a patch point away from.
+_STEPS = 60
+
+
+def out_of_reach(scene: Scene, hand: HandModel) -> str:
+    """Why the hand can hold the object nowhere, as a sentence; empty where it may."""
+    span, opening = reach_of(hand)
+    points, normals = _surface(scene)
+    # A convex body is narrowest along a normal of its surface.
+    narrowest = float(np.ptp(scene.object.mesh.vertices @ normals[:: len(normals) // _DIRECTIONS + 1].T, axis=0).min())
+    if narrowest <= span:
+        return ""
+    angle = np.arctan(min(scene.object.friction, _MOST_FRICTION))
+    if not _one_sided(points, normals, span, float(np.sin(angle))):
+        return ""
+    return (
+        f"the object is {_centimetres(narrowest)} across where it is narrowest, without edge or handle to hold it by, "
+        f"and the fingertips of {hand.name} open to {_centimetres(opening)}: smaller things or a larger hand"
+    )
+
+
+def reach_of(hand: HandModel) -> tuple[float, float]:
+    """Of the open hand: the greatest distance of two points of it, and the widest gap between two fingertips [m]."""
+    frames = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
+    links = torch.as_tensor(hand.candidate_link)
+    rotations, translations = (frame[0, links] for frame in frames)
+    points = (rotations @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + translations
+    groups = hand.link_group[hand.candidate_link]
+    tips = [points[torch.as_tensor(groups == group)] for group in fingertip_groups(hand)]
+    gaps = [float(torch.cdist(a, b).min()) for k, a in enumerate(tips) for b in tips[:k] if len(a) and len(b)]
+    return float(torch.cdist(points, points).max()), max(gaps, default=0.0)
+
+
+def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of the object's surface and their outward unit normals."""
+    mesh = scene.object.mesh
+    points, normals = surface_samples(mesh, _SAMPLES, seed=0)
+    corners = mesh.vertices[mesh.faces[:: len(mesh.faces) // _SAMPLES + 1]]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+    return np.concatenate([points, corners.mean(1)]), np.concatenate([normals, across])
+
+
+def _one_sided(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, least: float
+) -> bool:
+    """Whether in every patch of `radius` [m] of the surface one direction separates all forces from their opposites.
+
+    A direction a does so where n·a > `least`, the sine of the friction angle, for all normals n. The best one is along
+    the point of their convex hull that is nearest to the origin; Gilbert's steps go there (SIAM J. Control 1966), and
+    the first patch whose point is too near for any direction ends the search.
+    """
+    _, first = np.unique(np.round(points / (radius / 2)).astype(np.int64), axis=0, return_index=True)
+    within = np.linalg.norm(points[first, None] - points[None], axis=-1) < radius
+    nearest = normals[first]
+    for _ in range(_STEPS):
+        along = np.where(within, nearest @ normals.T, np.inf)
+        worst = along.argmin(1)
+        length = np.linalg.norm(nearest, axis=-1)
+        if (length <= least).any():
+            return False
+        open_ = along[np.arange(len(worst)), worst] <= least * length
+        if not open_.any():
+            return True
+        within, nearest, worst = within[open_], nearest[open_], worst[open_]
+        step = nearest - normals[worst]
+        share = (nearest * step).sum(-1) / np.maximum((step * step).sum(-1), 1e-12)
+        nearest = nearest - np.clip(share, 0.0, 1.0)[:, None] * step
+    return False
+
+
+def _centimetres(metres: float) -> str:
+    return f"{metres * 100:.0f} cm"
