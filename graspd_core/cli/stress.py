@@ -25,13 +25,15 @@ def run(options: argparse.Namespace) -> int:
     preset = (options.presets or ["balanced"])[0]
     load_preset(preset)
     cases = cases_of(options.cases)
-    anything = options.any_code or options.no_run
-    shelf = Shelf(options.out, preset, None if anything else code_version("stress"))
-    endings = {case: ending for case in cases if (ending := shelf.read(case)) is not None}
+    shelf = Shelf(options.out, preset, code_version("stress"), any_code=options.any_code or options.no_run)
+    kept = {case: found for case in cases if (found := shelf.read(case)) is not None}
+    endings = {case: ending for case, (ending, _) in kept.items()}
+    codes = {code for _, code in kept.values()}
     todo = [] if options.no_run else [case for case in cases if case not in endings]
     with Interrupt() as interrupt:
         for case, ending in run_cases(todo, shelf, options.processes, interrupt.came):
             endings[case] = ending
+            codes.add(shelf.code)
             wrong = "".join(f"\n  {fault}" for fault in faults(case, ending))
             took = f"{ending.loading + ending.planning:.1f} s"
             print(f"graspd: {len(endings)}/{len(cases)} {case.name}: {ending.ending}, {took}{wrong}", file=sys.stderr)
@@ -39,8 +41,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"graspd: interrupted; {len(endings)} of {len(cases)} cases are kept in {options.out}", file=sys.stderr)
         return EXIT_INTERRUPTED
     found = {case: endings[case] for case in cases if case in endings}
-    told = f"{summary(found)}\n\n{stress_table(found)}"
+    came, table = f"{summary(found)}\n\nPreset `{preset}`; code {', '.join(sorted(codes))}.", stress_table(found)
     for document in options.readme:
-        fill(document, {"stress": told})
-    print(told)
+        fill(document, {"stress-summary": came, "stress": table})
+    print(f"{came}\n\n{table}")
     return EXIT_FAULTS if any(faults(case, ending) for case, ending in found.items()) else EXIT_OK

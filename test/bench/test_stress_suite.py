@@ -29,7 +29,7 @@ def test_a_case_ends_in_a_process_of_its_own_and_a_death_is_an_ending(tmp_path: 
     assert "nan-vertices.obj: 3 of " in endings["nan-vertices"].message
     assert endings["not-a-case"].ending == "crash"
     assert "not-a-case" in endings["not-a-case"].message
-    assert shelf.read(NAN) == endings["nan-vertices"]
+    assert shelf.read(NAN) == (endings["nan-vertices"], "here")
 
 
 def test_a_process_that_does_not_end_is_killed_and_called_hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -46,8 +46,8 @@ def test_nothing_is_begun_once_stopped(tmp_path: Path):
 
 def test_an_ending_counts_for_its_code_and_preset_alone(tmp_path: Path):
     Shelf(tmp_path, "fast", "here").write(GRASPED, BOX)
-    assert Shelf(tmp_path, "fast", "here").read(BOX) == GRASPED
-    assert Shelf(tmp_path, "fast", None).read(BOX) == GRASPED
+    assert Shelf(tmp_path, "fast", "here").read(BOX) == (GRASPED, "here")
+    assert Shelf(tmp_path, "fast", "there", any_code=True).read(BOX) == (GRASPED, "here")
     assert Shelf(tmp_path, "fast", "there").read(BOX) is None
     assert Shelf(tmp_path, "balanced", "here").read(BOX) is None
     Shelf(tmp_path, "fast", "here").path(BOX).write_text('{"preset": "fast", "code": "here", "ending": {"odd": 1}}')
@@ -76,10 +76,13 @@ def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
 def test_the_command_reports_kept_endings_and_fills_a_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Shelf(tmp_path, "balanced", "here").write(GRASPED, BOX)
     page = tmp_path / "page.md"
-    page.write_text("<!-- stress:begin -->\nbygone\n<!-- stress:end -->\n")
+    sections = ("stress-summary", "stress")
+    page.write_text("".join(f"<!-- {name}:begin -->\nbygone\n<!-- {name}:end -->\n" for name in sections))
     command = ["bench", "--suite", "stress", "--no-run", "--out", str(tmp_path), "--readme", str(page)]
     assert main(command) == EXIT_OK
     assert "1 cases, 0 faults." in capsys.readouterr().out
+    assert "1 cases, 0 faults." in page.read_text()
+    assert "Preset `balanced`; code here." in page.read_text()
     assert "open-box" in page.read_text()
     assert "bygone" not in page.read_text()
 

@@ -40,12 +40,14 @@ class Shelf:
     Attributes:
         folder: of the files.
         preset: that the cases are planned with.
-        code: version of the code; None takes those of any.
+        code: version of the code.
+        any_code: endings of other versions count, too.
     """
 
     folder: Path
     preset: str
-    code: str | None
+    code: str
+    any_code: bool = False
 
     def path(self, case: Case) -> Path:
         """The file of one case."""
@@ -56,12 +58,12 @@ class Shelf:
         kept = {"format": FORMAT, "version": VERSION, "code": self.code, "preset": self.preset}
         save_text(self.path(case), json.dumps({**kept, "ending": asdict(ending)}, indent=1) + "\n")
 
-    def read(self, case: Case) -> Ending | None:
-        """The ending of a case, None where there is none of this code and preset."""
+    def read(self, case: Case) -> tuple[Ending, str] | None:
+        """The ending of a case and the code that it came of; None where there is none that counts."""
         try:
             kept = json.loads(self.path(case).read_text(encoding="utf-8"))
-            good = kept["preset"] == self.preset and (self.code is None or kept["code"] == self.code)
-            return Ending(**kept["ending"]) if good else None
+            good = kept["preset"] == self.preset and (self.any_code or kept["code"] == self.code)
+            return (Ending(**kept["ending"]), str(kept["code"])) if good else None
         except (OSError, ValueError, TypeError, KeyError):
             return None
 
