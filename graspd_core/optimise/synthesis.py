@@ -37,9 +37,9 @@ from graspd_core.types import Contact, Grasp, Posture
 _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 # A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
 _DEEPEST = 0.0015
-# So is one that is deeper than this in the object at its grasp, or on its way there: it began inside and did not get
-# out, and a trial would refuse it [m].
-_DEEPEST_IN_OBJECT, _DEEPEST_ON_THE_WAY = 0.005, 0.01
+# So is one that is deeper than this in the object before its grasp, where a trial would refuse it: it began inside and
+# did not get out [m]. Of the grasp itself nothing is asked: some methods press fingers in deep, and yet hold.
+_DEEPEST_ON_THE_WAY = 0.01
 # What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
 _KNOCK_COST = 100.0
 
@@ -107,9 +107,7 @@ def assemble(
         depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
         overlap = torch.maximum(overlap, depth.to(overlap))
     scores = score(touches, pressed, clearance, overlap)
-    stuck = (touches.distance.amin(-1) < -_DEEPEST_IN_OBJECT) | (
-        -clearance * config.postures.clearance > _DEEPEST_ON_THE_WAY
-    )
+    stuck = -clearance * config.postures.clearance > _DEEPEST_ON_THE_WAY
     scores = torch.where(stuck, -torch.inf, scores)
     if problem.obstacles is not None:
         ends = (opened.translation, opened.joints), (poses.translation, poses.joints)

@@ -103,7 +103,7 @@ class _Running:
         command = [sys.executable, "-m", "graspd_core.bench.stress.run", case.name, "--preset", preset]
         self._streams = out, err = _scratch(), _scratch()
         # A group of its own: a Ctrl-C is the parent's, who decides what it means.
-        self._process = subprocess.Popen(command, stdout=out, stderr=err, start_new_session=True)
+        self._process = subprocess.Popen(command, stdout=out, stderr=err, process_group=0)
 
     def over(self) -> bool:
         return self._process.poll() is not None or time.perf_counter() > self._end
