@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.bench.charts_maps import draw_map
+from graspd_core.bench.charts_maps import Shares, draw_map
 from graspd_core.bench.maps import friction_mass, size, view, wall
 from graspd_core.bench.maps.atlas import COUNT, MAPS, METHODS, Axis, jobs_of
 from graspd_core.bench.maps.job import Job, hand_for, job_key, kind_of, run_job
@@ -153,7 +153,7 @@ def test_pictures_show_what_is_stored_and_are_the_same_every_time(tmp_path: Path
 
 
 def test_rows_of_which_nothing_is_known_are_left_out(tmp_path: Path):
-    panels = {"some": {(x, "box"): 0.5 for x in MAPS["size"].across.places}}
+    panels: dict[str, Shares] = {"some": {(x, "box"): 0.5 for x in MAPS["size"].across.places}}
     draw_map(MAPS["size"], panels, tmp_path / "part")
     said = (tmp_path / "part.svg").read_text()
     assert "<!-- box -->" in said
