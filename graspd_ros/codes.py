@@ -11,6 +11,7 @@ from graspd_core.errors import (
     HandError,
     MeshError,
     NoObjectError,
+    ResourceError,
     TransformError,
 )
 
@@ -54,6 +55,7 @@ _CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
     (TransformError, ErrorCode.NO_TRANSFORM),
     (HandError, ErrorCode.WRONG_HAND),
     (ConfigError, ErrorCode.BAD_REQUEST),
+    (ResourceError, ErrorCode.OUT_OF_MEMORY),
     (MemoryError, ErrorCode.OUT_OF_MEMORY),
 )
 

@@ -56,6 +56,8 @@ def test_a_plan_is_put_in_order_and_says_by_what():
     world = build_world(hand, scene.object, object_parts(scene.object), PROTOCOLS["standard"])
     errors = pose_errors(0, 2)
     assert noisy_share(world, result.grasps[0], PROTOCOLS["standard"], errors, stop=lambda: True) is None
+    # Nor do none at all.
+    assert noisy_share(world, result.grasps[0], PROTOCOLS["standard"], []) is None
 
 
 def test_the_preset_and_only_it_ranks():

@@ -15,6 +15,9 @@ REACH = 0.004
 FEWEST = 8
 # Shorter sides than this share of the outline's size are no border of a picture.
 LONG = 0.1
+# A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
+# of a thing to the corner of the table behind it has none between.
+PARTS, FILLED = 20, 0.6
 
 
 def reaches_border(
@@ -34,8 +37,15 @@ def reaches_border(
         return False
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > LONG * np.ptp(plane, axis=0).max()
-    for *normal, offset in hull.equations[long]:
+    for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
         near = plane @ np.array(normal) + offset > -REACH
-        if min((near & mine).sum(), (near & ~mine).sum()) >= FEWEST:
+        if min((near & mine).sum(), (near & ~mine).sum()) >= FEWEST and _filled(plane[near], start, end) >= FILLED:
             return True
     return False
+
+
+def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
+    """Share of a side's parts in which points lie."""
+    side = end - start
+    part = np.floor(PARTS * ((near - start) @ side) / (side @ side))
+    return len(np.unique(part[(part >= 0) & (part < PARTS)])) / PARTS

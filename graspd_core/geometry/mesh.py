@@ -12,6 +12,7 @@ from torch.quasirandom import SobolEngine
 
 from graspd_core.errors import MeshError
 from graspd_core.geometry.dae import read_dae
+from graspd_core.geometry.specks import without_specks
 from graspd_core.geometry.topology import (
     drop_degenerate,
     drop_repeated,
@@ -59,7 +60,9 @@ def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
 
 
-def check_mesh(mesh: TriangleMesh, source: str, most_faces: int | None = None) -> tuple[TriangleMesh, tuple[str, ...]]:
+def check_mesh(
+    mesh: TriangleMesh, source: str, most_faces: int | None = None, *, scale: float = 1.0, dusty: bool = False
+) -> tuple[TriangleMesh, tuple[str, ...]]:
     """A cleaned mesh and what was found wrong with it, one sentence each.
 
     Merges coincident vertices, drops degenerate and repeated faces, and makes neighbouring faces wind alike.
@@ -67,12 +70,15 @@ def check_mesh(mesh: TriangleMesh, source: str, most_faces: int | None = None) -
 
     Args:
         most_faces: a mesh of more is simplified to about this many.
+        scale: factor that the file's coordinates were multiplied by, for the advice on its unit.
+        dusty: tiny pieces that float clear of the rest are dropped.
 
     Raises:
         MeshError: no usable faces, vertices that are not finite, or an extent outside 2 mm to 2 m.
     """
     _refuse_unusable(mesh, source)
-    warnings = _doubted_size(mesh, source)
+    _doubted_size(mesh, source, scale)
+    warnings: list[str] = []
     mesh, dropped, repeated = _distinct(mesh, source)
     if dropped:
         warnings.append(f"{source}: dropped {dropped} faces without area")
@@ -83,6 +89,11 @@ def check_mesh(mesh: TriangleMesh, source: str, most_faces: int | None = None) -
     if most_faces is not None and len(mesh.faces) > most_faces:
         warnings.append(f"{source}: simplified from {len(mesh.faces)} to {most_faces} faces")
         mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
+    if dusty:
+        # Before all else that is said of the mesh: its size and its holes could be the dust's.
+        mesh, specks = without_specks(mesh)
+        if specks:
+            warnings.append(f"{source}: dropped {specks} tiny pieces that float clear of the rest")
     faces = mesh.faces
     if not is_oriented(faces):
         faces = orient(mesh.vertices, faces)
@@ -92,7 +103,7 @@ def check_mesh(mesh: TriangleMesh, source: str, most_faces: int | None = None) -
     # Simplifying can tear a surface; that is no fault of the input, and the winding number bears it.
     if not is_closed(clean) and not is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
-    return clean, tuple(warnings)
+    return clean, (*_doubted_size(clean, source, scale), *warnings)
 
 
 def simplify(mesh: TriangleMesh, faces: int) -> TriangleMesh:
@@ -191,18 +202,19 @@ def _refuse_unusable(mesh: TriangleMesh, source: str) -> None:
         raise MeshError(f"{source}: faces name vertices outside 0 to {len(mesh.vertices) - 1}")
 
 
-def _doubted_size(mesh: TriangleMesh, source: str) -> list[str]:
+def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
     """A warning where a size is odd, none where it is usual, and MeshError where it is absurd."""
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[mesh.faces] = True
     size = float(np.ptp(mesh.vertices[used], axis=0).max())
     if not SMALLEST <= size <= LARGEST:
-        advice = unit_advice(size) if size > 0 else "its vertices all lie in one point"
+        advice = unit_advice(size, scale) if size > 0 else "its vertices all lie in one point"
         raise MeshError(f"{source}: {size:.4g} m across, outside {SMALLEST} to {LARGEST} m; {advice}")
     if SMALL <= size <= LARGE:
         return []
     odd = "large" if size > LARGE else "small"
-    return [f"{source}: {size:.3g} m across, {odd} for a hand; if the file is not in metres, {unit_advice(size)}"]
+    doubt = "not in metres" if scale == 1 else "in another unit"
+    return [f"{source}: {size:.3g} m across, {odd} for a hand; if the file is {doubt}, {unit_advice(size, scale)}"]
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:

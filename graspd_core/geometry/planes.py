@@ -100,8 +100,9 @@ def find_planes(
         part, close = None, []
         # A step in a table lies within the wide gate, which then takes both levels for one slope.
         for gate in (COARSE, min(least, 0.5 * COARSE)):
+            # All trials, whatever they find: threads that may stop early give another plane each time.
             o3d.utility.random.seed(0)
-            guess, close = cloud.segment_plane(gate, 3, RANSAC_TRIALS)
+            guess, close = cloud.segment_plane(gate, 3, RANSAC_TRIALS, 1.0)
             part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), least, gate)
             if part is not None:
                 break

@@ -7,6 +7,7 @@ format", version 0.7 (Point Cloud Library).
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,7 +38,9 @@ def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     Raises:
         ValueError: it is no ply file, lacks x, y or z, is cut short, or has lists before its vertices end.
     """
-    head, _, rest = path.read_bytes().partition(b"end_header")
+    # At the start of a line: a comment may hold the word.
+    head, *more = re.split(rb"[\r\n]end_header", path.read_bytes(), maxsplit=1)
+    rest = more[0] if more else b""
     body = rest[rest.find(b"\n") + 1 :]
     order, elements = _ply_header(head.decode("ascii", errors="replace").splitlines())
     start = 0
@@ -55,8 +58,9 @@ def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     if not order:
         columns = [element.names.index(name) for name in "xyz"]
         return _numbers_of_text(body, start, element.count, len(element.names))[:, columns]
-    dtype = np.dtype([(name, order + code) for name, code in zip(element.names, element.codes, strict=True)])
-    return _rows(body, dtype, element.count, start)
+    sizes = [np.dtype(code).itemsize for code in element.codes]
+    places = [element.names.index(name) for name in "xyz"]
+    return _rows(body, _packed([order + element.codes[k] for k in places], places, sizes), element.count, start)
 
 
 def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
@@ -74,10 +78,12 @@ def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
         at = end + 1
         if words and not words[0].startswith("#"):
             header[words[0]] = words[1:]
-    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA") if not header.get(key)]
+    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA") if not header.get(key)]
     if missing:
         raise ValueError(f"its header has no {missing[0]}")
-    fields, points = header["FIELDS"], int(header["POINTS"][0])
+    fields = header["FIELDS"]
+    # Not all writers say again what width and height say.
+    points = int(header["POINTS"][0]) if header.get("POINTS") else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(fields))]
     if {len(counts), len(header["SIZE"]), len(header["TYPE"])} != {len(fields)} or min(counts) < 1 or points < 0:
         raise ValueError("its header has not as many SIZE, TYPE and COUNT as FIELDS, or less than none of something")
@@ -92,9 +98,7 @@ def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
         return None
     sizes = [int(word) * count for word, count in zip(header["SIZE"], counts, strict=True)]
     codes = ["<" + header["TYPE"][place].lower() + header["SIZE"][place] for place in places]
-    starts = [sum(sizes[:place]) for place in places]
-    rows = np.dtype({"names": list("xyz"), "formats": codes, "offsets": starts, "itemsize": sum(sizes)})
-    return _rows(data, rows, points, at)
+    return _rows(data, _packed(codes, places, sizes), points, at)
 
 
 def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
@@ -119,6 +123,12 @@ def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
     if not lines or lines[0].strip() != "ply" or order is None:
         raise ValueError("it has no header of a ply file")
     return order, elements
+
+
+def _packed(codes: list[str], places: list[int], sizes: list[int]) -> np.dtype:
+    """Rows whose fields have `sizes` [bytes], and x, y and z of types `codes` at `places`."""
+    starts = [sum(sizes[:place]) for place in places]
+    return np.dtype({"names": list("xyz"), "formats": codes, "offsets": starts, "itemsize": sum(sizes)})
 
 
 def _rows(data: bytes, dtype: np.dtype, count: int, start: int) -> Float[np.ndarray, "count 3"]:

@@ -15,7 +15,6 @@ from graspd_core.geometry.convex import convex_parts
 from graspd_core.geometry.mesh import check_mesh, content_hash, mass_properties
 from graspd_core.geometry.own_process import elsewhere
 from graspd_core.geometry.sdf import GridSDF, build_sdf, grid_layout, is_solid
-from graspd_core.geometry.specks import without_specks
 from graspd_core.geometry.trust import trust_grid
 from graspd_core.types import Plane, TriangleMesh
 
@@ -106,7 +105,7 @@ def build_scene(
     neighbours: tuple[Neighbour, ...] = (),
     trust: Float[np.ndarray, "vertices"] | None = None,
 ) -> Scene:
-    """The scene of a mesh already in metres; `scale` is only recorded.
+    """The scene of a mesh already in metres; `scale` is what its file was multiplied by, for the record and for advice.
 
     Args:
         support: what the object stands on.
@@ -120,11 +119,7 @@ def build_scene(
         raise MeshError(f"{source}: {len(trust)} values of trust for {len(mesh.vertices)} vertices; valid: one each")
     started = time.perf_counter() if started is None else started
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
-    clean, found = check_mesh(mesh, source, MOST_FACES)
-    if trust is None:
-        clean, specks = without_specks(clean)
-        if specks:
-            found += (f"{source}: dropped {specks} tiny pieces that float clear of the rest",)
+    clean, found = check_mesh(mesh, source, MOST_FACES, scale=scale, dusty=trust is None)
     model = _object_model(clean, source, mass, friction, scale, warnings + found)
     loaded = time.perf_counter()
     sdf = object_sdf(model, resolution)

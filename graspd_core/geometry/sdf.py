@@ -25,8 +25,9 @@ from graspd_core.types import TriangleMesh
 # Nearer to the surface than this share of a cell, the direction to it is rounding noise: the face's normal is taken.
 NEAR_SURFACE = 1e-3
 
-# Free space about the object that the grid covers [m]. Beyond it distances are extrapolated, and err by a millimetre at
-# 4 cm off hollow things, where nothing touches; every cell saved there makes those at the surface finer.
+# Free space about the object that the grid covers [m]. Beyond it distances are extrapolated, off hollow things too long
+# by half a millimetre in the mean at 5 cm and by 1.3 at 8, by 10 and 20 at worst. Nothing touches there, and every cell
+# that is saved makes those at the surface finer.
 PADDING = 0.015
 
 

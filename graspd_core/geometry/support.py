@@ -31,6 +31,8 @@ BESIDE = 0.05
 # A point is on a flat part, and not where the part's plane cuts through a thing, if of the points within so many
 # tolerances at least this share is on the plane too: on a wall that it cuts squarely, four in ten are.
 AROUND, ON_PLANE = 3.0, 0.6
+# Of so many points around it is asked; where there are more, as noise makes it wide, some of them stand for all.
+ASKED = 50
 # Beyond so many clusters the rest is noise.
 MOST_THINGS = 20
 
@@ -56,17 +58,23 @@ def find_ground(
     """Sort the flat parts."""
     parts = [part for part in parts if part.filled > FILLED and not _falls_off(scene, part)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
-    covered = {id(part): _covered(scene, part) for part in large}
+    # As they are asked for: of a table alone in view, which is the support, never.
+    known: dict[int, Bool[np.ndarray, "voxels"]] = {}
+
+    def covered(others: Sequence[FlatPart]) -> list[Bool[np.ndarray, "voxels"]]:
+        known.update({id(part): _covered(scene, part) for part in others if id(part) not in known})
+        return [known[id(part)] for part in others]
+
     best, most = None, (0, 0)
     for part in parts:
         if (viewpoints @ part.plane.normal <= part.plane.offset).any():
             continue
-        others = [covered[id(x)] for x in large if x is not part]
+        others = covered([x for x in large if x is not part])
         standing = _standing(scene, part, _left(scene, part, others), settings)
         if standing > most:
             best, most = part, standing
     background = tuple(part for part in large if part is not best)
-    return Ground(best, background, _left(scene, best, [covered[id(part)] for part in background]))
+    return Ground(best, background, _left(scene, best, covered(background)))
 
 
 def _left(
@@ -91,9 +99,14 @@ def _covered(scene: ThinScene, part: FlatPart) -> Bool[np.ndarray, "voxels"]:
     on = band[(height[band] <= tolerance[band]) & part.beneath(scene.mean[band], BESIDE)]
     if len(on) == 0:
         return np.zeros(len(scene.mean), dtype=bool)
-    near = {"r": AROUND * tolerance[on], "return_length": True}
-    around = KDTree(scene.mean[band]).query_ball_point(scene.mean[on], **near)
-    alike = KDTree(scene.mean[on]).query_ball_point(scene.mean[on], **near)
+    reach = AROUND * tolerance[on]
+    # A flat part has so many voxels within reach.
+    share = ASKED * scene.size**2 / (np.pi * np.median(reach) ** 2)
+    band = band[np.random.default_rng(0).random(len(band)) < share]
+    around, alike = (
+        KDTree(scene.mean[rows]).query_ball_point(scene.mean[on], r=reach, return_length=True)
+        for rows in (band, np.intersect1d(band, on))
+    )
     covered = np.zeros(len(scene.mean), dtype=bool)
     covered[on[alike >= ON_PLANE * around]] = True
     return covered

@@ -15,15 +15,22 @@ USUAL, SPREAD = 0.12, 6.0
 REMEDIES = {"--units mm": 1e-3, "--units cm": 1e-2, "--units inch": 0.0254, "--scale 0.1": 0.1}
 
 
-def unit_advice(size: float) -> str:
-    """What to pass so that a thing of `size` [m] across becomes one that a hand can grasp, the likeliest first."""
-    if size < USUAL:
-        # Every unit that files come in is smaller than a metre: it was scaled down once too often.
-        factor = 10 ** ceil(log10(USUAL / size) - 0.5)
-        return f"--scale {factor:g} makes it {_length(size * factor)}"
-    likely = sorted(REMEDIES, key=lambda option: _strangeness(size * REMEDIES[option]))
-    kept = [option for option in likely if _strangeness(size * REMEDIES[option]) < log(SPREAD)] or likely[:1]
-    return ", ".join(f"{option} makes it {_length(size * REMEDIES[option])}" for option in kept)
+def unit_advice(size: float, scale: float = 1.0) -> str:
+    """What to pass so that a thing of `size` [m] across becomes one that a hand can grasp, the likeliest first.
+
+    Args:
+        scale: what was passed already; the advice is to pass something else in its stead.
+    """
+    # Of absurd numbers, whose ratio overflows, too.
+    given = min(max(size / scale, 1e-200), 1e200)
+    remedies = REMEDIES if scale == 1 else {"--scale 1": 1.0} | REMEDIES
+    likely = sorted(remedies, key=lambda option: _strangeness(given * remedies[option]))
+    kept = {option: remedies[option] for option in likely if _strangeness(given * remedies[option]) < log(SPREAD)}
+    if not kept:
+        # No unit that files come in: scaled once too often, or for another purpose.
+        factor = 10.0 ** ceil(log10(USUAL / given) - 0.5)
+        kept = {f"--scale {factor:g}": factor}
+    return ", ".join(f"{option} makes it {_length(given * factor)}" for option, factor in kept.items())
 
 
 def _strangeness(size: float) -> float:

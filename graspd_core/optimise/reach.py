@@ -20,7 +20,7 @@ from graspd_core.optimise.problem import fingertip_groups
 
 # The roughest surface that a trial believes in; see `verify.world.at_friction`.
 _MOST_FRICTION = 0.6
-# Points of the surface and, beside them, middles of faces, so that no small handle is missed.
+# Points of the surface; beside them go the middles of all faces, so that no small handle is missed.
 _SAMPLES = 4000
 # Directions that the object's width is looked at along.
 _DIRECTIONS = 400
@@ -61,10 +61,13 @@ def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
     """Points of the object's surface and their outward unit normals."""
     mesh = scene.object.mesh
     points, normals = surface_samples(mesh, _SAMPLES, seed=0)
-    corners = mesh.vertices[mesh.faces[:: len(mesh.faces) // _SAMPLES + 1]]
+    corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
-    return np.concatenate([points, corners.mean(1)]), np.concatenate([normals, across])
+    doubled = np.linalg.norm(across, axis=-1)
+    # A face without area has no normal.
+    real = doubled > 1e-12
+    middles, across = corners[real].mean(1), across[real] / doubled[real, None]
+    return np.concatenate([points, middles]), np.concatenate([normals, across])
 
 
 def _one_sided(
@@ -72,26 +75,32 @@ def _one_sided(
 ) -> bool:
     """Whether in every patch of `radius` [m] of the surface one direction separates all forces from their opposites.
 
-    A direction a does so where n·a > `least`, the sine of the friction angle, for all normals n. The best one is along
-    the point of their convex hull that is nearest to the origin; Gilbert's steps go there (SIAM J. Control 1966), and
-    the first patch whose point is too near for any direction ends the search.
+    The first patch in which none does ends the search.
     """
-    _, first = np.unique(np.round(points / (radius / 2)).astype(np.int64), axis=0, return_index=True)
-    within = np.linalg.norm(points[first, None] - points[None], axis=-1) < radius
-    nearest = normals[first]
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    _, first = np.unique(np.round(points / (radius / 4)).astype(np.int64), axis=0, return_index=True)
+    return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)
+
+
+def _separated(normals: Float[np.ndarray, "n 3"], least: float) -> bool:
+    """Whether one direction a has n·a > `least`, the sine of the friction angle, for all normals n.
+
+    The best one is along the point of their convex hull that is nearest to the origin; Gilbert's steps go there (SIAM
+    J. Control 1966), and end where its distance is too small for any direction.
+    """
+    nearest = normals.mean(0)
     for _ in range(_STEPS):
-        along = np.where(within, nearest @ normals.T, np.inf)
-        worst = along.argmin(1)
-        length = np.linalg.norm(nearest, axis=-1)
-        if (length <= least).any():
+        along = normals @ nearest
+        worst, length = along.argmin(), float(np.linalg.norm(nearest))
+        if length <= least:
             return False
-        open_ = along[np.arange(len(worst)), worst] <= least * length
-        if not open_.any():
+        if along[worst] > least * length:
             return True
-        within, nearest, worst = within[open_], nearest[open_], worst[open_]
         step = nearest - normals[worst]
-        share = (nearest * step).sum(-1) / np.maximum((step * step).sum(-1), 1e-12)
-        nearest = nearest - np.clip(share, 0.0, 1.0)[:, None] * step
+        share = float(nearest @ step) / max(float(step @ step), 1e-12)
+        nearest = nearest - min(max(share, 0.0), 1.0) * step
     return False
 
 

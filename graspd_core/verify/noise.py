@@ -48,13 +48,16 @@ def noisy_share(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> float | None:
-    """Share of hold trials under the given errors that the grasp passes; None where `stop` ended one of them."""
+    """Share of hold trials under the given errors that the grasp passes.
+
+    None where `stop` ended one of them, or there is none.
+    """
     held = 0
     for error in errors:
         held += hold_trial(world, displaced(grasp, *error, world.center_of_mass), protocol, stop=stop).passed
         if stop():
             return None
-    return held / len(errors)
+    return held / len(errors) if errors else None
 
 
 def pose_errors(seed: int | Sequence[int], count: int) -> list[PoseError]:

@@ -28,8 +28,17 @@ def test_a_case_ends_in_a_process_of_its_own_and_a_death_is_an_ending(tmp_path: 
     assert endings["nan-vertices"].ending == "MeshError"
     assert "nan-vertices.obj: 3 of " in endings["nan-vertices"].message
     assert endings["not-a-case"].ending == "crash"
+    assert endings["not-a-case"].message.startswith("exit status 2; ")
     assert "not-a-case" in endings["not-a-case"].message
     assert shelf.read(NAN) == (endings["nan-vertices"], "here")
+
+
+def test_nothing_of_a_case_is_remembered_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Else it would load faster the second time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    ((_, ending),) = run_cases([CASES["too-wide"]], Shelf(tmp_path, "fast", "here"), processes=1)
+    assert ending.ending in CASES["too-wide"].expect
+    assert not (tmp_path / "cache" / "graspd").exists()
 
 
 def test_a_process_that_does_not_end_is_killed_and_called_hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -64,9 +73,9 @@ def test_cases_are_chosen_by_name_and_family():
 def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
     wrong = Ending("nan-vertices", GRASP, "", 0.1, 30.0, 300.0, 2, 1, 0)
     told = summary({BOX: GRASPED, NAN: wrong})
-    assert told.startswith("2 cases, 3 faults. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
+    assert told.startswith("2 cases, 4 faults. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
     assert "2 of 3 verified grasps hold in a second trial." in told
-    for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified grasps fail"):
+    for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified", "the user does not read"):
         assert f"* `nan-vertices`: {fault}" in told
     table = stress_table({BOX: GRASPED, NAN: wrong})
     assert f"| `open-box` | {BOX.about} | grasp | 0.5 | 2.4 | 400 | 2/3 | 2 | – | open \\| closed |" in table

@@ -8,9 +8,9 @@ from graspd_core.geometry.border import reaches_border
 EYE = np.array([0.0, 0.0, 1.0])
 
 
-def picture() -> np.ndarray:
+def picture(rows: int = 120) -> np.ndarray:
     """A plane seen by a camera above, half a metre wide."""
-    row, column = np.mgrid[-0.25:0.25:120j, -0.25:0.25:120j]
+    row, column = np.mgrid[-0.25 : 0.25 : rows * 1j, -0.25 : 0.25 : rows * 1j]
     return np.column_stack([row.ravel(), column.ravel(), np.zeros(row.size)])
 
 
@@ -23,6 +23,14 @@ def test_what_lies_on_the_border_reaches_it(middle: tuple[float, float], reaches
 
 def test_what_makes_the_outline_alone_does_not():
     points = picture()
+    out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
+    both = np.concatenate([points, out])
+    assert not reaches_border(both, EYE, np.arange(len(both)) >= len(points))
+
+
+def test_what_stands_out_over_the_end_of_the_table_does_not():
+    """The sides of the outline go from its top to the corners of the table, and there is nothing along them."""
+    points = picture(rows=300)
     out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
     both = np.concatenate([points, out])
     assert not reaches_border(both, EYE, np.arange(len(both)) >= len(points))

@@ -1,6 +1,7 @@
 """Reading, refusing, cleaning and measuring meshes."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from graspd_core.geometry.mesh import (
 )
 from graspd_core.geometry.shapes import BOX_HALF, make_shape, shape_volume
 from graspd_core.geometry.topology import is_closed
+from graspd_core.geometry.units import unit_advice
 from graspd_core.types import TriangleMesh
 
 
@@ -70,6 +72,7 @@ def test_bad_files_are_named(tmp_path, make, complaint):
         (100.0, "9 m across.*--units cm makes it 90 mm, --units inch makes it 229 mm"),
         (1 / 0.0254, "3.543 m across.*--units inch makes it 90 mm.*--units cm makes it 35.4 mm"),
         (1e-3, "9e-05 m across.*--scale 1000 makes it 90 mm"),
+        (1e6, r"9e\+04 m across.*--scale 1e-06 makes it 90 mm$"),
         (0.0, "0 m across.*all lie in one point"),
     ],
 )
@@ -95,6 +98,28 @@ def test_small_and_large_things_are_allowed_and_doubted(size, doubt):
     mesh, warnings = check_mesh(scaled(make_shape("box"), size / 0.09), "box")
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(size)
     assert [w.partition("across, ")[2] for w in warnings] == ([doubt] if doubt else [])
+
+
+@pytest.mark.parametrize(
+    ("scale", "size", "advice"),
+    [
+        (0.01, 0.9, "in another unit, --units mm makes it 90 mm"),
+        (
+            1e-3,
+            0.005,
+            "in another unit, --units inch makes it 127 mm, --units cm makes it 50 mm, --scale 0.1 makes it 500 mm",
+        ),
+        (10.0, 0.9, "in another unit, --scale 1 makes it 90 mm"),
+    ],
+)
+def test_advice_is_on_what_to_pass_in_place_of_what_was_passed(scale, size, advice):
+    _, (doubt,) = check_mesh(scaled(make_shape("box"), size / 0.09), "box", scale=scale)
+    assert doubt.partition("if the file is ")[2] == advice
+
+
+@pytest.mark.parametrize(("size", "scale"), [(float("inf"), 1.0), (1e300, 1e-300), (5e-324, 1e10), (1e-9, 1e300)])
+def test_advice_on_absurd_numbers_is_a_number_still(size, scale):
+    assert re.fullmatch(r"--scale 1e[+-]\d+ makes it [\d.]+ mm", unit_advice(size, scale))
 
 
 def test_a_face_without_its_vertex_is_named(tmp_path):

@@ -110,3 +110,13 @@ def test_extent_does_not_depend_on_the_frame(seed):
     turn = Rotation.random(rng=rng).as_matrix()
     assert extent(points @ turn.T + 1.0) == pytest.approx(extent(points), rel=1e-6)
     assert extent(points) == pytest.approx(0.2, abs=0.03)
+
+
+def test_the_same_points_give_the_same_planes_every_time():
+    """Open3D looks from several threads: where it may stop early, that which comes first decides."""
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.uniform(-0.5, 0.5, (1500, 2)), rng.normal(0.0, 0.006, 1500)])
+    points = np.vstack([table, rng.uniform(-0.5, 0.5, (3000, 3)) * [1, 1, 0.2]])
+    away, eye = np.full(len(points), 1.5), np.array([[0.0, 0.0, 1.5]])
+    found = [find_planes(points, away, eye, least=0.004, smallest=0.1) for _ in range(8)]
+    assert len({tuple(part.plane.offset for part in parts) for parts in found}) == 1

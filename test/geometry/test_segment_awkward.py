@@ -6,14 +6,17 @@ import pytest
 from graspd_core.bench.stress.scenery import beside_a_step, half_out_of_view, zero_filled
 from graspd_core.config import SegmentConfig
 from graspd_core.errors import CloudError, NoObjectError
+from graspd_core.geometry import support
 from graspd_core.geometry.camera import PinholeCamera
 from graspd_core.geometry.choice import Target
 from graspd_core.geometry.cloud import PointCloud, measured
 from graspd_core.geometry.noise import NONE
 from graspd_core.geometry.pieces import join_pieces
+from graspd_core.geometry.planes import find_planes
 from graspd_core.geometry.reconstruct import _clean
 from graspd_core.geometry.segment import segment
 from graspd_core.geometry.tabletop import ring_poses, tabletop, views_of
+from graspd_core.geometry.thinning import thin_scene
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 STAGE = tabletop("box", yaw=0.3)
@@ -105,3 +108,23 @@ def test_pieces_are_joined_no_further_than_the_largest_object():
     settings = {"link": 0.006, "support": None}
     assert join_pieces(points, distance, label, eyes, largest=0.4, **settings).max() == 0
     assert join_pieces(points, distance, label, eyes, largest=0.25, **settings).max() == 1
+
+
+def test_where_noise_makes_the_look_around_wide_some_points_stand_for_all(monkeypatch: pytest.MonkeyPatch):
+    """A noisy table and a board that rises through it, seen from 1.6 m: the tolerance is six voxels."""
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (40_000, 2)), np.zeros(40_000)])
+    board = np.column_stack([rng.uniform(-0.1, 0.1, 8000), np.full(8000, 0.345), rng.uniform(-0.1, 0.1, 8000)])
+    points, eye = np.concatenate([table, board]), np.array([0.0, 0.0, 1.6])
+    rays = points - eye
+    points += rays * rng.normal(0, 0.003, (len(points), 1)) / np.linalg.norm(rays, axis=1)[:, None]
+    scene = thin_scene([PointCloud(points, eye)], SegmentConfig())
+    part = find_planes(scene.mean, scene.mean_distance, eye[None], least=0.004, smallest=0.1)[0]
+    some = support._covered(scene, part)
+    monkeypatch.setattr(support, "ASKED", 1e9)
+    every = support._covered(scene, part)
+    assert part.tolerance(scene.mean_distance).max() > 0.012
+    assert (some == every).mean() > 0.99
+    assert some[part.inliers].mean() == pytest.approx(every[part.inliers].mean(), abs=0.002)
+    rises = np.abs(scene.mean[:, 1] - 0.345) < 0.003
+    assert some[rises].mean() < 0.2

@@ -68,6 +68,12 @@ def test_a_scene_tells_of_its_dust_and_is_as_large_as_the_body():
     assert np.ptp(scene.object.mesh.vertices, axis=0) == pytest.approx(np.ptp(BOX.vertices, axis=0))
 
 
+def test_what_dust_looks_like_is_not_said_of_the_body():
+    speck = TriangleMesh(np.array([[1.0, 0, 0], [1.0, 0.001, 0], [1.0, 0, 0.001]]), np.array([[0, 1, 2]]))
+    scene = build_scene(joined(BOX, speck), resolution=16)
+    assert scene.object.warnings == ("mesh: dropped 1 tiny pieces that float clear of the rest",)
+
+
 def test_a_reconstruction_is_left_alone():
     dusty = joined(BOX, cube(0.0007, (0.2, 0.0, 0.0)))
     scene = build_scene(dusty, trust=np.ones(len(dusty.vertices)), resolution=16)

@@ -16,7 +16,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from graspd_core.config import preset_names
-from graspd_core.errors import CloudError, GraspdError, NoObjectError, TransformError
+from graspd_core.errors import CloudError, GraspdError, NoObjectError, ResourceError, TransformError
 from graspd_core.pipeline import PointCloud
 from graspd_ros.codes import ErrorCode, RequestError, code_of, sentence_of
 from graspd_ros.intake import Intake
@@ -260,6 +260,7 @@ def test_every_trouble_has_its_code():
         NoObjectError("x"): ErrorCode.NO_OBJECT,
         CloudError("x"): ErrorCode.BAD_CLOUD,
         TransformError("x"): ErrorCode.NO_TRANSFORM,
+        ResourceError("x"): ErrorCode.OUT_OF_MEMORY,
         MemoryError(): ErrorCode.OUT_OF_MEMORY,
         RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 8 bytes"): (
             ErrorCode.OUT_OF_MEMORY

@@ -32,6 +32,7 @@ class Case:
         loading: seconds that loading may take.
         memory: most that the process may use at its peak, the libraries' own included [MB].
         options: further arguments of `plan_grasps`.
+        told: words that the user must read.
         truth: the true object, in the scene's frame, where the scene is only what cameras saw of it.
     """
 
@@ -46,4 +47,5 @@ class Case:
     loading: float = 15.0
     memory: float = 2000.0
     options: dict[str, Any] = field(default_factory=dict)
+    told: str = ""
     truth: Callable[[], TriangleMesh] | None = None

@@ -19,6 +19,17 @@ from graspd_core.types import TriangleMesh
 _SEED = 7
 _FEW = ("TOO_FEW", "NO_CANDIDATES")
 
+# What must be said of some of them: what was done, or what to do.
+_TOLD = {
+    "debris": "40 ",
+    "millions-of-faces": "simplified from ",
+    "one-triangle": "not closed",
+    "nan-vertices": "NaN",
+    "millimetres": "--units mm",
+    "centimetres": "--units cm",
+    "crate-1200-mm": "fingertips of allegro_right open to ",
+}
+
 Maker = Callable[[], TriangleMesh]
 
 
@@ -76,7 +87,7 @@ def _case(name: str, about: str, make: Maker, expect: tuple[str, ...] = (GRASP,)
         write_obj(make(), path)
         return load_scene(path)
 
-    return Case(name, "mesh", about, scene, expect, whole)
+    return Case(name, "mesh", about, scene, expect, whole, told=_TOLD.get(name, ""))
 
 
 def _text(name: str, about: str, text: str) -> Case:

@@ -77,6 +77,8 @@ def faults(case: Case, ending: Ending) -> tuple[str, ...]:
         wrong.append("a number of the result is not finite")
     if ending.ending != GRASP and not ending.message:
         wrong.append("the user is told nothing")
+    if case.told not in ending.message:
+        wrong.append(f"the user does not read {case.told!r}")
     return tuple(wrong)
 
 
@@ -86,15 +88,16 @@ def run_case(case: Case, preset: str = "balanced") -> Ending:
 
     hand = load_hand(case.hand)
     with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
+        began = loaded = time.perf_counter()
         try:
             scene = case.scene(Path(folder))
+            loaded = time.perf_counter()
+            options = {"count": 2, "deadline": case.deadline, "preset": preset} | case.options
+            result = plan_grasps(scene, hand, **options)
         except GraspdError as error:
             told = str(error).replace(f"{folder}/", "")
-            return Ending(case.name, type(error).__name__, told, time.perf_counter() - began, memory=_peak())
-        loaded = time.perf_counter()
-        options = {"count": 2, "deadline": case.deadline, "preset": preset} | case.options
-        result = plan_grasps(scene, hand, **options)
+            loading = (loaded if loaded > began else time.perf_counter()) - began
+            return Ending(case.name, type(error).__name__, told, loading, memory=_peak())
         planned = time.perf_counter()
         verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
         return Ending(
@@ -106,7 +109,7 @@ def run_case(case: Case, preset: str = "balanced") -> Ending:
             _peak(),
             len(result.grasps),
             len(verified),
-            _hold_again(result, scene, hand, Path(folder) / "grasps.json", preset) if verified else 0,
+            _hold_again(case, result, scene, hand, Path(folder), preset) if verified else 0,
             _finite(result),
             None if case.truth is None else _hold_truly(verified, scene, hand, case.truth()),
         )
@@ -118,17 +121,21 @@ def _told(result: GraspResult, folder: str) -> str:
     return "; ".join(filter(None, told)).replace(f"{folder}/", "")
 
 
-def _hold_again(result: GraspResult, scene: Scene, hand: Any, path: Path, preset: str) -> int:
-    """How many verified grasps hold again, read back from a file."""
+def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
+    """How many verified grasps hold again: read back from a file, on the object loaded and cut into parts anew."""
     from graspd_core.config import load_preset
+    from graspd_core.geometry import cache
     from graspd_core.io import grasps_of, load_document, save_result
     from graspd_core.verify.trial import hold_trial
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
+    path = folder / "grasps.json"
     save_result(path, result, scene.object, hand, load_preset(preset))
     kept = grasps_of(load_document(path))
-    protocol = at_friction(PROTOCOLS["standard"], scene.object.friction)
-    world = build_world(hand, scene.object, object_parts(scene.object), protocol)
+    cache.forget()
+    again = case.scene(folder).object
+    protocol = at_friction(PROTOCOLS["standard"], again.friction)
+    world = build_world(hand, again, object_parts(again), protocol)
     return sum(hold_trial(world, grasp, protocol).passed for grasp in kept if grasp.verdict is Verdict.VERIFIED)
 
 
@@ -156,8 +163,8 @@ def _finite(result: GraspResult) -> bool:
                 yield from numbers(inner)
         elif isinstance(value, np.ndarray):
             yield from value.ravel().tolist()
-        elif isinstance(value, float):
-            yield value
+        elif isinstance(value, float | np.floating):
+            yield float(value)
 
     good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
     postures = [(g.pregrasp, g.grasp, g.squeeze) for g in result.grasps]

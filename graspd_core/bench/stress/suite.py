@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -13,9 +15,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO
 
+from graspd_core.bench.cells.cell import settings_of
 from graspd_core.bench.stress.case import Case
 from graspd_core.bench.stress.cases import CASES
 from graspd_core.bench.stress.run import Ending
+from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
 from graspd_core.io import save_text
 
@@ -23,6 +27,8 @@ FORMAT, VERSION = "graspd/stress", 1
 
 # Beyond loading and planning, before a process is called hung, and how often processes are looked at [s].
 _PATIENCE, _POLL = 60.0, 0.05
+# One thread each; nothing remembered on disk, so that every case builds its own and takes as long the second time.
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "GRASPD_CACHE": "off"}
 
 
 def cases_of(names: Sequence[str]) -> tuple[Case, ...]:
@@ -49,20 +55,26 @@ class Shelf:
     code: str
     any_code: bool = False
 
+    @property
+    def _settings(self) -> str:
+        """Hash of what the preset says."""
+        said = json.dumps(settings_of(load_preset(self.preset)), sort_keys=True)
+        return hashlib.sha256(said.encode()).hexdigest()
+
     def path(self, case: Case) -> Path:
         """The file of one case."""
         return self.folder / f"stress-{Path(self.preset).stem}-{case.name}.json"
 
     def write(self, ending: Ending, case: Case) -> None:
         """Keep an ending; its file appears whole or not at all."""
-        kept = {"format": FORMAT, "version": VERSION, "code": self.code, "preset": self.preset}
+        kept = {"format": FORMAT, "version": VERSION, "code": self.code, "settings": self._settings}
         save_text(self.path(case), json.dumps({**kept, "ending": asdict(ending)}, indent=1) + "\n")
 
     def read(self, case: Case) -> tuple[Ending, str] | None:
         """The ending of a case and the code that it came of; None where there is none that counts."""
         try:
             kept = json.loads(self.path(case).read_text(encoding="utf-8"))
-            good = kept["preset"] == self.preset and (self.any_code or kept["code"] == self.code)
+            good = kept["settings"] == self._settings and (self.any_code or kept["code"] == self.code)
             return (Ending(**kept["ending"]), str(kept["code"])) if good else None
         except (OSError, ValueError, TypeError, KeyError):
             return None
@@ -98,12 +110,14 @@ class _Running:
 
     def __init__(self, case: Case, preset: str) -> None:
         self.case = case
-        self._patience = case.loading + case.deadline + _PATIENCE
+        # It is loaded twice: for the second trial, too.
+        self._patience = 2 * case.loading + case.deadline + _PATIENCE
         self._end = time.perf_counter() + self._patience
         command = [sys.executable, "-m", "graspd_core.bench.stress.run", case.name, "--preset", preset]
         self._streams = out, err = _scratch(), _scratch()
         # A group of its own: a Ctrl-C is the parent's, who decides what it means.
-        self._process = subprocess.Popen(command, stdout=out, stderr=err, process_group=0)
+        environment = {**os.environ, **_ENVIRONMENT}
+        self._process = subprocess.Popen(command, stdout=out, stderr=err, env=environment, process_group=0)
 
     def over(self) -> bool:
         return self._process.poll() is not None or time.perf_counter() > self._end
@@ -125,7 +139,8 @@ class _Running:
         try:
             return Ending(**json.loads(out[-1]))
         except (IndexError, ValueError, TypeError):
-            told = err[-1] if err else f"exit status {self._process.returncode}"
+            # Both: the last words of what a signal ended are of something else.
+            told = "; ".join([f"exit status {self._process.returncode}", *err[-1:]])
             return Ending(self.case.name, "crash", told)
 
 

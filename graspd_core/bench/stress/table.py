@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from graspd_core.bench.stress.case import GRASP, Case
 from graspd_core.bench.stress.run import Ending, faults
 from graspd_core.bench.tables import markdown_table
+from graspd_core.types import Outcome
 
 # Longer messages end in dots [characters].
 _MESSAGE = 110
@@ -33,7 +34,11 @@ def summary(endings: Mapping[Case, Ending]) -> str:
     truths = [ending for ending in endings.values() if ending.true is not None]
     if truths:
         held = sum(ending.true or 0 for ending in truths)
-        lines.append(f"{held} of {sum(e.verified for e in truths)} verified on a cloud hold on the true object.")
+        none = [e.case for e in truths if e.verified and not e.true]
+        lines.append(
+            f"{held} of {sum(e.verified for e in truths)} verified on a cloud hold on the true object"
+            + (f" (none of {', '.join(none)})." if none else ".")
+        )
     return "\n\n".join([" ".join(filter(None, lines)), *(["\n".join(wrong)] if wrong else [])])
 
 
@@ -47,7 +52,9 @@ def _share(family: str, whole: Sequence[tuple[Case, Ending]]) -> str:
 
 def _line(case: Case, ending: Ending) -> list[str]:
     good = ending.ending in case.expect
-    told = ending.message.replace("|", "\\|").replace("\n", " ")
+    # That all went well is told by the ending.
+    told = ending.message.removeprefix(Outcome.SUCCEEDED.value).removeprefix("; ")
+    told = told.replace("|", "\\|").replace("\n", " ")
     return [
         f"`{case.name}`",
         case.about,
