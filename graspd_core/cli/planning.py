@@ -51,12 +51,13 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     return config, request
 
 
-def summary(result: GraspResult, wanted: int) -> str:
-    """A few lines for a person."""
+def summary(result: GraspResult, wanted: int, different: int) -> str:
+    """A few lines for a person; so many of the good grasps are `different`."""
     good = good_grasps(result)
     kind = "unverified" if any(g.verdict is Verdict.UNVERIFIED for g in result.grasps) else "verified"
     ending = result.message or result.outcome.value
-    lines = [f"{good} of {wanted} grasps ({kind}, {len(result.grasps)} tried): {ending}"]
+    copies = f", {different} of them different" if different < good else ""
+    lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.grasps)} tried): {ending}"]
     timing = result.timing
     lines.append(
         f"load {timing.load:.2f} s, sdf {timing.sdf:.2f} s, optimise {timing.optimise:.2f} s, "

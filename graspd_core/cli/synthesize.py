@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.cli.clouds import add_object_options, target_of
-from graspd_core.cli.planning import add_planning_options, exit_status, planning_options, summary
+from graspd_core.cli.planning import add_planning_options, exit_status, good_grasps, planning_options, summary
 from graspd_core.cli.running import Interrupt, Reporter
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
@@ -31,6 +31,7 @@ def add_command(commands: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Returns the exit status."""
     from graspd_core.io import check_writable, save_result
+    from graspd_core.metrics.diversity import distinct
     from graspd_core.pipeline import load_hand, load_scene, plan_grasps
 
     config, request = planning_options(options)
@@ -59,5 +60,6 @@ def run(options: argparse.Namespace) -> int:
         from graspd_core.html import save_view
 
         save_view(options.html, scene.object.mesh, hand, result.grasps)
-    print(summary(result, options.count))
+    different = len(distinct(result.grasps[: good_grasps(result)], hand))
+    print(summary(result, options.count, different))
     return exit_status(result)
