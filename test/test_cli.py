@@ -168,7 +168,6 @@ def test_every_outcome_has_its_status(
 ):
     ended = GraspResult(outcome, (), Timing(), 0, "closed_form")
     monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: ended)
-    monkeypatch.setattr(pipeline, "load_hand", lambda *_, **__: None)
     assert main(["synthesize", "shape:box"]) == status
     assert outcome.value in capsys.readouterr().out
 
