@@ -23,11 +23,16 @@ def write_cell(folder: Path, cell: Cell, record: Record) -> None:
 
 def read_cell(folder: Path, cell: Cell, code: str | None) -> Record | None:
     """The record of a cell that finished without error under `code` (None: under any); None where there is none."""
+    return kept_record(folder / cell_file(cell), cell_key(cell), code)
+
+
+def kept_record(path: Path, key: str, code: str | None) -> Record | None:
+    """What a file holds under `key`, if that ended without error under `code` (None: under any)."""
     try:
-        record = json.loads((folder / cell_file(cell)).read_text(encoding="utf-8"))
+        record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    good = isinstance(record, dict) and record.get("key") == cell_key(cell) and not record.get("error")
+    good = isinstance(record, dict) and record.get("key") == key and not record.get("error")
     return record if good and (code is None or record.get("code") == code) else None
 
 

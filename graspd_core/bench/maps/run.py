@@ -10,14 +10,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from graspd_core.bench.cells.run import finite
 from graspd_core.bench.maps.atlas import MAPS, METHODS, jobs_of
 from graspd_core.bench.maps.job import Job, Place, job_key, record_of, run_job
+from graspd_core.bench.store import Record, kept_record
 from graspd_core.io import save_text
-
-Record = dict[str, Any]
 
 
 def job_file(job: Job) -> str:
@@ -28,12 +26,7 @@ def job_file(job: Job) -> str:
 
 def read_job(folder: Path, job: Job, code: str | None) -> Record | None:
     """The record of a job that finished without error under `code` (None: under any); None where there is none."""
-    try:
-        record = json.loads((folder / job_file(job)).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    good = isinstance(record, dict) and record.get("key") == job_key(job) and not record.get("error")
-    return record if good and (code is None or record.get("code") == code) else None
+    return kept_record(folder / job_file(job), job_key(job), code)
 
 
 def run_missing(jobs: Iterable[Job], folder: Path, code: str, *, any_code: bool = False) -> Iterator[Record]:
