@@ -37,9 +37,6 @@ from graspd_core.types import Contact, Grasp, Posture
 _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 # A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
 _DEEPEST = 0.0015
-# So is one that is deeper than this in the object before its grasp, where a trial would refuse it: it began inside and
-# did not get out [m]. Of the grasp itself nothing is asked: some methods press fingers in deep, and yet hold.
-_DEEPEST_ON_THE_WAY = 0.01
 # What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
 _KNOCK_COST = 100.0
 
@@ -94,8 +91,9 @@ def assemble(
 ) -> tuple[Grasp, ...]:
     """Three postures and a score for every pose, best first.
 
-    Poses without a balanced squeeze are dropped, and those that reach through an obstacle, or are stuck in the object,
-    on their way or at its end.
+    Poses without a balanced squeeze are dropped, and those that reach through an obstacle on their way or at its end.
+    How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
+    to its pregrasp is refused by a trial before its first step.
     """
     touches = find_touches(problem, poses, config.postures.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.lower)
@@ -107,8 +105,6 @@ def assemble(
         depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
         overlap = torch.maximum(overlap, depth.to(overlap))
     scores = score(touches, pressed, clearance, overlap)
-    stuck = -clearance * config.postures.clearance > _DEEPEST_ON_THE_WAY
-    scores = torch.where(stuck, -torch.inf, scores)
     if problem.obstacles is not None:
         ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
         depth = intrusion(problem.obstacles, problem.kinematics, poses.quaternion, *ends)
