@@ -21,7 +21,7 @@ _SAMPLES = 4000
 
 
 def run(job: Job) -> Done:
-    """Plan on a grid of exactly that many nodes along the longest side of a cup with walls of so many millimetres."""
+    """Plan on a grid of that resolution, and no finer, of a cup with walls of so many millimetres."""
     (wall,) = job.up
     scene = on_grid(cup(float(wall)), int(job.across))
     hand, grasps = plan(job, scene)

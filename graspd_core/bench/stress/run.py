@@ -23,7 +23,7 @@ import numpy as np
 
 from graspd_core.bench.stress.case import GRASP, Case
 from graspd_core.errors import GraspdError
-from graspd_core.geometry.scene import Scene, object_parts
+from graspd_core.geometry.scene import ObjectModel, Scene, object_parts
 from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
 
 # What a deadline may be overrun by [s].
@@ -126,29 +126,31 @@ def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder
     from graspd_core.config import load_preset
     from graspd_core.geometry import cache
     from graspd_core.io import grasps_of, load_document, save_result
-    from graspd_core.verify.trial import hold_trial
-    from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
     path = folder / "grasps.json"
     save_result(path, result, scene.object, hand, load_preset(preset))
     kept = grasps_of(load_document(path))
     cache.forget()
-    again = case.scene(folder).object
-    protocol = at_friction(PROTOCOLS["standard"], again.friction)
-    world = build_world(hand, again, object_parts(again), protocol)
-    return sum(hold_trial(world, grasp, protocol).passed for grasp in kept if grasp.verdict is Verdict.VERIFIED)
+    verified = [grasp for grasp in kept if grasp.verdict is Verdict.VERIFIED]
+    return _held(verified, case.scene(folder).object, hand)
 
 
 def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: TriangleMesh) -> int:
     """How many verified grasps hold on the true object, of the mass and friction that were planned with."""
     from graspd_core.geometry.scene import build_scene
+
+    true = build_scene(truth, source="truth", mass=scene.object.mass, friction=scene.object.friction)
+    return _held(verified, true.object, hand)
+
+
+def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
+    """How many grasps pass the hold trial on an object, in a world of its own."""
     from graspd_core.verify.trial import hold_trial
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
-    true = build_scene(truth, source="truth", mass=scene.object.mass, friction=scene.object.friction).object
-    protocol = at_friction(PROTOCOLS["standard"], true.friction)
-    world = build_world(hand, true, object_parts(true), protocol)
-    return sum(hold_trial(world, grasp, protocol).passed for grasp in verified)
+    protocol = at_friction(PROTOCOLS["standard"], target.friction)
+    world = build_world(hand, target, object_parts(target), protocol)
+    return sum(hold_trial(world, grasp, protocol).passed for grasp in grasps)
 
 
 def _finite(result: GraspResult) -> bool:

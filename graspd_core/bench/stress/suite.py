@@ -12,23 +12,22 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import IO
 
 from graspd_core.bench.cells.cell import settings_of
+from graspd_core.bench.store import kept_record
 from graspd_core.bench.stress.case import Case
 from graspd_core.bench.stress.cases import CASES
 from graspd_core.bench.stress.run import Ending
+from graspd_core.bench.workers import ENVIRONMENT
 from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
 from graspd_core.io import save_text
 
-FORMAT, VERSION = "graspd/stress", 1
-
 # Beyond loading and planning, before a process is called hung, and how often processes are looked at [s].
 _PATIENCE, _POLL = 60.0, 0.05
-# One thread each; nothing remembered on disk, so that every case builds its own and takes as long the second time.
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "GRASPD_CACHE": "off"}
 
 
 def cases_of(names: Sequence[str]) -> tuple[Case, ...]:
@@ -55,8 +54,8 @@ class Shelf:
     code: str
     any_code: bool = False
 
-    @property
-    def _settings(self) -> str:
+    @cached_property
+    def _key(self) -> str:
         """Hash of what the preset says."""
         said = json.dumps(settings_of(load_preset(self.preset)), sort_keys=True)
         return hashlib.sha256(said.encode()).hexdigest()
@@ -67,16 +66,16 @@ class Shelf:
 
     def write(self, ending: Ending, case: Case) -> None:
         """Keep an ending; its file appears whole or not at all."""
-        kept = {"format": FORMAT, "version": VERSION, "code": self.code, "settings": self._settings}
-        save_text(self.path(case), json.dumps({**kept, "ending": asdict(ending)}, indent=1) + "\n")
+        record = {"key": self._key, "code": self.code, "ending": asdict(ending)}
+        save_text(self.path(case), json.dumps(record, indent=1) + "\n")
 
     def read(self, case: Case) -> tuple[Ending, str] | None:
         """The ending of a case and the code that it came of; None where there is none that counts."""
+        record = kept_record(self.path(case), self._key, None if self.any_code else self.code)
         try:
-            kept = json.loads(self.path(case).read_text(encoding="utf-8"))
-            good = kept["settings"] == self._settings and (self.any_code or kept["code"] == self.code)
-            return (Ending(**kept["ending"]), str(kept["code"])) if good else None
-        except (OSError, ValueError, TypeError, KeyError):
+            return None if record is None else (Ending(**record["ending"]), str(record["code"]))
+        # Other code may have said other things of an ending.
+        except (TypeError, KeyError):
             return None
 
 
@@ -116,7 +115,7 @@ class _Running:
         command = [sys.executable, "-m", "graspd_core.bench.stress.run", case.name, "--preset", preset]
         self._streams = out, err = _scratch(), _scratch()
         # A group of its own: a Ctrl-C is the parent's, who decides what it means.
-        environment = {**os.environ, **_ENVIRONMENT}
+        environment = {**os.environ, **ENVIRONMENT}
         self._process = subprocess.Popen(command, stdout=out, stderr=err, env=environment, process_group=0)
 
     def over(self) -> bool:
