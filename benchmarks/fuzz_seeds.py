@@ -160,7 +160,7 @@ def layouts() -> list[bytes]:
 
 def _messages() -> list[Any]:
     from graspd_core.bags.writer import camera_info_message, cloud_message, depth_message, transforms_message
-    from graspd_core.geometry.camera import PinholeCamera
+    from graspd_core.pointcloud.camera import PinholeCamera
 
     camera = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0, (0.1, -0.2, 0.001, -0.001, 0.05))
     depth = np.full((3, 4), 0.5)

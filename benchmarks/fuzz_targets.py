@@ -118,7 +118,7 @@ def _gripper() -> Any:
 
 
 def _description(path: Path) -> Any:
-    from graspd_core.hands.description import apply_description, read_description
+    from graspd_core.hands.readers.description import apply_description, read_description
 
     hand = apply_description(_gripper(), read_description(path))
     finite(hand.palm_center, hand.palm_normal, hand.approach, hand.open_posture, hand.closed_posture)
@@ -132,7 +132,7 @@ def _preset(path: Path) -> Any:
 
 
 def _document(path: Path) -> Any:
-    from graspd_core.io import grasps_of, load_document
+    from graspd_core.formats.grasps_json import grasps_of, load_document
 
     grasps = grasps_of(load_document(path))
     for grasp in grasps:
@@ -145,13 +145,13 @@ def _document(path: Path) -> Any:
 
 
 def _mano(path: Path) -> Any:
-    from graspd_core.hands.mano_file import read_mano
+    from graspd_core.hands.mano.mano_file import read_mano
 
     return read_mano(path)
 
 
 def _dae(path: Path) -> Any:
-    from graspd_core.geometry.dae import read_dae
+    from graspd_core.mesh.collada import read_dae
 
     mesh = read_dae(path)
     assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices), "faces name vertices that are not there"
@@ -159,7 +159,7 @@ def _dae(path: Path) -> Any:
 
 
 def _cloud(path: Path) -> Any:
-    from graspd_core.geometry.cloud_files import is_cloud_file, load_views
+    from graspd_core.pointcloud.cloud_files import is_cloud_file, load_views
 
     data = path.read_bytes()
     ending = next((e for mark, e in ((b"PK", "npz"), (b"ply", "ply"), (b"#", "pcd")) if data.startswith(mark)), "npy")
@@ -175,7 +175,7 @@ def _cloud(path: Path) -> Any:
 
 def _layout(path: Path) -> Any:
     """Width, height, step of a point and of a row, byte order and three fields, then the data."""
-    from graspd_core.geometry.layout import CloudLayout, points_from_layout
+    from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
 
     data = path.read_bytes().ljust(LAYOUT_HEAD.size, b"\0")
     width, height, point, row, big, *places = LAYOUT_HEAD.unpack_from(data)
@@ -208,7 +208,7 @@ def _message(path: Path) -> Any:
     from graspd_core.bags.reader import CLOUD, IMAGE, INFO, TRANSFORMS, jazzy_types
     from graspd_core.bags.writer import camera_info_message
     from graspd_core.errors import FormatError
-    from graspd_core.geometry.camera import PinholeCamera
+    from graspd_core.pointcloud.camera import PinholeCamera
     from graspd_core.transforms import TransformBuffer
 
     data = path.read_bytes() or b"\0"
@@ -246,17 +246,17 @@ TARGETS: dict[str, Target] = {
     for target in (
         Target(
             "urdf", _hand, "urdf", lambda: URDFS, _errors("HandError"),
-            (*_HANDS, "graspd_core.hands.urdf", "graspd_core.hands.collision"),
+            (*_HANDS, "graspd_core.hands.readers.urdf", "graspd_core.hands.readers.urdf_geometry"),
             (*_NUMBERS, "<mimic joint=", "<limit lower=", "continuous", "prismatic", "floating", "<mesh filename="),
         ),
         Target(
             "mjcf", _hand, "xml", lambda: MJCFS, _errors("HandError"),
-            (*_HANDS, *(f"graspd_core.hands.mjcf{n}" for n in ("", "_values", "_geoms"))),
+            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_values", "_geoms"))),
             (*_NUMBERS, "polycoef=", "eulerseq=", "childclass=", "<freejoint/>", "quat=", "xyaxes=", "fromto="),
         ),
         Target(
             "description", _description, "yaml", lambda: DESCRIPTIONS, _errors("HandError"),
-            ("graspd_core.hands.description", "graspd_core.hands.mount"),
+            ("graspd_core.hands.readers.description", "graspd_core.hands.readers.mount"),
             (*_NUMBERS, *_YAML, "palm:", "!!timestamp", ".nan"),
         ),
         Target(
@@ -265,7 +265,8 @@ TARGETS: dict[str, Target] = {
             (*_NUMBERS, *_YAML, "closed_form:", ".inf", "null"),
         ),
         Target(
-            "document", _document, "json", lambda: DOCUMENTS, _errors("FormatError"), ("graspd_core.io",),
+            "document", _document, "json", lambda: DOCUMENTS, _errors("FormatError"),
+            ("graspd_core.formats.grasps_json",),
             (*_NUMBERS, '"grasps"', '"hand"', "null", "true", "[[", '"mimic"', "NaN", '"verified"', '{"hold":'),
         ),
         Target(
@@ -275,15 +276,15 @@ TARGETS: dict[str, Target] = {
             16384,
         ),
         Target(
-            "dae", _dae, "dae", lambda: DAES, (ValueError,), ("graspd_core.geometry.dae",),
+            "dae", _dae, "dae", lambda: DAES, (ValueError,), ("graspd_core.mesh.collada",),
             (*_NUMBERS, "offset=", "stride=", "<vcount>", "<p>", "<instance_node url=", "<matrix>", "<rotate>"),
         ),
         Target(
             "cloud", _cloud, "npy", clouds, _errors("CloudError"),
-            ("graspd_core.geometry.cloud_files", "graspd_core.geometry.point_files"),
+            ("graspd_core.pointcloud.cloud_files", "graspd_core.pointcloud.ply_pcd"),
             (*_NUMBERS, "POINTS ", "WIDTH ", "VIEWPOINT ", "DATA ascii", "element vertex ", "element face 1"),
         ),
-        Target("layout", _layout, "bin", layouts, _errors("CloudError"), ("graspd_core.geometry.layout",)),
+        Target("layout", _layout, "bin", layouts, _errors("CloudError"), ("graspd_core.pointcloud.pointcloud2",)),
         Target(
             "message", _message, "bin", messages, _errors("CloudError", "TransformError", "FormatError"),
             tuple(f"graspd_core.{n}" for n in ("bags.messages", "geometry.camera", "geometry.depth", "transforms")),

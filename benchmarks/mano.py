@@ -30,18 +30,18 @@ def case(model: Path, source: str, betas: list[float], preset: str, seed: int) -
     """Plan on one object, try every grasp, measure the best."""
     import torch
 
+    from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
+    from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
     from graspd_core.config import load_preset
-    from graspd_core.geometry.exact import make_distance_query
-    from graspd_core.geometry.scene import object_parts
-    from graspd_core.hands.mano import load_mano
-    from graspd_core.metrics.skinned import measure_skin
-    from graspd_core.optimise.solver import Hooks
-    from graspd_core.optimise.synthesis import synthesise
-    from graspd_core.pipeline import load_scene
-    from graspd_core.verify.bullet import build_bullet_world, bullet_available
-    from graspd_core.verify.displacement import displacement_trial
-    from graspd_core.verify.trial import hold_trial
-    from graspd_core.verify.world import PROTOCOLS, build_world
+    from graspd_core.hands.mano.mano_hand import load_mano
+    from graspd_core.mesh.mesh_distance import make_distance_query
+    from graspd_core.methods.candidates import synthesise
+    from graspd_core.methods.loop import Hooks
+    from graspd_core.metrics.skin_metrics import measure_skin
+    from graspd_core.scene.load_scene import load_scene
+    from graspd_core.scene.scene import object_parts
+    from graspd_core.trials.hold_trial import hold_trial
+    from graspd_core.trials.world import PROTOCOLS, build_world
 
     torch.set_num_threads(1)
     config = load_preset(preset)
@@ -56,7 +56,7 @@ def case(model: Path, source: str, betas: list[float], preset: str, seed: int) -
     query = make_distance_query(scene.object.mesh)
     skins = [measure_skin(query, mano.skinned_mesh(grasp.grasp)) for grasp in found.grasps[:BEST]]
     bullet = build_bullet_world(mano.model, scene.object, parts) if bullet_available() else None
-    moved = [displacement_trial(bullet, grasp.grasp) for grasp in found.grasps[:BEST]] if bullet else []
+    moved = [bullet_displacement(bullet, grasp.grasp) for grasp in found.grasps[:BEST]] if bullet else []
     return {
         "object": source,
         "held": sum(hold.passed for hold in holds),

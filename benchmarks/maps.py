@@ -21,10 +21,10 @@ os.environ.update(GRASPD_CACHE="off", OMP_NUM_THREADS="1")
 def main() -> None:
     import torch
 
-    from graspd_core.bench.cells.cell import code_version
-    from graspd_core.bench.charts_maps import draw_map
-    from graspd_core.bench.maps.atlas import MAPS, METHODS, jobs_of
-    from graspd_core.bench.maps.run import finished, report, run_missing, shares
+    from graspd_core.bench.charts.failure_map_chart import draw_map
+    from graspd_core.bench.failure_maps.map_registry import MAPS, METHODS, jobs_of
+    from graspd_core.bench.failure_maps.run_map_jobs import finished, report, run_missing, shares
+    from graspd_core.bench.measurements.measurement import code_version
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--maps", nargs="+", choices=MAPS, default=list(MAPS), metavar="MAP", help=", ".join(MAPS))

@@ -45,7 +45,7 @@ class Case:
     preset: str = "balanced"
     noise: str = "default"
     clutter: bool = False
-    front: str = "graspd_core.geometry.perceive:scene_from_views"
+    front: str = "graspd_core.scene.scene_from_views:scene_from_views"
 
     @property
     def key(self) -> str:
@@ -55,7 +55,7 @@ class Case:
 
 def camera_poses(case: Case) -> tuple[np.ndarray, ...]:
     """One camera, three around, or two rings of eight and seven."""
-    from graspd_core.geometry.tabletop import ring_poses
+    from graspd_core.rendering.tabletop import ring_poses
 
     azimuth, elevation = np.deg2rad(20.0 + 120.0 * case.start), np.deg2rad(ELEVATIONS[case.start])
     if case.views <= 3:
@@ -70,7 +70,8 @@ def warm_hand(preset: str) -> Any:
     import torch
 
     from graspd_core.config import load_preset
-    from graspd_core.pipeline import load_hand, warm_up
+    from graspd_core.hands.library import load_hand
+    from graspd_core.planning.plan_grasps import warm_up
 
     torch.set_num_threads(1)
     hand = load_hand("allegro_right", candidates=load_preset(preset).closed_form.fine_candidates)
@@ -81,7 +82,7 @@ def warm_hand(preset: str) -> Any:
 @lru_cache(maxsize=1)
 def warm_front(name: str) -> Any:
     """The function that makes a scene of views, after its libraries have been loaded by a view of a ball."""
-    from graspd_core.geometry.tabletop import CAMERA, ring_poses, tabletop, views_of
+    from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 
     module, function = name.split(":")
     front = getattr(importlib.import_module(module), function)
@@ -91,11 +92,11 @@ def warm_front(name: str) -> Any:
 
 def run_case(case: Case) -> dict:
     """Everything that is reported of one case; a refusal is a result with its message."""
-    from graspd_core.geometry import cache
-    from graspd_core.geometry.mesh import load_mesh
-    from graspd_core.geometry.noise import LEVELS
-    from graspd_core.geometry.scene import build_scene
-    from graspd_core.geometry.tabletop import CAMERA, tabletop, views_of
+    from graspd_core.mesh.mesh_files import load_mesh
+    from graspd_core.rendering.depth_noise import LEVELS
+    from graspd_core.rendering.tabletop import CAMERA, tabletop, views_of
+    from graspd_core.runtime import disk_cache as cache
+    from graspd_core.scene.scene import build_scene
 
     hand = warm_hand(case.preset)
     thing = load_mesh(case.shape) if Path(case.shape).suffix else case.shape
@@ -122,12 +123,12 @@ def run_case(case: Case) -> dict:
 
 def _grasps(case: Case, scene: Any, stage: Any, hand: Any) -> dict:
     """Plan one grasp against the clock, then `count`; try all that were verified on the truth."""
-    from graspd_core.geometry.scene import build_scene, object_parts
-    from graspd_core.pipeline import plan_grasps
+    from graspd_core.planning.plan_grasps import plan_grasps
+    from graspd_core.scene.scene import build_scene, object_parts
+    from graspd_core.trials.hold_trial import hold_trial
+    from graspd_core.trials.lift_trial import lift_trial
+    from graspd_core.trials.world import PROTOCOLS, build_world
     from graspd_core.types import Verdict
-    from graspd_core.verify.lift import lift_trial
-    from graspd_core.verify.trial import hold_trial
-    from graspd_core.verify.world import PROTOCOLS, build_world
 
     first = plan_grasps(scene, hand, count=1, seed=case.start, preset=case.preset)
     many = plan_grasps(scene, hand, count=case.count, seed=case.start, preset=case.preset)
@@ -163,8 +164,8 @@ def _grasps(case: Case, scene: Any, stage: Any, hand: Any) -> dict:
 
 
 def _neighbours(stage: Any) -> tuple:
-    from graspd_core.geometry.scene import Neighbour
-    from graspd_core.geometry.sdf import build_sdf
+    from graspd_core.mesh.sdf import build_sdf
+    from graspd_core.scene.scene import Neighbour
 
     return tuple(Neighbour(mesh, build_sdf(mesh, resolution=32, padding=0.02)) for mesh in stage.neighbours)
 
@@ -175,10 +176,10 @@ def reconstruction_error(scene: Any, stage: Any) -> dict:
     chamfer_mm: mean of the mean distances either way [mm]; completeness: share of the true surface within 5 mm of the
     reconstruction; beyond_10mm: share of the reconstruction farther than 10 mm from the truth.
     """
-    from graspd_core.geometry.embree import make_surface, surface_distance
-    from graspd_core.geometry.mesh import surface_samples
-    from graspd_core.geometry.topology import is_closed
-    from graspd_core.geometry.winding import winding_inside
+    from graspd_core.mesh.mesh_files import surface_samples
+    from graspd_core.mesh.surface_queries import make_surface, surface_distance
+    from graspd_core.mesh.topology import is_closed
+    from graspd_core.mesh.winding_number import winding_inside
 
     points, normals = surface_samples(stage.truth, SAMPLES, 0)
     # Bodies that overlap have surfaces that nobody could see.

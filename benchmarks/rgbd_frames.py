@@ -23,8 +23,8 @@ def read_frame(folder: Path) -> tuple[Any, np.ndarray]:
     """The cloud of a depth image in its camera's frame, and the reference cloud of its object [m]."""
     import open3d as o3d
 
-    from graspd_core.geometry.camera import PinholeCamera
-    from graspd_core.geometry.depth import cloud_from_depth, depth_in_metres
+    from graspd_core.pointcloud.camera import PinholeCamera
+    from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_in_metres
 
     info = json.loads((folder / "camera.json").read_text())
     k = info["K"]
@@ -52,10 +52,10 @@ def run_frames(folder: Path, pictures: Path, *, count: int, preset: str) -> list
 
 def run_frame(folder: Path, pictures: Path, hand: Any, *, count: int, preset: str) -> dict:
     """The object nearest the view axis; where that is not the reference's, the one at the reference's centre."""
-    from graspd_core.geometry.perceive import scene_from_views
-    from graspd_core.geometry.segment import Target, segment
-    from graspd_core.geometry.topology import is_closed
-    from graspd_core.pipeline import plan_grasps
+    from graspd_core.mesh.topology import is_closed
+    from graspd_core.planning.plan_grasps import plan_grasps
+    from graspd_core.scene.scene_from_views import scene_from_views
+    from graspd_core.segmentation.segment import Target, segment
     from graspd_core.types import Verdict
 
     cloud, reference = read_frame(folder)
@@ -103,8 +103,8 @@ def draw(scene: Any, hand: Any, posture: Any, points: np.ndarray, eye: np.ndarra
     from scipy.spatial import KDTree
     from scipy.spatial.transform import Rotation
 
-    from graspd_core.geometry.raycast import look_at, render_shaded, save_png
-    from graspd_core.hands.meshes import hand_mesh
+    from graspd_core.hands.hand_mesh import hand_mesh
+    from graspd_core.rendering.render import look_at, render_shaded, save_png
     from graspd_core.types import TriangleMesh
 
     mesh = scene.object.mesh

@@ -27,11 +27,13 @@ def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
     import torch
 
     from graspd_core.config import load_preset
-    from graspd_core.geometry.scene import object_parts
-    from graspd_core.pipeline import load_hand, load_scene, plan_grasps
+    from graspd_core.hands.library import load_hand
+    from graspd_core.planning.plan_grasps import plan_grasps
+    from graspd_core.scene.load_scene import load_scene
+    from graspd_core.scene.scene import object_parts
+    from graspd_core.trials.noisy_trial import noisy_share, pose_errors
+    from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
     from graspd_core.types import Verdict
-    from graspd_core.verify.noise import noisy_share, pose_errors
-    from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
     torch.set_num_threads(1)
     config = load_preset(PRESET)
@@ -65,7 +67,7 @@ def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
 
 def report(rows: list[dict]) -> str:
     """Costs and gains as Markdown."""
-    from graspd_core.bench.robust import correlation, orders
+    from graspd_core.bench.robustness import correlation, orders
 
     lines = [
         "| shape | plan, CPU s | with ranking | first by score holds | first by noise | the best "
@@ -84,7 +86,7 @@ def report(rows: list[dict]) -> str:
 
 
 def main() -> None:
-    from graspd_core.geometry.shapes import SHAPES as KNOWN
+    from graspd_core.mesh.shapes import SHAPES as KNOWN
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/robust.json"))
@@ -104,7 +106,7 @@ def main() -> None:
             print(f"{shape}, seed {seed}: {rows[-1]['held']}", flush=True)
     print(report(rows))
     if options.chart:
-        from graspd_core.bench.charts_robust import draw_robust
+        from graspd_core.bench.charts.robustness_chart import draw_robust
 
         print(draw_robust(rows, options.chart))
 

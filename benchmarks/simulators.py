@@ -22,18 +22,19 @@ def shape_trials(shape: str, grasps: int, hold_time: float, preset: str = "balan
     import numpy as np
     import torch
 
+    from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
+    from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
+    from graspd_core.bench.bullet.bullet_world import build_bullet_world
     from graspd_core.config import load_preset
-    from graspd_core.geometry.scene import object_parts
-    from graspd_core.optimise.solver import Hooks
-    from graspd_core.optimise.synthesis import synthesise
-    from graspd_core.pipeline import load_hand, load_scene
-    from graspd_core.verify.bullet import build_bullet_world
-    from graspd_core.verify.bullet_hold import bullet_hold_trial
-    from graspd_core.verify.displacement import displacement_trial
-    from graspd_core.verify.frozen import build_frozen_world, frozen_displacement
-    from graspd_core.verify.noise import displaced, pose_error
-    from graspd_core.verify.trial import hold_trial
-    from graspd_core.verify.world import PROTOCOLS, build_world
+    from graspd_core.hands.library import load_hand
+    from graspd_core.methods.candidates import synthesise
+    from graspd_core.methods.loop import Hooks
+    from graspd_core.scene.load_scene import load_scene
+    from graspd_core.scene.scene import object_parts
+    from graspd_core.trials.displacement_trial import build_frozen_world, displacement_trial
+    from graspd_core.trials.hold_trial import hold_trial
+    from graspd_core.trials.noisy_trial import displaced, pose_error
+    from graspd_core.trials.world import PROTOCOLS, build_world
 
     torch.set_num_threads(1)
     config = load_preset(preset)
@@ -60,8 +61,8 @@ def shape_trials(shape: str, grasps: int, hold_time: float, preset: str = "balan
                 "mujoco_full": asdict(hold_trial(world, grasp, standard)),
                 "bullet": asdict(second),
                 "bullet_cpu_s": bullet_seconds,
-                "sd_bullet": displacement_trial(bullet, grasp.grasp),
-                "sd_mujoco": frozen_displacement(frozen, grasp.grasp),
+                "sd_bullet": bullet_displacement(bullet, grasp.grasp),
+                "sd_mujoco": displacement_trial(frozen, grasp.grasp),
             }
         )
     return rows
@@ -105,7 +106,7 @@ def _said(hold: dict) -> str:
 
 
 def main() -> None:
-    from graspd_core.geometry.shapes import SHAPES
+    from graspd_core.mesh.shapes import SHAPES
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/simulators.json"))

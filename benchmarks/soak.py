@@ -66,8 +66,8 @@ def soak(folder: Path, seconds: float) -> dict[str, Any]:
     """Start the processes, keep them busy, gather the figures."""
     from soak_client import SCENES, Client  # it imports ROS, which reads the environment set above
 
-    from graspd_core.geometry.mesh import save_mesh
-    from graspd_core.geometry.shapes import make_shape
+    from graspd_core.mesh.mesh_files import save_mesh
+    from graspd_core.mesh.shapes import make_shape
 
     for shape in ("sphere", "mug", "box"):
         save_mesh(make_shape(shape), folder / f"{shape}.obj")

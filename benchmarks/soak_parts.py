@@ -22,8 +22,9 @@ BALL, RADIUS, NOISE = np.array([0.0, 0.0, 0.5]), 0.035, 0.0005  # metres
 
 def run_node(file: Path, arguments: list[str]) -> int:
     """graspd_node, with a timer that notes how late it comes and a note of each cloud's age on arrival."""
-    from graspd_ros import node, service
-    from graspd_ros.sources import Sighting, nanoseconds
+    from graspd_ros import grasp_node as service
+    from graspd_ros import node
+    from graspd_ros.inputs.sensor_frames import Sighting, nanoseconds
 
     class TimedNode(service.GraspNode):
         def __init__(self, *args, **kwargs) -> None:

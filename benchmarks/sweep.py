@@ -13,11 +13,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from graspd_core.bench.cells.cell import Cell, code_version
-from graspd_core.bench.store import read_cells
-from graspd_core.bench.suite import find_objects, hand_hash, override
+from graspd_core.bench.benchmark_workers import run_cells
+from graspd_core.bench.measurements.measurement import Cell, code_version
+from graspd_core.bench.result_store import read_cells
+from graspd_core.bench.suites import find_objects, hand_hash, override
 from graspd_core.bench.tables import markdown_table
-from graspd_core.bench.workers import run_cells
 from graspd_core.config import load_preset
 
 HAND, COUNT = "allegro_right", 8

@@ -27,18 +27,8 @@ from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import String
 
-from graspd_core.geometry.depth import cloud_from_depth
-from graspd_core.geometry.mesh import save_mesh
-from graspd_core.geometry.raycast import (
-    camera_of_view,
-    look_at,
-    render_depth,
-    render_shaded,
-    save_png,
-)
-from graspd_core.geometry.shapes import make_shape
-from graspd_core.hands.library import load_hand
-from graspd_core.hands.meshes import hand_mesh
+from graspd_core import cloud_from_depth, hand_mesh, load_hand, make_shape, save_mesh
+from graspd_core.rendering.render import camera_of_view, look_at, render_depth, render_shaded, save_png
 from graspd_core.types import TriangleMesh
 
 GRASPS = 8

@@ -150,7 +150,7 @@ def _check_system_libraries() -> list[Check]:
 
 
 def _check_cache() -> Check:
-    from graspd_core.geometry.cache import cache_path
+    from graspd_core.runtime.disk_cache import cache_path
 
     path = cache_path("doctor")
     if path is None:

@@ -5,12 +5,19 @@ Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is 
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 # The one epsilon of the project: below it a squared length counts as zero [unit²].
 EPSILON = 1e-12
+
+
+def perpendicular(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """A unit vector square to a direction of any length but zero; any, but always the same."""
+    side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    return side / np.linalg.norm(side)
 
 
 def safe_norm(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:

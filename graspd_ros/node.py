@@ -33,9 +33,9 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown
 
+    from graspd_core import share_arenas
     from graspd_core.errors import GraspdError
-    from graspd_core.pipeline import share_arenas
-    from graspd_ros.service import GraspNode
+    from graspd_ros.grasp_node import GraspNode
 
     share_arenas()
     sys.setswitchinterval(SWITCH_INTERVAL)

@@ -30,12 +30,12 @@ from rclpy.utilities import remove_ros_args
 
 from graspd_core.cli import build_parser
 from graspd_ros import player
-from graspd_ros.codes import ErrorCode
 from graspd_ros.diagnostics import Health, health_message
-from graspd_ros.moveit import moveit_grasp
+from graspd_ros.grasp_node import GraspNode
+from graspd_ros.inputs.requests import check_request
+from graspd_ros.outputs.error_codes import ErrorCode
+from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings, check_parameters
-from graspd_ros.requests import check_request
-from graspd_ros.service import GraspNode
 from graspd_ros.worker import Ending
 
 ROOT = Path(__file__).parents[1]

@@ -10,7 +10,7 @@ import pytest
 
 from graspd_core.cli import build_parser
 from graspd_core.config import load_preset
-from graspd_core.io import FORMAT, VERSION
+from graspd_core.formats.grasps_json import FORMAT, VERSION
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError, TransformError
-from graspd_core.geometry.camera import PinholeCamera, camera_from_calibration
-from graspd_core.geometry.cloud import PointCloud
-from graspd_core.geometry.depth import cloud_from_depth, depth_from_bytes
-from graspd_core.geometry.layout import CloudLayout, points_from_layout
+from graspd_core.pointcloud.camera import PinholeCamera, camera_from_calibration
+from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_from_bytes
+from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
 from graspd_core.transforms import SECOND, TransformBuffer
 
 

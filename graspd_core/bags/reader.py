@@ -15,8 +15,8 @@ from typing import Any
 
 from graspd_core.bags.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
 from graspd_core.errors import BagError, TransformError
-from graspd_core.geometry.cloud import PointCloud, transform_cloud
-from graspd_core.geometry.depth import ENCODINGS
+from graspd_core.pointcloud.depth_image import ENCODINGS
+from graspd_core.pointcloud.point_cloud import PointCloud, transform_cloud
 from graspd_core.transforms import TransformBuffer
 
 BAG_ENDINGS = ("mcap", "db3")

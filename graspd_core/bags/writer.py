@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from graspd_core.bags.reader import jazzy_types
 from graspd_core.errors import BagError
-from graspd_core.geometry.camera import PinholeCamera
-from graspd_core.geometry.depth import ENCODINGS
+from graspd_core.pointcloud.camera import PinholeCamera
+from graspd_core.pointcloud.depth_image import ENCODINGS
 from graspd_core.transforms import SECOND
 
 # The most that a pixel of 16 bits can hold [mm].

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.bench.store import Record
+from graspd_core.bench.result_store import Record
 
 # Figures of one grasp, by name: where each is found in its record, in the unit of the name.
 GRASP_FIGURES: dict[str, Callable[[dict[str, Any]], float | None]] = {

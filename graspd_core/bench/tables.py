@@ -9,9 +9,9 @@ from pathlib import Path
 
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
 from graspd_core.bench.names import is_hand, is_preset
-from graspd_core.bench.store import Record
+from graspd_core.bench.result_store import Record
 from graspd_core.errors import ConfigError
-from graspd_core.io import save_text
+from graspd_core.formats.grasps_json import save_text
 
 # Columns of both tables: heading, figure, format; a summary takes means over objects.
 _COLUMNS = (

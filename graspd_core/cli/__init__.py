@@ -10,7 +10,11 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from graspd_core.cli import bench, hands, reconstruct, replay, synthesize
+from graspd_core.cli import bench_command as bench
+from graspd_core.cli import hands_command as hands
+from graspd_core.cli import reconstruct_command as reconstruct
+from graspd_core.cli import replay_command as replay
+from graspd_core.cli import synthesize_command as synthesize
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from graspd_core.errors import ConfigError, GraspdError
 

@@ -9,12 +9,12 @@ from typing import Literal
 
 from graspd_core.config.baselines import AnnealingConfig, RandomClosureConfig
 from graspd_core.config.closed_form import ClosedFormConfig, LossWeights
+from graspd_core.config.grasp_stages import PostureConfig
 from graspd_core.config.graspd2022 import Graspd2022Config
 from graspd_core.config.mapping import from_mapping
-from graspd_core.config.postures import PostureConfig
 from graspd_core.config.robust import RobustConfig
 from graspd_core.config.rounds import RoundsConfig
-from graspd_core.config.segment import SegmentConfig
+from graspd_core.config.segmentation import SegmentConfig
 from graspd_core.errors import ConfigError
 from graspd_core.paths import config_dir
 
@@ -48,7 +48,7 @@ class PlanConfig:
 
     Attributes:
         resolution: the signed distance grid has at most the cube of it in nodes; a cube has as many along each side.
-        method: how poses are searched for; `graspd_core.optimise.synthesis.SEARCHES` has one search for each.
+        method: how poses are searched for; `graspd_core.methods.candidates.SEARCHES` has one search for each.
         closed_form: settings of the closed-form relaxation.
         graspd2022: settings of the published Grasp'D.
         annealing: settings of the GraspIt!-style planner.

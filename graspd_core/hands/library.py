@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from graspd_core.errors import HandError
-from graspd_core.hands.description import apply_description, read_description
-from graspd_core.hands.guess import guess_palm, guess_postures
-from graspd_core.hands.mano import load_mano
-from graspd_core.hands.markup import read_xml, wrong
-from graspd_core.hands.mjcf import read_mjcf
+from graspd_core.hands.default_postures import guess_palm, guess_postures
+from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.overlap import adjacent_links
-from graspd_core.hands.surface import candidates as surface_candidates
-from graspd_core.hands.urdf import read_urdf
+from graspd_core.hands.readers.description import apply_description, read_description
+from graspd_core.hands.readers.mjcf import read_mjcf
+from graspd_core.hands.readers.urdf import read_urdf
+from graspd_core.hands.readers.xml_io import read_xml, wrong
+from graspd_core.hands.self_collision import adjacent_links
+from graspd_core.hands.surface_points import candidates as surface_candidates
 from graspd_core.paths import config_dir
 
 # A joint's greatest torque [N·m], a sliding joint's greatest force [N], where neither URDF nor description gives one.

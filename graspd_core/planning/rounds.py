@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from graspd_core.config import PlanConfig
-from graspd_core.geometry.scene import Scene
-from graspd_core.optimise.effort import at_effort
+from graspd_core.methods.budget import at_effort
+from graspd_core.scene.scene import Scene
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:

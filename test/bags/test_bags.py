@@ -20,9 +20,9 @@ from graspd_core.bags.writer import (
     write_bag,
 )
 from graspd_core.errors import BagError, CloudError, TransformError
-from graspd_core.geometry.camera import PinholeCamera
-from graspd_core.geometry.raycast import look_at, render_depth
-from graspd_core.geometry.shapes import SPHERE_RADIUS, make_shape
+from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
+from graspd_core.pointcloud.camera import PinholeCamera
+from graspd_core.rendering.render import look_at, render_depth
 from graspd_core.transforms import SECOND
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5, (0.1, -0.2, 0.001, -0.001, 0.05))

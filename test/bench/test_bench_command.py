@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from graspd_core.bench import workers
-from graspd_core.bench.cells.cell import Cell
-from graspd_core.bench.store import read_results
+from graspd_core.bench import benchmark_workers as workers
+from graspd_core.bench.measurements.measurement import Cell
+from graspd_core.bench.result_store import read_results
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 from graspd_core.config import PlanConfig

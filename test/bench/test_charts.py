@@ -9,7 +9,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from graspd_core.bench import charts, charts_style
+from graspd_core.bench.charts import chart_style as charts_style
+from graspd_core.bench.charts import speed_chart as charts
 from graspd_core.bench.figures import by_name, rows
 
 ENDS = ("_verified", "_planned", "_ladder")

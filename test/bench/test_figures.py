@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from graspd_core.bench import tables
-from graspd_core.bench.compare import comparison, moves
+from graspd_core.bench.comparison import comparison, moves
 from graspd_core.bench.figures import by_name, per_verified, rows, spread
 from graspd_core.bench.names import parent_of, short_name
 from graspd_core.bench.pareto import pareto_front

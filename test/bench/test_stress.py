@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from graspd_core.bench.stress.case import GRASP
-from graspd_core.bench.stress.cases import CASES
-from graspd_core.bench.stress.run import Ending, faults, run_case
+from graspd_core.bench.stress.run_stress_case import Ending, faults, run_case
+from graspd_core.bench.stress.stress_case import GRASP
+from graspd_core.bench.stress.stress_cases import CASES
 from graspd_core.types import Outcome
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.bench.stress import suite
-from graspd_core.bench.stress.case import GRASP
-from graspd_core.bench.stress.cases import CASES
-from graspd_core.bench.stress.run import Ending
-from graspd_core.bench.stress.suite import Shelf, cases_of, run_cases
-from graspd_core.bench.stress.table import stress_table, summary
+from graspd_core.bench.stress import stress_suite as suite
+from graspd_core.bench.stress.run_stress_case import Ending
+from graspd_core.bench.stress.stress_case import GRASP
+from graspd_core.bench.stress.stress_cases import CASES
+from graspd_core.bench.stress.stress_suite import Shelf, cases_of, run_cases
+from graspd_core.bench.stress.stress_table import stress_table, summary
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
 from graspd_core.errors import ConfigError

@@ -17,7 +17,7 @@ import pytest
 
 from graspd_core.bags.reader import CLOUD, read_frames
 from graspd_core.errors import BagError, shown
-from graspd_core.geometry.cloud_files import load_views
+from graspd_core.pointcloud.cloud_files import load_views
 
 
 def npy(header: str, data: bytes = b"") -> bytes:

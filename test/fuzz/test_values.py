@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from graspd_core.config import PlanConfig, from_mapping
 from graspd_core.errors import CloudError, ConfigError, FormatError
-from graspd_core.geometry.cloud_files import load_views
-from graspd_core.geometry.layout import CloudLayout, points_from_layout
-from graspd_core.io import grasps_of
+from graspd_core.formats.grasps_json import grasps_of
+from graspd_core.pointcloud.cloud_files import load_views
+from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
 
 # GRASPD_FUZZ=50 tries fifty times as many examples, others each time; without it they are the same on every machine.
 LONGER = int(os.environ.get("GRASPD_FUZZ", "1"))

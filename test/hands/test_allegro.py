@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.hands.distance import hand_sdf
+from graspd_core.hands.hand_mesh import hand_mesh, primitive_mesh
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.meshes import hand_mesh, primitive_mesh
+from graspd_core.hands.link_distance import hand_sdf
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.overlap import link_overlaps
-from graspd_core.hands.surface import dense_samples
+from graspd_core.hands.self_collision import link_overlaps
+from graspd_core.hands.surface_points import dense_samples
 
 TIPS = ("link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip")
 # Extents of the maker's meshes in their link frames [m]: lower corner, upper corner.

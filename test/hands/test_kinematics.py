@@ -23,7 +23,7 @@ from graspd_core.hands.kinematics import (
 )
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.urdf import read_urdf
+from graspd_core.hands.readers.urdf import read_urdf
 
 SLIDER = """<robot name="slider">
   <link name="rail"/><link name="cart"/><link name="plate"/><link name="arm"/><link name="second"/>

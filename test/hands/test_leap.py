@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graspd_core.hands.hand_mesh import primitive_mesh
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.meshes import primitive_mesh
 from graspd_core.hands.model import HandModel
 
 TIPS = ("fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip")

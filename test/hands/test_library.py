@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from graspd_core.errors import HandError
-from graspd_core.hands.description import read_description
 from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.readers.description import read_description
 from graspd_core.paths import config_dir
 
 GRIPPER = """<!-- a comment before the header, and a namespace that nobody declared -->

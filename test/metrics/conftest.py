@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd_core.geometry.mesh import content_hash, mass_properties
-from graspd_core.geometry.scene import ObjectModel
-from graspd_core.geometry.shapes import make_shape
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import content_hash, mass_properties
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.scene.scene import ObjectModel
 from graspd_core.types import Posture, TriangleMesh
 
 BLOCK = """<robot name="block">

@@ -28,8 +28,8 @@ from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from graspd_core.geometry.mesh import save_mesh
-from graspd_core.geometry.shapes import make_shape
+from graspd_core.mesh.mesh_files import save_mesh
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.paths import config_dir
 from graspd_ros.parameters import Settings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from graspd_ros import planning
+from graspd_ros import request_planner as planning
 from graspd_ros.node import main
 
 ERRORS: dict[int, BaseException] = {

@@ -19,12 +19,12 @@ from std_msgs.msg import Header
 from graspd_core.bags.messages import add_transforms
 from graspd_core.errors import GraspdError
 from graspd_core.transforms import TransformBuffer
-from graspd_ros.convert import status_line
-from graspd_ros.depth import ImagePairs
-from graspd_ros.intake import Intake
+from graspd_ros.inputs.depth_stream import ImagePairs
+from graspd_ros.inputs.request_builder import Intake
+from graspd_ros.inputs.requests import Request
+from graspd_ros.inputs.sensor_frames import cloud_sighting, depth_sighting
+from graspd_ros.outputs.status_json import status_line
 from graspd_ros.parameters import Settings
-from graspd_ros.requests import Request
-from graspd_ros.sources import cloud_sighting, depth_sighting
 
 HAND = "allegro_right"
 floats = st.one_of(st.floats(), st.sampled_from([0.0, 1.0, np.nan, np.inf, -np.inf, 1e308, 5e-324]))

@@ -25,7 +25,7 @@ from graspd_core.bags.writer import (
     write_bag,
 )
 from graspd_core.errors import BagError
-from graspd_core.geometry.camera import PinholeCamera
+from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 from graspd_ros.player import main, play
 

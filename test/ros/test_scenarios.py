@@ -29,10 +29,10 @@ from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
 
 from graspd_core.bags.writer import Record, camera_info_message, depth_message, transforms_message, write_bag
-from graspd_core.geometry.camera import PinholeCamera
-from graspd_core.geometry.noise import DEFAULT
-from graspd_core.geometry.tabletop import TabletopScene, depth_views, ring_poses, tabletop
-from graspd_core.io import grasps_of, load_document
+from graspd_core.formats.grasps_json import grasps_of, load_document
+from graspd_core.pointcloud.camera import PinholeCamera
+from graspd_core.rendering.depth_noise import DEFAULT
+from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
 from graspd_core.transforms import SECOND
 
 RESULT_TIMEOUT = 60.0

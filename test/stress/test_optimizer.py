@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from graspd_core.config import PlanConfig
-from graspd_core.geometry.load import load_scene
-from graspd_core.geometry.scene import Scene
-from graspd_core.geometry.sdf import sample_sdf
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.optimise.closed_form import ClosedForm, pack, unpack
-from graspd_core.optimise.initial import draw_starts
-from graspd_core.optimise.problem import Problem, evaluate, place
-from graspd_core.optimise.search import Task, problem_of
-from graspd_core.optimise.solver import Hooks, Poses, minimise
-from graspd_core.optimise.synthesis import assemble
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods.candidates import assemble
+from graspd_core.methods.closed_form.closed_form import ClosedForm, pack, unpack
+from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.planner import Task, problem_of
+from graspd_core.methods.problem import Problem, evaluate, place
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
 
 PLAN = PlanConfig()
@@ -156,7 +156,9 @@ def test_a_closed_hand_on_the_centre_of_mass_gives_no_nan(sound, starts):
 _CAPPED = """
 import resource, torch
 torch.set_num_threads(1)
-from graspd_core.pipeline import load_hand, load_scene, plan_grasps
+from graspd_core.hands.library import load_hand
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.scene.load_scene import load_scene
 hand, scene = load_hand("allegro_right"), load_scene("shape:box")
 plan_grasps(scene, hand, count=1, preset="fast")
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
@@ -181,7 +183,9 @@ def test_a_cold_process_keeps_a_deadline_of_a_fifth_of_a_second():
     code = """
 import time, torch
 torch.set_num_threads(1)
-from graspd_core.pipeline import load_hand, load_scene, plan_grasps
+from graspd_core.hands.library import load_hand
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.scene.load_scene import load_scene
 hand, scene = load_hand("allegro_right"), load_scene("shape:box")
 began = time.process_time()
 print(plan_grasps(scene, hand, count=2, deadline=0.2).outcome.name, time.process_time() - began)

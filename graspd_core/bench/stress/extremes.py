@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from graspd_core.bench.stress.case import GRASP, Case
-from graspd_core.geometry.load import load_scene
-from graspd_core.geometry.scene import Scene
+from graspd_core.bench.stress.stress_case import GRASP, Case
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Scene
 
 _FEW = ("TOO_FEW", "NO_CANDIDATES")
 

@@ -1,0 +1,190 @@
+"""The second simulator: an object of convex parts and a hand of primitives in PyBullet.
+
+A world here is plain data. Every trial builds its own simulation from it and throws that away, because Bullet keeps
+contacts and solver state from one trial to the next, which would make a figure depend on what ran before.
+"""
+
+# pybullet is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.errors import SimulatorError
+from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.scene.scene import ObjectModel
+from graspd_core.se3 import quaternion_from_rotation, rotation_from_quaternion
+from graspd_core.types import Posture, TriangleMesh
+
+# Smallest principal moment of an object, per kilogram [m²]: a ball of 0.5 mm.
+_LEAST_MOMENT = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class BulletWorld:
+    """One hand and one object, ready for trials in PyBullet; plain data, so that processes can share it.
+
+    Attributes:
+        hand: the hand.
+        parts: the object's convex parts as the text of an OBJ file, about its centre of mass in its principal axes [m].
+        mass: the object's own [kg].
+        center_of_mass: in the object's frame [m].
+        axes: `R_object_principal`.
+        moments: principal moments of inertia per kilogram [m²].
+    """
+
+    hand: HandModel
+    parts: str
+    mass: float
+    center_of_mass: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    moments: Float[np.ndarray, "3"]
+
+
+def bullet_available() -> bool:
+    """Whether PyBullet is installed; it has no wheel for Python 3.12."""
+    return importlib.util.find_spec("pybullet") is not None
+
+
+def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh]) -> BulletWorld:
+    """Prepare trials of one hand and one object.
+
+    Args:
+        hand: any loaded hand.
+        target: gives mass, centre of mass and inertia.
+        parts: convex collision parts of the object, object frame [m].
+
+    Raises:
+        SimulatorError: PyBullet is not installed.
+    """
+    if not bullet_available():
+        raise SimulatorError(
+            "pybullet is not installed: the displacement trial and the second simulator need it; "
+            "valid: Python 3.11 with pip install -e '.[bench]' (there is no wheel for 3.12)"
+        )
+    moments, axes = np.linalg.eigh(0.5 * (target.inertia + target.inertia.T) / target.mass)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return BulletWorld(
+        hand=hand,
+        parts=wavefront([TriangleMesh((part.vertices - target.center_of_mass) @ axes, part.faces) for part in parts]),
+        mass=target.mass,
+        center_of_mass=target.center_of_mass,
+        axes=axes,
+        moments=np.maximum(moments, _LEAST_MOMENT),
+    )
+
+
+@contextmanager
+def simulation(*, timestep: float, solver_iterations: int) -> Iterator[int]:
+    """An empty simulation without gravity; yields the number of its PyBullet client.
+
+    Args:
+        timestep: [s].
+        solver_iterations: most iterations a step.
+    """
+    import pybullet
+
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=timestep,
+            numSolverIterations=solver_iterations,
+            enableFileCaching=0,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
+        )
+        yield client
+    finally:
+        pybullet.disconnect(client)
+
+
+def add_object(client: int, world: BulletWorld, mass: float) -> int:
+    """Put the object of a given mass [kg] where its frame is the simulation's; returns its body.
+
+    Bullet's origin of a body is its centre of mass. What is not said here is left as PyBullet has it: a margin of 1 mm
+    about convex parts, damping of 4 % a second.
+    """
+    import pybullet
+
+    # Bullet reads the file a second time, for the body's looks.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "parts.obj")
+        path.write_text(world.parts)
+        body = pybullet.createMultiBody(
+            baseMass=mass,
+            baseCollisionShapeIndex=pybullet.createCollisionShape(
+                pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
+            ),
+            basePosition=world.center_of_mass.tolist(),
+            baseOrientation=xyzw(world.axes),
+            physicsClientId=client,
+        )
+    pybullet.changeDynamics(body, -1, localInertiaDiagonal=(mass * world.moments).tolist(), physicsClientId=client)
+    return body
+
+
+def add_frozen_hand(client: int, hand: HandModel, posture: Posture) -> tuple[int, ...]:
+    """Every collision primitive of a hand as a fixed body, where a posture puts it; returns the bodies."""
+    import pybullet
+
+    kinematics = make_kinematics(hand, "cpu", torch.float64)
+    rotations, translations = forward(kinematics, torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None])
+    base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+    bodies = []
+    for primitive in hand.primitives:
+        link = base @ rotations[0, primitive.link].numpy()
+        origin = base @ translations[0, primitive.link].numpy() + posture.position
+        bodies.append(
+            pybullet.createMultiBody(
+                baseMass=0.0,
+                baseCollisionShapeIndex=_collision_shape(client, primitive),
+                basePosition=(link @ primitive.translation + origin).tolist(),
+                baseOrientation=xyzw(link @ primitive.rotation),
+                physicsClientId=client,
+            )
+        )
+    return tuple(bodies)
+
+
+def _collision_shape(client: int, primitive: Primitive) -> int:
+    import pybullet
+
+    size = primitive.size
+    if primitive.kind == "box":
+        shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": list(size)}
+    elif primitive.kind == "sphere":
+        shape = {"shapeType": pybullet.GEOM_SPHERE, "radius": size[0]}
+    elif primitive.kind == "hull":
+        shape = {"shapeType": pybullet.GEOM_MESH, "vertices": primitive.vertices.tolist()}
+    else:
+        kind = pybullet.GEOM_CAPSULE if primitive.kind == "capsule" else pybullet.GEOM_CYLINDER
+        shape = {"shapeType": kind, "radius": size[0], "height": 2 * size[1]}
+    return pybullet.createCollisionShape(**shape, physicsClientId=client)
+
+
+def wavefront(parts: Sequence[TriangleMesh]) -> str:
+    """Meshes as the text of one OBJ file, an object each: PyBullet makes a convex hull of every one."""
+    lines, first = [], 1
+    for index, part in enumerate(parts):
+        lines.append(f"o part{index}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (part.faces + first).tolist()]
+        first += len(part.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def xyzw(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
+    """A rotation as PyBullet's quaternion."""
+    w, x, y, z = quaternion_from_rotation(torch.as_tensor(np.ascontiguousarray(rotation))).tolist()
+    return [x, y, z, w]

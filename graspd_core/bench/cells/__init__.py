@@ -1,1 +1,0 @@
-"""What one cell of the benchmark is, and how each kind of it is run."""

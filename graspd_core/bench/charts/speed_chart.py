@@ -1,0 +1,167 @@
+"""The charts: what each second buys (speed against accuracy), and what each setting buys (the ladder)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_core.bench.charts.chart_style import COLOURS, FRONT, MARKERS, figure, place_labels, save
+from graspd_core.bench.charts.sweep_chart import draw_ladder
+from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
+from graspd_core.bench.names import METHOD_NAMES, is_preset, is_rung, parent_of, short_name
+from graspd_core.bench.pareto import pareto_front
+from graspd_core.bench.result_store import Record
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a panel shows against time.
+
+    Attributes:
+        figure: of `figures.Row`.
+        label: of its axis.
+        factor: from the figure's unit to the label's.
+        less_is_better: or more is.
+        mean: the marker is the mean over objects, because a share's median hides failures; or the median.
+        log: of the axis.
+    """
+
+    figure: str
+    label: str
+    factor: float = 1.0
+    less_is_better: bool = True
+    mean: bool = False
+    log: bool = False
+
+
+PANELS = (
+    Panel("standard", "hold success, raw [%]", factor=100.0, less_is_better=False, mean=True),
+    Panel("sd_cm", "simulation displacement SD [cm]", log=True),
+    Panel("penetration_mm", "penetration [mm]"),
+)
+# What a log axis shows of less than this [cm].
+_LEAST = 0.01
+
+
+@dataclass(frozen=True)
+class Point:
+    """One preset on one panel: middle and quartiles over objects on both axes, and whether any grasp of it held."""
+
+    name: str
+    method: str
+    x: tuple[float, float, float]
+    y: tuple[float, float, float]
+    held: bool
+
+
+def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
+    """Draw what the records have figures for: PATH.png and .svg, PATH_verified, PATH_planned, PATH_ladder.
+
+    Returns the PNGs drawn, by "speed", "verified", "planned" and "ladder".
+    """
+    found = rows(records)
+    ladder = [row for row in found if is_rung(row.name)]
+    presets = by_name(row for row in found if is_preset(row.name))
+    drawn = {
+        "speed": draw_speed(presets, path, "cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),
+        "verified": draw_speed(
+            presets,
+            path.with_name(f"{path.name}_verified"),
+            "cpu_per_verified",
+            "CPU seconds per verified grasp, trials included (one thread, log scale)",
+        ),
+        "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned")),
+        "ladder": draw_ladder(ladder, path.with_name(f"{path.name}_ladder")) if ladder else None,
+    }
+    return {name: png for name, png in drawn.items() if png}
+
+
+def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
+    """Seconds per verified grasp against seconds to the first, both as planned. None where there is nothing to draw."""
+    panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
+    points = points_of(presets, "first_cpu", panel)
+    if not points:
+        return None
+    with figure(4.8, 4.2, squeeze=False) as (made, axes):
+        axis = axes[0][0]
+        _draw_panel(axis, points, panel)
+        axis.set_xscale("linear")
+        axis.set_xlabel("CPU seconds to the first verified grasp")
+        axis.set_xlim(left=0.0)
+        names = [p.name for p in points]
+        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [COLOURS[p.method] for p in points])
+        return save(made, path)
+
+
+def draw_speed(presets: dict[str, list[Row]], path: Path, time: str, label: str) -> Path | None:
+    """A panel for every figure of accuracy, against time. None where there is nothing to draw."""
+    panels = [(panel, points) for panel in PANELS if (points := points_of(presets, time, panel))]
+    if not panels:
+        return None
+    with figure(4.6 * len(panels), 4.4, ncols=len(panels), squeeze=False) as (made, axes):
+        for axis, (panel, points) in zip(axes[0], panels, strict=True):
+            _draw_panel(axis, points, panel)
+        made.supxlabel(label, fontsize=9)
+        _legend(made, list(dict.fromkeys(row.method for group in presets.values() for row in group)))
+        for axis, (_, points) in zip(axes[0], panels, strict=True):
+            names, colours = [short_name(p.name) for p in points], [COLOURS[p.method] for p in points]
+            place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, colours)
+        return save(made, path)
+
+
+def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
+    """A point for every preset that has both figures, in the panel's unit."""
+    points = []
+    for name, group in presets.items():
+        x, y = spread(group, time), spread(group, panel.figure)
+        middle = per_verified(group) if time == "cpu_per_verified" else x and x.median
+        if x and y and middle is not None:
+            heights = (y.low, y.mean if panel.mean else y.median, y.high)
+            low, mid, high = (max(height * panel.factor, _LEAST if panel.log else 0.0) for height in heights)
+            held = any(row.held for row in group)
+            points.append(Point(name, group[0].method, (x.low, middle, x.high), (low, mid, high), held))
+    return points
+
+
+def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
+    place = {p.name: (p.x[1], p.y[1]) for p in points}
+    for p in points:
+        (x, y), colour, parent = place[p.name], COLOURS[p.method], parent_of(p.name)
+        if parent in place:
+            axis.plot(*zip(place[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2)
+        bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
+        axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
+        filling = "white" if parent else colour
+        axis.plot(x, y, MARKERS[p.method], color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
+    # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
+    spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
+    front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
+    axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
+    axis.set_xscale("log")
+    axis.set_ylabel(panel.label)
+    axis.margins(0.18, 0.1)
+    if panel.log:
+        axis.set_yscale("log")
+    else:
+        low, high = axis.get_ylim()
+        axis.set_ylim((0.0, high) if panel.less_is_better else (max(-4.0, low), 104.0))
+    way = "left and down" if panel.less_is_better else "left and up"
+    axis.set_title(f"better: {way}", fontsize=7.5, color="#666666")
+
+
+def _bars(low: float, middle: float, high: float) -> list[list[float]]:
+    return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
+
+
+def _legend(made: Any, methods: Sequence[str]) -> None:
+    from matplotlib.lines import Line2D
+
+    plain = {"ls": "none", "ms": 7, "mew": 1.3}
+    handles = [Line2D([], [], marker=MARKERS[m], color=COLOURS[m], label=METHOD_NAMES[m], **plain) for m in methods]
+    handles.append(Line2D([], [], marker="o", color="#666666", mfc="white", label="ablation", **plain))
+    handles.append(Line2D([], [], color=FRONT, lw=1.2, alpha=0.6, label="Pareto front"))
+    made.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=8.5)

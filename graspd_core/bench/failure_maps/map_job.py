@@ -1,0 +1,146 @@
+"""One piece of a map's work: a planning, the cells that its grasps are tried in, and what came of it in each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any
+
+from graspd_core.config import PlanConfig, load_preset
+from graspd_core.errors import GraspdError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.loop import Hooks
+from graspd_core.scene.scene import ObjectModel, Scene, object_parts
+from graspd_core.trials.hold_trial import hold_trial
+from graspd_core.trials.world import Protocol, build_world
+from graspd_core.types import Grasp
+
+# Where a cell lies on an axis of its map: a number, or the name of an object.
+Place = float | str
+
+HAND = "allegro_right"
+# What an empty place among the grasps asked for is called.
+NOT_FOUND, NO_SCENE = "no grasp found", "no scene"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A planning, and the cells that its grasps are tried in.
+
+    Attributes:
+        map: name of the map.
+        preset: settings of the method.
+        thing: name of the object.
+        across: place of all its cells on the horizontal axis.
+        up: places of its cells on the vertical axis.
+        count: raw grasps asked for, each of which is tried in every cell.
+        seed: of everything that is drawn.
+    """
+
+    map: str
+    preset: str
+    thing: str
+    across: Place
+    up: tuple[Place, ...]
+    count: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What came of one job's grasps in one cell.
+
+    Attributes:
+        up: its place on the vertical axis.
+        held: grasps that passed the hold trial.
+        reasons: why the others did not, and how many each; a grasp that was not found has a reason, too.
+    """
+
+    up: Place
+    held: int
+    reasons: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Done:
+    """Cells of a job, and figures of what was planned on that help to explain them."""
+
+    cells: tuple[Cell, ...]
+    evidence: Mapping[str, float | None]
+
+
+# What a map does for each of its jobs. A scene that is refused raises a GraspdError.
+Run = Callable[[Job], Done]
+
+
+def job_key(job: Job) -> str:
+    """Hash of everything that a job is asked, hexadecimal. The code that answers is recorded beside it.
+
+    Of the settings those count that raw grasps depend on: there are no rounds, and clouds are segmented as usual.
+    """
+    config = asdict(settings(job.preset))
+    looked_at = {name: config[name] for name in ("resolution", "closed_form", config["method"], "postures")}
+    asked = {**asdict(job), "hand": HAND, "settings": looked_at}
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def run_job(run: Run, job: Job) -> Done:
+    """The cells of a job; where its scene is refused, all of its grasps are lost for that reason."""
+    try:
+        return run(job)
+    except GraspdError as error:
+        reason = f"{NO_SCENE}: {kind_of(str(error))}"
+        return Done(tuple(Cell(up, 0, {reason: job.count}) for up in job.up), {})
+
+
+@lru_cache(maxsize=4)
+def settings(preset: str) -> PlanConfig:
+    """Settings by name."""
+    return load_preset(preset)
+
+
+@lru_cache(maxsize=4)
+def hand_for(candidates: int) -> HandModel:
+    """The hand of all maps."""
+    return load_hand(HAND, candidates=candidates)
+
+
+def plan(job: Job, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
+    """The hand, and the first of the method's own ranking, none filtered by a trial."""
+    config = settings(job.preset)
+    hand = hand_for(config.closed_form.fine_candidates)
+    found = synthesise(scene, hand, count=job.count, seed=job.seed, config=config, hooks=Hooks())
+    return hand, found.grasps[: job.count]
+
+
+def try_grasps(
+    job: Job, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
+) -> Cell:
+    """Every grasp in the hold trial on `target`."""
+    if not grasps:
+        return Cell(up, 0, {NOT_FOUND: job.count})
+    world = build_world(hand, target, object_parts(target), protocol)
+    holds = [hold_trial(world, grasp, protocol) for grasp in grasps]
+    reasons = Counter(kind_of(hold.reason) for hold in holds if not hold.passed)
+    if len(grasps) < job.count:
+        reasons[NOT_FOUND] = job.count - len(grasps)
+    return Cell(up, sum(hold.passed for hold in holds), dict(reasons))
+
+
+def kind_of(reason: str) -> str:
+    """A reason without its figures and directions, so that like ones can be counted."""
+    for figures in (r"\([^()]*\d[^()]*\)", r"(by )?[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?", r"along [-+][xyz]"):
+        reason = re.sub(figures, " ", reason)
+    return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
+
+
+def record_of(job: Job, done: Done, code: str, cpu: float) -> dict[str, Any]:
+    """What is kept of a job."""
+    return {"key": job_key(job), "code": code, **asdict(job), **asdict(done), "cpu": cpu, "error": ""}

@@ -1,0 +1,1 @@
+"""One measurement each: what is asked, how it runs, what comes of it."""

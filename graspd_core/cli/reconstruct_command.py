@@ -1,0 +1,45 @@
+"""`graspd reconstruct`: clouds in, a closed mesh out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from graspd_core.cli.cloud_options import add_bag_options, add_object_options, check_bag_options, load_views, target_of
+from graspd_core.cli.running import EXIT_OK
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("reconstruct", help="turn a point cloud into a closed mesh")
+    parser.set_defaults(run=run)
+    parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="a cloud file; of a bag, its first cloud")
+    add_object_options(parser)
+    add_bag_options(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="mesh.ply")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Returns the exit status."""
+    from graspd_core.formats.grasps_json import check_writable
+    from graspd_core.mesh.mesh_files import save_mesh
+    from graspd_core.reconstruction.reconstruct import reconstruct
+    from graspd_core.segmentation.segment import segment
+
+    check_bag_options(options)
+    check_writable(options.out)
+    views = load_views(options.cloud, options)
+    support, warnings = None, ()
+    if not options.alone:
+        seen = segment(views, target=target_of(options))
+        views, support, warnings = seen.views, seen.support, seen.warnings
+    whole = reconstruct(views, support=support)
+    mesh = whole.mesh
+    save_mesh(mesh, options.out)
+    for warning in (*warnings, *whole.warnings):
+        print(f"graspd: {warning}", file=sys.stderr)
+    extent = mesh.vertices.max(0) - mesh.vertices.min(0)
+    print(f"{options.out}: {len(mesh.faces)} faces, {' x '.join(f'{e * 1e3:.0f}' for e in extent)} mm")
+    return EXIT_OK

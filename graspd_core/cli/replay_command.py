@@ -1,0 +1,141 @@
+"""`graspd replay`: the clouds of a recording in, grasps for each of them out, as they would have come over DDS."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from graspd_core.cli.cloud_options import (
+    add_bag_options,
+    add_object_options,
+    bag_views,
+    check_bag_options,
+    fused_views,
+    target_of,
+)
+from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt, Reporter
+from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
+from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.transforms import SECOND
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Views to plan on together, or why there are none."""
+
+    name: str
+    label: str
+    views: tuple[PointCloud, ...] = ()
+    refusal: str = ""
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("replay", help="plan grasps on the clouds or depth images of a rosbag2 recording")
+    parser.set_defaults(run=run)
+    parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
+    add_bag_options(parser)
+    parser.add_argument("--fuse", action="store_true", help="take all clouds as views of one scene")
+    add_object_options(parser)
+    add_planning_options(parser)
+    parser.add_argument("--out", type=Path, default=None, metavar="DIR", help="or a .json file for a single result")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Returns the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no cloud of any use."""
+    from graspd_core.formats.grasps_json import check_writable, save_result
+    from graspd_core.hands.library import load_hand
+    from graspd_core.planning.plan_grasps import plan_grasps
+
+    config, request = planning_options(options)
+    check_bag_options(options)
+    single = options.out is not None and options.out.suffix == ".json"
+    if single and not (options.fuse or options.limit == 1):
+        raise ConfigError(f"{options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
+    if options.out:
+        check_writable(options.out if single else options.out / "probe")
+    hand = load_hand(options.hand, candidates=config.closed_form.fine_candidates)
+    began, statuses, grasps, interrupted = time.perf_counter(), [], 0, False
+    with Interrupt() as interrupt:
+        for job in _jobs(options):
+            # Here, so that it ends a recording of which every cloud is refused, too.
+            if interrupted := interrupt.came():
+                break
+            try:
+                scene = _scene_of(job, options, config.resolution)
+            except GraspdError as error:
+                print(f"{job.label}: refused: {error}", flush=True)
+                # An empty table is an answer; a cloud that cannot be used is bad input.
+                statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
+                continue
+            for warning in scene.object.warnings:
+                print(f"graspd: {job.label}: {warning}", file=sys.stderr)
+            with Reporter() as reporter:
+                result = plan_grasps(scene, hand, preset=config, progress=reporter, stop=interrupt.came, **request)
+            if options.out:
+                path = options.out if single else options.out / f"{job.name}.json"
+                save_result(path, result, scene.object, hand, config)
+            good = good_grasps(result)
+            first = result.timing.first_verified
+            print(
+                f"{job.label}: {sum(len(v.points) for v in job.views)} points, {good} of {options.count} grasps "
+                f"({len(result.grasps)} tried): {result.message or result.outcome.value}; "
+                + (f"first verified after {first:.2f} s, " if first else "")
+                + f"total {result.timing.total:.2f} s",
+                flush=True,
+            )
+            grasps += good
+            statuses.append(exit_status(result))
+    refused = statuses.count(EXIT_BAD_INPUT)
+    print(
+        f"{len(statuses)} scenes: {statuses.count(EXIT_OK)} with enough grasps, "
+        f"{len(statuses) - refused - statuses.count(EXIT_OK)} with fewer, {refused} refused; "
+        f"{grasps} grasps in {time.perf_counter() - began:.1f} s"
+    )
+    return EXIT_INTERRUPTED if interrupted else _status(statuses)
+
+
+def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
+    """One cloud after the other, or all of them together."""
+    if options.fuse:
+        views = fused_views(options.bag, options)
+        yield _Job("fused", f"{len(views)} clouds fused", views)
+        return
+    for frame, seen in bag_views(options.bag, options):
+        name = f"cloud_{frame.index:06d}"
+        label = f"cloud {frame.index} at {frame.stamp // SECOND}.{frame.stamp % SECOND:09d} s"
+        if isinstance(seen, str):
+            yield _Job(name, label, refusal=seen)
+        else:
+            yield _Job(name, label, (seen,))
+
+
+def _scene_of(job: _Job, options: argparse.Namespace, resolution: int):
+    """What the views of a job show. Raises a GraspdError: they show no usable object."""
+    from graspd_core.scene.scene_from_views import scene_from_views
+
+    if job.refusal:
+        raise CloudError(job.refusal)
+    return scene_from_views(
+        job.views,
+        target=target_of(options),
+        alone=options.alone,
+        mass=options.mass,
+        friction=options.friction,
+        source=f"{options.bag}: {job.label}",
+        resolution=resolution,
+    )
+
+
+def _status(statuses: list[int]) -> int:
+    if EXIT_INTERRUPTED in statuses:
+        return EXIT_INTERRUPTED
+    if not statuses or set(statuses) == {EXIT_BAD_INPUT}:
+        return EXIT_BAD_INPUT
+    return EXIT_OK if set(statuses) == {EXIT_OK} else EXIT_TOO_FEW

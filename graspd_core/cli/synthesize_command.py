@@ -1,0 +1,67 @@
+"""`graspd synthesize`: one object in, grasps out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from graspd_core.cli.cloud_options import add_object_options, target_of
+from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options, summary
+from graspd_core.cli.running import Interrupt, Reporter
+
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("synthesize", help="plan grasps on a mesh, a cloud or a boxed shape")
+    parser.set_defaults(run=run)
+    parser.add_argument("object", metavar="OBJECT", help="mesh or cloud file, or shape:NAME")
+    add_planning_options(parser)
+    add_object_options(parser)
+    sizes = parser.add_mutually_exclusive_group()
+    sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file")
+    sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
+    parser.add_argument("--out", type=Path, default=None, metavar="grasps.json")
+    parser.add_argument("--html", type=Path, default=None, metavar="view.html")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Returns the exit status."""
+    from graspd_core.formats.grasps_json import check_writable, save_result
+    from graspd_core.hands.library import load_hand
+    from graspd_core.metrics.diversity import distinct
+    from graspd_core.planning.plan_grasps import plan_grasps
+    from graspd_core.scene.load_scene import load_scene
+
+    config, request = planning_options(options)
+    # A run whose result could not be written would be lost.
+    for path in (options.out, options.html):
+        if path:
+            check_writable(path)
+    scale = _UNITS[options.units] if options.units else options.scale
+    scene = load_scene(
+        options.object,
+        mass=options.mass,
+        friction=options.friction,
+        scale=scale,
+        resolution=config.resolution,
+        target=target_of(options),
+        alone=options.alone,
+    )
+    hand = load_hand(options.hand, candidates=config.closed_form.fine_candidates)
+    for warning in scene.object.warnings:
+        print(f"graspd: {warning}", file=sys.stderr)
+    with Reporter() as reporter, Interrupt() as interrupt:
+        result = plan_grasps(scene, hand, preset=config, progress=reporter, stop=interrupt.came, **request)
+    if options.out:
+        save_result(options.out, result, scene.object, hand, config)
+    if options.html:
+        from graspd_core.formats.grasp_page import save_view
+
+        save_view(options.html, scene.object.mesh, hand, result.grasps)
+    different = len(distinct(result.grasps[: good_grasps(result)], hand))
+    print(summary(result, options.count, different))
+    return exit_status(result)

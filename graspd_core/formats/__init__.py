@@ -1,0 +1,1 @@
+"""Files that graspd writes and reads: grasps, pages."""

@@ -1,0 +1,59 @@
+"""A grasp to look at: one HTML page that needs no network, to turn and zoom in any browser."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from graspd_core.formats.grasps_json import save_text
+from graspd_core.hands.hand_mesh import hand_mesh
+from graspd_core.hands.model import HandModel
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
+
+OBJECT_COLOUR, HAND_COLOUR = (217, 140, 64), (89, 115, 153)
+
+
+def save_view(path: str | Path, object_mesh: TriangleMesh, hand: HandModel, grasps: Sequence[Grasp]) -> None:
+    """Write a page with the object and the hand at the first grasp that did not fail its trial.
+
+    Args:
+        path: of the page; appears whole or not at all.
+        object_mesh: object frame [m].
+        hand: that the grasps are for.
+        grasps: in rank order; where all failed, the page shows the object alone.
+    """
+    from trimesh.viewer.notebook import scene_to_html
+
+    scene = view_scene(object_mesh, hand, next((g for g in grasps if g.verdict is not Verdict.FAILED), None))
+    save_text(Path(path), scene_to_html(scene))
+
+
+def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasp: Grasp | None):
+    """Object and hand as a `trimesh.Scene` with the meshes `object` and `hand`, object frame [m]."""
+    import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    meshes = {"object": (object_mesh, OBJECT_COLOUR)}
+    if grasp is not None:
+        meshes["hand"] = (placed_hand(hand, grasp.grasp), HAND_COLOUR)
+    scene = trimesh.Scene()
+    for name, (mesh, colour) in meshes.items():
+        material = PBRMaterial(baseColorFactor=[*colour, 255], doubleSided=True)
+        # Faces that share no vertices are shaded flat, which is what shows the edges of a hand made of boxes.
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        body = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+        body.visual = TextureVisuals(material=material)
+        scene.add_geometry(body, geom_name=name, node_name=name)
+    return scene
+
+
+def placed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
+    """The hand's collision surface at a posture, object frame [m]."""
+    mesh = hand_mesh(hand, posture.joint_positions)
+    rotation = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz)).numpy()
+    return TriangleMesh(mesh.vertices @ rotation.T + posture.position, mesh.faces)

@@ -1,1 +1,0 @@
-"""Meshes, clouds, signed distance fields and scenes."""

@@ -1,0 +1,112 @@
+"""A MANO model as its file gives it: template, blend shapes, weights, tree (Romero, Tzionas and Black 2017).
+
+The file is licensed and never shipped: every user brings their own from https://mano.is.tue.mpg.de.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from graspd_core.errors import HandError
+from graspd_core.hands.mano.mano_numbers import numbers
+from graspd_core.hands.mano.mano_pickle import read_pickle
+
+# The sixteen bodies, each named after the bone that it moves; 1 is the knuckle, 3 the last joint. Not the order of a
+# hand: the little finger comes before the ring finger.
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+BODIES = ("wrist", *(f"{finger}{number}" for finger in FINGERS for number in (1, 2, 3)))
+PARENTS = (-1, *(0 if number == 1 else 3 * finger + number - 1 for finger in range(5) for number in (1, 2, 3)))
+# Values of the pose blend shapes' input: entries of fifteen rotation matrices.
+POSE_FEATURES = 9 * 15
+
+
+@dataclass(frozen=True, eq=False)
+class ManoData:
+    """One MANO model in float64.
+
+    Attributes:
+        path: the file.
+        template: vertices of the mean shape at rest [m].
+        shape_directions: displacement of each vertex per unit of each shape coefficient [m].
+        pose_directions: displacement of each vertex per unit of each entry of R − I, body by body, row by row [m].
+        joint_regressor: joints as combinations of vertices.
+        weights: skinning weights, rows sum to one.
+        faces: triangles, counter-clockwise seen from outside, open at the wrist.
+        components: principal components of the pose, one per row [rad].
+        mean: the mean pose, axis-angle of bodies 1 to 15 [rad].
+    """
+
+    path: Path
+    template: Float[np.ndarray, "vertices 3"]
+    shape_directions: Float[np.ndarray, "vertices 3 shapes"]
+    pose_directions: Float[np.ndarray, "vertices 3 135"]
+    joint_regressor: Float[np.ndarray, "16 vertices"]
+    weights: Float[np.ndarray, "vertices 16"]
+    faces: Int[np.ndarray, "faces 3"]
+    components: Float[np.ndarray, "components 45"]
+    mean: Float[np.ndarray, "45"]
+
+
+def read_mano(path: Path) -> ManoData:
+    """Read and check a MANO file (.pkl), as downloaded.
+
+    Raises:
+        HandError: it cannot be read, asks for code to be run, or an entry is missing or wrong; names file and entry.
+    """
+    content = read_pickle(path)
+    if not isinstance(content, Mapping):
+        raise HandError(f"{path}: holds {type(content).__name__}, a MANO file holds a dictionary")
+    template = _read(path, content, "v_template", (None, 3))
+    count = len(template)
+    data = ManoData(
+        path=path,
+        template=template,
+        shape_directions=_read(path, content, "shapedirs", (count, 3, None)),
+        pose_directions=_read(path, content, "posedirs", (count, 3, POSE_FEATURES)),
+        joint_regressor=_read(path, content, "J_regressor", (len(BODIES), count)),
+        weights=_read(path, content, "weights", (count, len(BODIES))),
+        faces=_read(path, content, "f", (None, 3)).astype(np.int64),
+        components=_read(path, content, "hands_components", (None, 45)),
+        mean=_read(path, content, "hands_mean", (45,)),
+    )
+    tree = _read(path, content, "kintree_table", (2, len(BODIES))).astype(np.int64)
+    # The root's parent is -1, which an unsigned table shows as its largest number.
+    if not np.array_equal(tree[1], range(len(BODIES))) or tuple(tree[0, 1:]) != PARENTS[1:]:
+        raise HandError(f"{path}: kintree_table is not MANO's tree of a wrist and five fingers of three joints")
+    for key, rows in (("weights", data.weights), ("J_regressor", data.joint_regressor)):
+        if np.abs(rows.sum(1) - 1.0).max() > 0.01:
+            raise HandError(f"{path}: {key}: rows do not sum to one")
+    if len(data.faces) == 0 or data.faces.min() < 0 or data.faces.max() >= count:
+        raise HandError(f"{path}: f: names vertices outside 0 to {count - 1}")
+    bare = set(range(len(BODIES))) - set(data.weights.argmax(1).tolist())
+    if bare:
+        raise HandError(f"{path}: weights: no vertex belongs to {', '.join(BODIES[i] for i in sorted(bare))}")
+    return data
+
+
+def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """An entry as float64 of a shape in which None is any positive number."""
+    if key not in content:
+        known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
+        raise HandError(f"{path}: {key} is missing; the file has {known}")
+    try:
+        # A NaN of any kind is looked for below: numpy would warn of those that signal.
+        with np.errstate(invalid="ignore"):
+            array = numbers(content[key]).astype(np.float64)
+    except ValueError as error:
+        raise HandError(f"{path}: {key}: {error}") from error
+    fits = len(array.shape) == len(shape) and all(
+        n == m or (m is None and n) for n, m in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = " x ".join("any" if n is None else str(n) for n in shape)
+        raise HandError(f"{path}: {key} is {' x '.join(map(str, array.shape))}, expected {wanted}")
+    if not np.isfinite(array).all():
+        raise HandError(f"{path}: {key} has entries that are not finite")
+    return array

@@ -1,0 +1,207 @@
+"""A MANO model as a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
+
+The optimiser, the judges and the trials see a hand like any other; figures of the skinned surface come from
+`ManoHand.skinned_mesh`, the mesh that MANO itself makes of the same joint values. The hulls stand for the skin at rest:
+they do not follow the blend shapes of the pose, and at a strongly bent joint the skin bulges by a few millimetres
+against them.
+
+Base frame: the model's axes, origin in the wrist joint. The wrist body carries the palm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from graspd_core.errors import HandError
+from graspd_core.hands.mano import mano_joints
+from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
+from graspd_core.hands.mano.mano_skin import Skin, close_wrist, closed_faces, make_skin, rest, skin_vertices
+from graspd_core.hands.model import HandModel, JointKind, Primitive
+from graspd_core.hands.self_collision import adjacent_links
+from graspd_core.hands.surface_points import candidates as surface_candidates
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Posture, TriangleMesh
+
+# Of muscle and bone together [kg/m³].
+_DENSITY = 1100.0
+_CANDIDATE_SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ManoHand:
+    """A MANO model of one shape, as a hand and as a skin.
+
+    Attributes:
+        model: the hand that is planned with.
+        data: the file's content.
+        betas: the shape.
+        frames: anatomical frames at rest, model axes (`mano_joints`).
+    """
+
+    model: HandModel
+    data: ManoData
+    betas: Float[np.ndarray, "shapes"]
+    frames: Float[np.ndarray, "16 3 3"]
+
+    def skinned_mesh(self, posture: Posture) -> TriangleMesh:
+        """MANO's own surface at a posture, wrist closed, in the frame that the posture is in [m]."""
+        skin, betas = _float64(self.data), torch.as_tensor(self.betas)[None]
+        rotations = mano_joints.rotations_from_joints(
+            torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None]
+        )
+        origin = rest(skin, betas)[1][:, 0]
+        vertices, _ = skin_vertices(skin, betas, rotations, -origin)
+        turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64))
+        placed = close_wrist(self.data, vertices)[0] @ turn.T + torch.as_tensor(posture.position)
+        return TriangleMesh(placed.numpy(), closed_faces(self.data))
+
+
+def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int = 600) -> ManoHand:
+    """The hand of a MANO file (.pkl) and a shape; the mean shape without betas.
+
+    Raises:
+        HandError: the file cannot be used, or there are more betas than it has shapes.
+    """
+    data = read_mano(Path(path))
+    shape = np.zeros(data.shape_directions.shape[-1])
+    if len(betas) > len(shape) or not np.isfinite(list(betas)).all():
+        raise HandError(f"{path}: {len(betas)} betas, expected at most {len(shape)} finite numbers")
+    shape[: len(betas)] = betas
+    vertices, joints = (t[0].numpy() for t in rest(_float64(data), torch.as_tensor(shape)[None]))
+    closed_faces(data)  # a mesh that cannot be closed is refused here, not after an hour of planning
+    owner = data.weights.argmax(1)
+    tips = _fingertips(vertices, joints, owner)
+    normal = mano_joints.palm_normal(data, joints)
+    frames = mano_joints.anatomical_frames(joints, tips, normal)
+    hand = _bare_hand(data, vertices, joints, owner, tips, normal, frames)
+    hand = replace(hand, adjacent=adjacent_links(hand))
+    points, normals, links = surface_candidates(hand, candidates, _CANDIDATE_SEED)
+    hand = replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)
+    return ManoHand(hand, data, shape, frames)
+
+
+def _float64(data: ManoData) -> Skin:
+    return make_skin(data, dtype=torch.float64)
+
+
+def _fingertips(
+    vertices: Float[np.ndarray, "vertices 3"], joints: Float[np.ndarray, "16 3"], owner: Int[np.ndarray, "vertices"]
+) -> Float[np.ndarray, "5 3"]:
+    """Of each finger's last body the vertex farthest from its joint [m]."""
+    tips = []
+    for body in range(3, len(BODIES), 3):
+        own = vertices[owner == body]
+        tips.append(own[np.linalg.norm(own - joints[body], axis=1).argmax()])
+    return np.array(tips)
+
+
+def _bare_hand(
+    data: ManoData,
+    vertices: Float[np.ndarray, "vertices 3"],
+    joints: Float[np.ndarray, "16 3"],
+    owner: Int[np.ndarray, "vertices"],
+    tips: Float[np.ndarray, "5 3"],
+    normal: Float[np.ndarray, "3"],
+    frames: Float[np.ndarray, "16 3 3"],
+) -> HandModel:
+    """Tree, limits, hulls and masses; no candidates yet.
+
+    A body hangs from its parent by two massless links and its own: flexion, abduction, twist.
+    """
+    names, parents, axes = [BODIES[0]], [-1], [np.zeros(3)]
+    offsets = [(np.eye(3), np.zeros(3))]
+    link_of = {0: 0}
+    for body in range(1, len(BODIES)):
+        above = PARENTS[body]
+        turn = frames[above].T
+        offsets += [(turn @ frames[body], turn @ (joints[body] - joints[above])), *[(np.eye(3), np.zeros(3))] * 2]
+        parents += [link_of[above], len(names), len(names) + 1]
+        names += [f"{BODIES[body]}_{hinge}" for hinge in mano_joints.HINGES[:2]] + [BODIES[body]]
+        axes += list(np.eye(3))
+        link_of[body] = len(names) - 1
+    count = len(names)
+    hulls = {
+        body: _hull(data, BODIES[body], link_of[body], (vertices[owner == body] - joints[body]) @ frames[body])
+        for body in range(len(BODIES))
+    }
+    mass, com, inertia = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for body, hull in hulls.items():
+        mass[link_of[body]], com[link_of[body]], inertia[link_of[body]] = _inertial(hull)
+    lower, upper = mano_joints.limits()
+    opened, closed = mano_joints.postures()
+    turning: tuple[JointKind, ...] = ("revolute",)
+    return HandModel(
+        name=data.path.stem,
+        urdf=str(data.path),
+        link_names=tuple(names),
+        joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in mano_joints.HINGES),
+        lower=lower,
+        upper=upper,
+        effort=mano_joints.efforts(joints, tips),
+        velocity=np.full(count - 1, np.inf),
+        open_posture=opened,
+        closed_posture=closed,
+        palm_center=_palm_center(hulls[0], joints, normal),
+        palm_normal=normal,
+        approach=normal,
+        link_parent=np.array(parents),
+        link_joint=np.arange(-1, count - 1),
+        link_offset_rotation=np.array([rotation for rotation, _ in offsets]),
+        link_offset_translation=np.array([translation for _, translation in offsets]),
+        joint_axis=np.array(axes),
+        joint_kind=("fixed", *turning * (count - 1)),
+        link_group=np.arange(count),
+        link_mass=mass,
+        link_com=com,
+        link_inertia=inertia,
+        primitives=tuple(hulls.values()),
+        adjacent=np.eye(count, dtype=bool),
+        candidate_points=np.zeros((0, 3)),
+        candidate_normals=np.zeros((0, 3)),
+        candidate_link=np.zeros(0, dtype=np.int64),
+    )
+
+
+def _hull(data: ManoData, name: str, link: int, points: Float[np.ndarray, "points 3"]) -> Primitive:
+    """Convex hull of a body's vertices, in the body's frame."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        raise HandError(f"{data.path}: weights: the vertices of {name} span no solid") from error
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    corners = points[used][faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # Qhull leaves the winding to chance; its equations point outwards.
+    inward = (outward * hull.equations[:, :3]).sum(-1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return Primitive(link, "hull", np.eye(3), np.zeros(3), (), points[used], faces.astype(np.int64))
+
+
+def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Mass [kg], centre of mass [m] and inertia about it [kg·m²] of a hull of uniform density."""
+    import trimesh
+
+    solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
+    solid.density = _DENSITY
+    return float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
+
+
+def _palm_center(
+    palm: Primitive, joints: Float[np.ndarray, "16 3"], normal: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """Where a line out of the middle of the palm's bones leaves the palm's hull, base frame [m]."""
+    middle = joints[[1, 4, 7, 10]].mean(0) * 0.7 + joints[0] * 0.3 - joints[0]
+    a, b, c = (palm.vertices[palm.faces[:, i]] for i in range(3))
+    outward = np.cross(b - a, c - a)
+    slope, room = outward @ normal, ((a - middle) * outward).sum(1)
+    ahead = slope > 1e-9 * np.abs(slope).max()
+    return middle + max(0.0, float((room[ahead] / slope[ahead]).min())) * normal

@@ -1,0 +1,125 @@
+"""The numbers that the inert objects of a MANO file stand for: arrays, sparse matrices, chumpy's expressions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from graspd_core.hands.mano.mano_pickle import Array, Dtype, Encoded, Inert, Leaf, Select, Sparse, SparseRows
+
+# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
+_MAX_DENSE, _MAX_DEPTH = 2**22, 8
+# Types of numbers that an array may hold: booleans, integers, floats.
+_NUMERIC = {"b1", *(kind + size for kind in "iu" for size in "1248"), "f2", "f4", "f8"}
+# More axes than any array has.
+_MOST_AXES = 8
+
+
+def numbers(value: Any, depth: int = 0) -> np.ndarray:
+    """The dense array of numbers that a value of the file stands for, native byte order.
+
+    `depth` counts the expressions around it.
+
+    Raises:
+        ValueError: it stands for none; says why.
+    """
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
+    if isinstance(value, Array):
+        return _array(value)
+    if isinstance(value, Sparse):
+        return _dense(value, depth + 1)
+    if isinstance(value, Leaf):
+        return numbers(_entry(value, "x"), depth + 1)
+    if isinstance(value, Select):
+        return _selected(value, depth + 1)
+    if _is_number(value) or (isinstance(value, (list, tuple)) and all(map(_is_number, value))):
+        return np.asarray(value)
+    raise ValueError(f"holds {type(value).__name__} where numbers are expected")
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value of Python is a number that numpy has a type for."""
+    return isinstance(value, float) or (isinstance(value, int) and -(2**63) <= value < 2**63)
+
+
+def _shown(value: object) -> str:
+    """A value for an error. What is not text is not written out: lists in lists can be endless."""
+    return repr(value[:40]) if isinstance(value, str) else f"a {type(value).__name__}"
+
+
+def _is_shape(value: object) -> bool:
+    return (
+        isinstance(value, tuple) and len(value) <= _MOST_AXES and all(type(n) is int and 0 <= n < 2**40 for n in value)
+    )
+
+
+def _array(value: Array) -> np.ndarray:
+    state = value.state
+    if not isinstance(state, tuple) or len(state) != 5:
+        raise ValueError("holds an array without content")
+    _, shape, dtype, fortran, raw = state
+    kind = _dtype(dtype)
+    if isinstance(raw, Encoded) and raw.arguments[1:] in ((), ("latin1",), ("latin-1",)):
+        raw = raw.arguments[0] if raw.arguments else None
+    raw = raw.encode("latin1") if isinstance(raw, str) else raw
+    if not isinstance(raw, bytes) or not _is_shape(shape):
+        raise ValueError("holds an array whose content is no block of numbers")
+    flat = np.frombuffer(raw, dtype=kind)
+    # Checked in Python's integers, which cannot overflow.
+    count = 1
+    for n in shape:
+        count *= n
+    if count != len(flat):
+        raise ValueError(f"holds {len(flat)} numbers for an array of shape {shape}")
+    return flat.astype(kind.newbyteorder("=")).reshape(shape, order="F" if fortran else "C")
+
+
+def _dtype(value: Any) -> np.dtype:
+    code = value.arguments[0] if isinstance(value, Dtype) and value.arguments else None
+    if not isinstance(code, str) or code not in _NUMERIC:
+        raise ValueError(f"holds an array of {_shown(code)}, which is no type of numbers")
+    order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
+    if order not in ("<", ">", "|", "="):
+        raise ValueError(f"holds an array in byte order {_shown(order)}")
+    return np.dtype(("<" if order in ("|", "=") else order) + code)
+
+
+def _dense(value: Sparse, depth: int) -> np.ndarray:
+    data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
+    if indices.dtype.kind not in "iu" or starts.dtype.kind not in "iu":
+        raise ValueError("holds a sparse matrix whose indices are no integers")
+    # Signed: of unsigned ones the difference is never negative, and may be huge.
+    indices, starts = indices.astype(np.int64), starts.astype(np.int64)
+    shape = value.state.get("_shape", value.state.get("shape"))
+    if not _is_shape(shape) or len(shape) != 2 or 0 in shape:
+        raise ValueError("holds a sparse matrix of shape other than two numbers")
+    if shape[0] * shape[1] > _MAX_DENSE:
+        raise ValueError(f"holds a sparse matrix of shape {shape!r}, larger than any of MANO's")
+    major, minor = shape if isinstance(value, SparseRows) else shape[::-1]
+    consistent = len(starts) == major + 1 and starts[0] == 0 and starts[-1] == len(data) == len(indices)
+    if (
+        not consistent
+        or (np.diff(starts) < 0).any()
+        or (len(indices) and not 0 <= indices.min() <= indices.max() < minor)
+    ):
+        raise ValueError("holds a sparse matrix that does not fit together")
+    dense = np.zeros((major, minor))
+    np.add.at(dense, (np.repeat(np.arange(major), np.diff(starts)), indices), data)
+    return dense if isinstance(value, SparseRows) else dense.T
+
+
+def _selected(value: Select, depth: int) -> np.ndarray:
+    source, index = (numbers(_entry(value, key), depth).ravel() for key in ("a", "idxs"))
+    if index.dtype.kind not in "iu" or (len(index) and not 0 <= index.min() <= index.max() < len(source)):
+        raise ValueError("holds a selection outside its array")
+    shape = value.state.get("preferred_shape")
+    chosen = source[index]
+    return chosen if shape is None else chosen.reshape(numbers(shape, depth).astype(np.int64))
+
+
+def _entry(value: Inert, key: str) -> Any:
+    if not isinstance(value.state, dict) or key not in value.state:
+        raise ValueError(f"holds a {type(value).__name__} without {key!r}")
+    return value.state[key]

@@ -1,0 +1,144 @@
+"""MANO's forward function in torch: blend shapes and linear blend skinning, batched and differentiable.
+
+Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015). Gradients are exact, in the shape, in
+the pose (that of the zero rotation included) and in the translation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from graspd_core.errors import HandError
+from graspd_core.hands.mano.mano_file import PARENTS, ManoData
+from graspd_core.se3 import quaternion_from_rotation, rotation_from_quaternion, safe_norm
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A MANO model as tensors on one device; fields as in `ManoData`."""
+
+    template: Float[Tensor, "vertices 3"]
+    shape_directions: Float[Tensor, "vertices 3 shapes"]
+    pose_directions: Float[Tensor, "vertices 3 135"]
+    joint_regressor: Float[Tensor, "16 vertices"]
+    weights: Float[Tensor, "vertices 16"]
+
+
+def make_skin(data: ManoData, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Skin:
+    """Lay a model out as tensors."""
+    fields = (data.template, data.shape_directions, data.pose_directions, data.joint_regressor, data.weights)
+    return Skin(*(torch.as_tensor(array, device=device, dtype=dtype) for array in fields))
+
+
+def rest(
+    skin: Skin, betas: Float[Tensor, "batch shapes"]
+) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
+    """Vertices and joints of a shape at rest [m]; betas beyond those given are zero."""
+    shaped = skin.template + torch.einsum("vcs,bs->bvc", skin.shape_directions[..., : betas.shape[-1]], betas)
+    return shaped, skin.joint_regressor @ shaped
+
+
+def skin_vertices(
+    skin: Skin,
+    betas: Float[Tensor, "batch shapes"],
+    rotations: Float[Tensor, "batch 16 3 3"],
+    translation: Float[Tensor, "batch 3"],
+) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
+    """Posed vertices and joints [m].
+
+    Args:
+        skin: the model.
+        betas: shape coefficients.
+        rotations: of every body against its parent, in the model's axes; the first is that of the whole hand, about
+            the wrist joint.
+        translation: added to everything [m].
+    """
+    shaped, joints = rest(skin, betas)
+    feature = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
+    posed = shaped + torch.einsum("vcp,bp->bvc", skin.pose_directions, feature)
+    turns, places = [rotations[:, 0]], [joints[:, 0]]
+    for body in range(1, len(PARENTS)):
+        parent = PARENTS[body]
+        bone = joints[:, body] - joints[:, parent]
+        places.append(places[parent] + (turns[parent] @ bone[..., None]).squeeze(-1))
+        turns.append(turns[parent] @ rotations[:, body])
+    turn, place = torch.stack(turns, 1), torch.stack(places, 1)
+    shift = place - (turn @ joints[..., None]).squeeze(-1)
+    mixed = torch.einsum("vj,bjrc->bvrc", skin.weights, torch.cat([turn, shift[..., None]], -1))
+    vertices = (mixed[..., :3] @ posed[..., None]).squeeze(-1) + mixed[..., 3]
+    return vertices + translation[:, None], place + translation[:, None]
+
+
+def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rodrigues' formula for axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
+    half = 0.5 * safe_norm(vector)[..., None]
+    return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
+
+
+def vector_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Axis-angle vectors of length up to π [rad]; of two that are half a turn long, either."""
+    quaternion = quaternion_from_rotation(rotation)
+    sine = safe_norm(quaternion[..., 1:])
+    angle = 2.0 * torch.atan2(sine, quaternion[..., 0])
+    # For small angles the ratio of angle and sine of the half is two.
+    ratio = torch.where(sine < 1e-9, 2.0, angle / sine.clamp_min(1e-9))
+    return ratio[..., None] * quaternion[..., 1:]
+
+
+def pose_from_components(
+    data: ManoData, coefficients: Float[Tensor, "batch components"], *, about_mean: bool = True
+) -> Float[Tensor, "batch 15 3"]:
+    """Axis-angle vectors of bodies 1 to 15 [rad] of the first k principal components, about the mean pose or the flat.
+
+    Raises:
+        HandError: more coefficients than the model has components.
+    """
+    count = coefficients.shape[-1]
+    if count > len(data.components):
+        raise HandError(f"{data.path}: {count} pose coefficients, but {len(data.components)} components")
+    components, mean = (torch.as_tensor(a).to(coefficients) for a in (data.components, data.mean))
+    pose = coefficients @ components[:count] + (mean if about_mean else 0.0)
+    return pose.unflatten(-1, (15, 3))
+
+
+def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
+    """The vertices around the opening at the wrist, in the direction of the faces' edges; empty for a closed mesh.
+
+    Raises:
+        HandError: the boundary is not one loop, so that the inside is not defined.
+    """
+    edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
+    present = set(map(tuple, edges.tolist()))
+    if len(present) != len(edges):
+        raise HandError(f"{data.path}: f: faces that are wound against each other, or an edge of three faces")
+    after = {a: b for a, b in present if (b, a) not in present}
+    if not after:
+        return np.zeros(0, dtype=np.int64)
+    start = min(after)
+    loop = [start]
+    while (following := after.get(loop[-1])) not in (start, None) and len(loop) <= len(after):
+        loop.append(following)
+    open_edges = sum((b, a) not in present for a, b in present)
+    if len(loop) != open_edges:
+        raise HandError(f"{data.path}: f: the boundary is not one loop around the wrist")
+    return np.array(loop)
+
+
+def closed_faces(data: ManoData) -> Int[np.ndarray, "faces 3"]:
+    """The faces with a fan over the wrist about one vertex more: MANO's 1538 become 1554."""
+    loop = wrist_loop(data)
+    hub = np.full(len(loop), len(data.template))
+    return np.concatenate([data.faces, np.column_stack([np.roll(loop, -1), loop, hub])])
+
+
+def close_wrist(data: ManoData, vertices: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch closed 3"]:
+    """The vertices with the fan's hub, the middle of the loop, for `closed_faces`."""
+    loop = wrist_loop(data)
+    if len(loop) == 0:
+        return vertices
+    return torch.cat([vertices, vertices[:, loop].mean(1, keepdim=True)], 1)

@@ -1,0 +1,1 @@
+"""Readers of hand files: URDF, MJCF, hand descriptions."""

@@ -1,0 +1,117 @@
+"""Mesh files that a hand names: where they lie, and their convex hulls."""
+
+from __future__ import annotations
+
+import os
+import re
+import xml.etree.ElementTree as ET
+from functools import lru_cache
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import MeshError
+from graspd_core.hands.readers.xml_io import wrong
+from graspd_core.mesh.convex_parts import limited_hull
+from graspd_core.mesh.mesh_files import load_mesh
+from graspd_core.types import TriangleMesh
+
+# The most corners of a hull: on a ball of 12 mm its facets lie up to 0.3 mm below the mesh's own surface.
+_CORNERS = 200
+# Nothing of a hand is larger [m].
+LARGEST_SIZE = 2.0
+
+
+def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
+    """Where a mesh lies that a URDF names by a `package://`, `model://` or `file://` address or by a path.
+
+    A package is looked for in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then in the folders above the URDF and among
+    their neighbours: by folder name or by the name in its package.xml. A relative path is taken from the URDF's folder
+    and from the folders above.
+
+    Raises:
+        HandError: no such file, or one that would have to be fetched.
+    """
+    scheme, separator, rest = filename.replace("\\", "/").partition("://")
+    if not separator:
+        scheme, rest = "", scheme
+    if scheme in ("http", "https", "ftp"):
+        raise wrong(urdf, shape, f"mesh {filename!r} is not fetched from the network; name a local file")
+    parents = urdf.resolve().parents
+    if scheme in ("package", "model"):
+        package, _, inside = unquote(rest).partition("/")
+        candidates = [folder / inside for folder in _package_folders(package, parents)]
+        # An unpacked archive often has another name than the package: then what follows the package's name decides.
+        candidates += [folder / inside for folder in parents]
+    else:
+        plain = unquote(rest.removeprefix("localhost")) if scheme == "file" else rest
+        candidates = [folder / plain for folder in parents]
+    for candidate in candidates:
+        if inside_exists(candidate):
+            return candidate
+    where = "in any package path, nor " if scheme in ("package", "model") else ""
+    raise wrong(urdf, shape, f"mesh {filename!r} was not found {where}beside the file or above it")
+
+
+def inside_exists(path: Path) -> bool:
+    """Whether a file is there; a name that no file can have is not."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def mesh_hull(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"]) -> TriangleMesh:
+    """Convex hull of a mesh file, scaled along each axis (a negative factor mirrors), at most some 200 corners [m].
+
+    Raises:
+        HandError: the file is not there, not a mesh, or not of a hand's size.
+    """
+    path = resolve_mesh(urdf, shape, filename)
+    try:
+        hull = _hull(path, path.stat().st_mtime_ns, tuple(scale.tolist()))
+    except (MeshError, OSError) as error:
+        raise wrong(urdf, shape, f"mesh {filename!r} cannot be read as a collision mesh: {error}") from error
+    extent = float(np.ptp(hull.vertices, axis=0).max())
+    if extent > LARGEST_SIZE:
+        raise wrong(
+            urdf, shape, f"mesh {filename!r} is {extent:.3g} m across: if it is in millimetres, scale it by 0.001"
+        )
+    return hull
+
+
+@lru_cache(maxsize=64)
+def _hull(path: Path, modified: int, scale: tuple[float, float, float]) -> TriangleMesh:
+    del modified
+    mesh = load_mesh(path)
+    # Scaled first and hulled then: a mirrored hull would be inside out.
+    return limited_hull(mesh.vertices[np.unique(mesh.faces)] * np.array(scale), _CORNERS)
+
+
+def _package_folders(package: str, parents) -> list[Path]:
+    """Where a package may lie, likeliest first."""
+    named = [Path(entry) for entry in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if entry]
+    installed = [Path(entry) / "share" for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if entry]
+    found = [folder for folder in named if folder.name == package or _package_name(folder) == package]
+    found += [folder / package for folder in (*named, *installed, *parents)]
+    found += [folder for folder in parents if _package_name(folder) == package]
+    # Beside the URDF's own package, where a workspace keeps the others.
+    for folder in list(parents)[:4]:
+        try:
+            beside = sorted(folder.glob("*/package.xml"))
+        except OSError:
+            continue
+        found += [file.parent for file in beside if _package_name(file.parent) == package]
+    return found
+
+
+def _package_name(folder: Path) -> str | None:
+    """The name in a folder's package.xml, None where there is none."""
+    try:
+        text = (folder / "package.xml").read_text(encoding="utf-8", errors="replace")
+    except (OSError, ValueError):
+        return None
+    found = re.search(r"<name>\s*([\w.-]+)\s*</name>", text)
+    return found.group(1) if found else None

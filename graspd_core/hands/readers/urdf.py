@@ -1,0 +1,176 @@
+"""URDF to `HandModel`: what descriptions in use get wrong is mended with a warning or refused by name."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.hands.model import HandModel, JointKind
+from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.mimic import read_couplings
+from graspd_core.hands.readers.urdf_geometry import read_primitives
+from graspd_core.hands.readers.xml_io import read_xml, wrong
+from graspd_core.hands.readers.xml_values import read_numbers, read_origin
+
+_KINDS: dict[str, JointKind] = {
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "fixed": "fixed",
+}
+# Joint types that only place a whole robot in the world.
+_FREE = ("floating", "planar")
+_MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
+# Of a mass [kg] or a moment of inertia [kg·m²].
+_HEAVIEST = 1e3
+
+
+def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
+    """The hand that a URDF describes, without candidates; postures mid-range, palm at the base's origin.
+
+    `continuous` joints are kept within ±π; an effort or velocity that is absent or zero becomes infinite; a link
+    without collision shapes takes its visual ones; a `world` link or a floating joint above the base is dropped. All
+    but the second leave a warning.
+
+    Args:
+        path: of the file.
+        root: its root element, where it has been read already.
+
+    Raises:
+        HandError: the file is missing, malformed, not a tree, has no moving joint, or has one of an unknown type.
+    """
+    root = read_xml(path) if root is None else root
+    if root.tag != "robot":
+        raise wrong(path, root, f"the root element is <{root.tag}>, a URDF has <robot>")
+    links, joints = root.findall("link"), root.findall("joint")
+    shapes = sum(len(link.findall(tag)) for link in links for tag in ("collision", "visual"))
+    refuse_crowds(path, len(links), len(joints), shapes)
+    for element in (*links, *joints):
+        if not element.get("name"):
+            raise wrong(path, element, f"a <{element.tag}> has no name")
+    _refuse_xacro(path, root)
+    links, joints, dropped = _below_world(path, links, joints)
+    specs = [_read_joint(path, joint) for joint in joints]
+    bodies, shown = [], []
+    for link in links:
+        primitives, from_visuals = read_primitives(path, link)
+        if from_visuals:
+            shown.append(str(link.get("name")))
+        bodies.append(LinkSpec(str(link.get("name")), *_inertial(path, link), tuple(primitives)))
+    if shown:
+        dropped.append(f"no <collision>, so the <visual> is taken: {', '.join(shown)}")
+    name = str(root.get("name") or path.stem)
+    return assemble(path, name, bodies, specs, read_couplings(path, joints), tuple(dropped))
+
+
+def _refuse_xacro(path: Path, root: ET.Element) -> None:
+    for top in root:
+        if top.tag.startswith("xacro:"):
+            raise wrong(path, top, f"is a xacro file (<{top.tag}>); expand it to a URDF first")
+        if top.tag not in ("link", "joint"):
+            continue
+        for element in top.iter():
+            unexpanded = [text for text in element.attrib.values() if "${" in text or "$(" in text]
+            if unexpanded or element.tag.startswith("xacro:"):
+                what = unexpanded[0] if unexpanded else f"<{element.tag}>"
+                raise wrong(path, element, f"xacro left over in <{element.tag}>: {what}; expand it to a URDF first")
+
+
+def _below_world(
+    path: Path, links: list[ET.Element], joints: list[ET.Element]
+) -> tuple[list[ET.Element], list[ET.Element], list[str]]:
+    """Links and joints below whatever only places the hand in the world, and a warning for what was dropped."""
+    dropped: list[str] = []
+    while True:
+        children = {_end(joint, "child") for joint in joints}
+        roots = [link for link in links if link.get("name") not in children]
+        below = [joint for joint in joints if len(roots) == 1 and _end(joint, "parent") == roots[0].get("name")]
+        if len(below) != 1 or any(roots[0].find(tag) is not None for tag in ("visual", "collision", "inertial")):
+            break
+        is_world = roots[0].get("name") == "world" and below[0].get("type") == "fixed"
+        if not is_world and below[0].get("type") not in _FREE:
+            break
+        links = [link for link in links if link is not roots[0]]
+        joints = [joint for joint in joints if joint is not below[0]]
+        dropped.append(
+            f"link {roots[0].get('name')!r} and {below[0].get('type')} joint {below[0].get('name')!r} above the base "
+            f"{_end(below[0], 'child')!r} were dropped"
+        )
+    for joint in joints:
+        if joint.get("type") not in _KINDS:
+            raise wrong(path, joint, f"is of type {joint.get('type')!r}; known: {', '.join(_KINDS)}")
+    return links, joints, dropped
+
+
+def _end(joint: ET.Element, end: str) -> str | None:
+    element = joint.find(end)
+    return None if element is None else element.get("link")
+
+
+def _read_joint(path: Path, joint: ET.Element) -> JointSpec:
+    ends = {end: _end(joint, end) for end in ("parent", "child")}
+    for end, link in ends.items():
+        if link is None:
+            raise wrong(path, joint, f"has no <{end} link=...>")
+    kind = _KINDS[str(joint.get("type"))]
+    rotation, translation = read_origin(path, joint)
+    name, parent, child = str(joint.get("name")), str(ends["parent"]), str(ends["child"])
+    if kind == "fixed":
+        return JointSpec(name, parent, child, kind, rotation, translation)
+    return JointSpec(name, parent, child, kind, rotation, translation, _axis(path, joint), *_limits(path, joint))
+
+
+def _axis(path: Path, joint: ET.Element) -> Float[np.ndarray, "3"]:
+    element = joint.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if element is None else read_numbers(path, element, "xyz", 3, "1 0 0")
+    largest = float(np.abs(axis).max())
+    if largest == 0:
+        raise wrong(path, joint, "has a zero axis")
+    axis = axis / largest
+    return axis / np.linalg.norm(axis)
+
+
+def _limits(path: Path, joint: ET.Element) -> tuple[float, float, float, float]:
+    """Lower, upper [rad] or [m], effort [N·m] or [N], velocity; infinite where there is none."""
+    limit = joint.find("limit")
+    continuous = joint.get("type") == "continuous"
+    if limit is None:
+        if not continuous:
+            raise wrong(path, joint, "has no <limit>")
+        limit = ET.Element("limit")
+    lower, upper = (float(read_numbers(path, limit, key, 1, "0")[0]) for key in ("lower", "upper"))
+    if continuous:
+        lower, upper = -np.inf, np.inf
+    if lower > upper:
+        raise wrong(path, joint, f"has lower {lower:g} above upper {upper:g}")
+    return lower, upper, _unset_if_zero(path, limit, "effort"), _unset_if_zero(path, limit, "velocity")
+
+
+def _unset_if_zero(path: Path, limit: ET.Element, key: str) -> float:
+    """A limit that is absent, zero or infinite is a placeholder."""
+    if (limit.get(key) or "").strip().lower().lstrip("+") in ("inf", "infinity"):
+        return np.inf
+    value = float(read_numbers(path, limit, key, 1, "0")[0])
+    return value if value > 0 else np.inf
+
+
+def _inertial(path: Path, link: ET.Element) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Mass [kg], centre of mass [m] and inertia about it [kg·m²] in link axes; zero where the link gives none."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    rotation, com = read_origin(path, inertial)
+    element, inertia = inertial.find("mass"), inertial.find("inertia")
+    mass = 0.0 if element is None else float(read_numbers(path, element, "value", 1, "0")[0])
+    if mass < 0:
+        raise wrong(path, inertial, f"has a negative mass, {mass:g}")
+    moments = np.zeros(6)
+    if inertia is not None:
+        moments = np.array([read_numbers(path, inertia, f"i{key}", 1, "0")[0] for key in _MOMENTS])
+    if max(mass, *np.abs(moments)) > _HEAVIEST:
+        raise wrong(path, inertial, f"weighs {mass:g} kg with moments up to {np.abs(moments).max():g} kg·m²: no hand")
+    xx, xy, xz, yy, yz, zz = moments
+    return mass, com, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T

@@ -1,0 +1,241 @@
+"""The hand's outer surface as points: contact candidates for the optimiser, dense samples for the judges.
+
+The outer surface is what can touch something: points inside another solid welded to the same link are left out, and so
+are those that stay inside the next link of the chain at every value of the joint between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.errors import HandError
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.link_distance import primitive_sdf
+from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
+
+# Steps along the normal that tell a face that lies on another solid from one that is flush with it [m].
+_STEP = 1e-6
+# How far out of a face a point must come free of the other solids of its group: in a crease nothing can be touched [m].
+_CREASE = 1e-4
+# Random points drawn for each that lies on the outer surface, at most.
+_MOST_DRAWN = 200
+# Of the candidates, the most that may be corners chosen beforehand.
+_CORNER_SHARE = 0.3
+# Spacing of candidates is inversely proportional to these; a surface that faces the grasp has 1.
+_TIP_WEIGHT, _EDGE_WEIGHT, _BACK_WEIGHT = 2.0, 1.25, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Pool:
+    """Surface points in link frames, with the primitive each came from and the area it stands for [m²]."""
+
+    points: Float[np.ndarray, "points 3"]
+    normals: Float[np.ndarray, "points 3"]
+    links: Int[np.ndarray, "points"]
+    source: Int[np.ndarray, "points"]
+    areas: Float[np.ndarray, "points"]
+    corner: Bool[np.ndarray, "points"]
+
+    def take(self, keep: np.ndarray) -> _Pool:
+        """The points that a mask or an index array chooses."""
+        return _Pool(*(array[keep] for array in vars(self).values()))
+
+
+def candidates(
+    hand: HandModel, count: int, seed: int
+) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"], Int[np.ndarray, "count"]]:
+    """Evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
+
+    Corners of boxes that face the grasp are always in, since they are what sinks in unnoticed; then farthest-point
+    sampling (Gonzalez 1985) within each rigid group of links, denser on fingertips and sparser on backs (`_weights`).
+    The order is that of the sampling: the first n of many cover the hand evenly too.
+    """
+    rng = np.random.default_rng(seed)
+    features = _exposed(hand, _feature_pool(hand))
+    faces = _exposed(hand, _random_pool(hand, 20 * count, rng))
+    pool = _Pool(*(np.concatenate(pair) for pair in zip(vars(features).values(), vars(faces).values(), strict=True)))
+    weights, facing = _weights(hand, pool)
+    placed = _placed(link_poses(hand, hand.open_posture), pool.points, pool.links)
+    corners = np.flatnonzero(pool.corner & facing)
+    groups = hand.link_group[pool.links]
+    limit = int(_CORNER_SHARE * count)
+    if len(corners) > limit:
+        corners = corners[_farthest(placed[corners], groups[corners], weights[corners], np.zeros(0, int), limit)]
+    picked = _farthest(placed, groups, weights, corners, count)
+    # Sampled once more among themselves, so that the first few of them are not the corners alone.
+    picked = picked[_farthest(placed[picked], groups[picked], weights[picked], np.zeros(0, int), count)]
+    chosen = pool.take(picked)
+    return chosen.points, chosen.normals, chosen.links
+
+
+def dense_samples(
+    hand: HandModel, *, count: int = 4000, seed: int = 1
+) -> tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"], Float[np.ndarray, "samples"]]:
+    """At least `count` random points of the outer surface for judging: points in link frames [m], links, areas [m²].
+
+    Independent of the candidates. The areas sum to the area of the hand's outer surface.
+
+    Raises:
+        HandError: hardly any of its surface is outer surface.
+    """
+    rng = np.random.default_rng(seed)
+    drawn, pool = count, _exposed(hand, _random_pool(hand, count, rng))
+    while len(pool.points) < count:
+        drawn = int(np.ceil(1.05 * drawn * count / max(len(pool.points), 1)))
+        if drawn > _MOST_DRAWN * count:
+            raise HandError(f"{hand.urdf}: almost all of the hand's solids lie inside others")
+        pool = _exposed(hand, _random_pool(hand, drawn, rng))
+    return pool.points, pool.links, pool.areas
+
+
+def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool:
+    areas = np.array([primitive_area(p) for p in hand.primitives])
+    counts = np.maximum(8, np.ceil(count * areas / areas.sum())).astype(int)
+    parts = [surface_points(p, int(n), rng) for p, n in zip(hand.primitives, counts, strict=True)]
+    return _Pool(
+        points=np.concatenate([points for points, _ in parts]),
+        normals=np.concatenate([normals for _, normals in parts]),
+        links=np.repeat([p.link for p in hand.primitives], counts),
+        source=np.repeat(np.arange(len(counts)), counts),
+        areas=np.repeat(areas / counts, counts),
+        corner=np.zeros(counts.sum(), dtype=bool),
+    )
+
+
+def _feature_pool(hand: HandModel) -> _Pool:
+    parts = [feature_points(p, spacing=0.004) for p in hand.primitives]
+    counts = [len(points) for points, _, _ in parts]
+    return _Pool(
+        points=np.concatenate([part[0] for part in parts]),
+        normals=np.concatenate([part[1] for part in parts]),
+        links=np.repeat([p.link for p in hand.primitives], counts),
+        source=np.repeat(np.arange(len(counts)), counts),
+        areas=np.zeros(sum(counts)),
+        corner=np.concatenate([part[2] for part in parts]),
+    )
+
+
+def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
+    """The points of the pool that lie on the outer surface."""
+    pool = pool.take(~_covered_in_group(hand, pool))
+    groups, parent_group = hand.link_group[pool.links], parent_groups(hand)
+    always = np.ones(len(pool.points), dtype=bool)
+    # One joint lies between neighbouring groups, so that its range is covered by moving all joints together.
+    for share in np.linspace(0.0, 1.0, 5):
+        poses = link_poses(hand, hand.lower + share * (hand.upper - hand.lower))
+        inside = np.zeros(len(pool.points), dtype=bool)
+        for primitive in hand.primitives:
+            group = hand.link_group[primitive.link]
+            neighbour = (parent_group[groups] == group) | (groups == parent_group[group])
+            at = np.flatnonzero(always & neighbour & (groups != group))
+            inside[at] |= _distance(poses, primitive, pool.points[at], pool.links[at]) < 0.0
+        always &= inside
+    return pool.take(~always)
+
+
+def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
+    """Points inside another solid of their rigid group, on a face glued to one, or flush with an earlier one."""
+    poses = link_poses(hand, hand.open_posture)
+    covered = np.zeros(len(pool.points), dtype=bool)
+    groups = hand.link_group[pool.links]
+    for number, primitive in enumerate(hand.primitives):
+        at = np.flatnonzero((groups == hand.link_group[primitive.link]) & (pool.source != number))
+        here = _distance(poses, primitive, pool.points[at], pool.links[at])
+        outside = _distance(poses, primitive, pool.points[at] + _CREASE * pool.normals[at], pool.links[at])
+        flush = (np.abs(here) < 0.1 * _STEP) & (number < pool.source[at])
+        covered[at] |= (here < -0.1 * _STEP) | (outside < 0.5 * _CREASE) | flush
+    return covered
+
+
+def _placed(
+    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
+    points: Float[np.ndarray, "points 3"],
+    links: Int[np.ndarray, "points"],
+) -> Float[np.ndarray, "points 3"]:
+    """Link-frame points in the base frame [m]."""
+    rotations, translations = poses
+    return np.einsum("pij,pj->pi", rotations[links], points) + translations[links]
+
+
+def _distance(
+    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
+    primitive: Primitive,
+    points: Float[np.ndarray, "points 3"],
+    links: Int[np.ndarray, "points"],
+) -> Float[np.ndarray, "points"]:
+    """Signed distance [m] of points of any links to one primitive, at one posture."""
+    rotations, translations = poses
+    local = (_placed(poses, points, links) - translations[primitive.link]) @ rotations[primitive.link]
+    return primitive_sdf(primitive, torch.as_tensor(local)).numpy()
+
+
+def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
+    """By group number: the nearest group with solids that the group's first link hangs from, -1 where there is none.
+
+    Bare groups are passed over: a joint of several axes is modelled by hinges with massless links between them.
+    """
+    parent = hand.link_parent
+    above = np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)
+    solid = np.isin(np.arange(hand.num_links), hand.link_group[[p.link for p in hand.primitives]])
+    # Links come in depth-first order, so that what a bare parent hangs from is known before its children.
+    for link, group in enumerate(above.tolist()):
+        if group >= 0 and not solid[group]:
+            above[link] = above[group]
+    return above
+
+
+def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
+    """How densely each point's surroundings deserve candidates, and whether the point faces the grasp.
+
+    A link faces where closing the hand takes it; the palm faces along its normal. A fingertip is the outer half of a
+    rigid group that ends a finger.
+    """
+    poses = rotations, origins = link_poses(hand, hand.open_posture)
+    groups = hand.link_group[pool.links]
+    placed = _placed(poses, pool.points, pool.links)
+    closing = hand.open_posture + 0.02 * (hand.closed_posture - hand.open_posture)
+    motion = _placed(link_poses(hand, closing), pool.points, pool.links) - placed
+    motion[groups == hand.link_group[0]] = hand.palm_normal
+    motion /= np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-9)
+    outward = np.einsum("pij,pj->pi", rotations[pool.links], pool.normals)
+    facing = (outward * motion).sum(1)
+    weights = _BACK_WEIGHT + 0.5 * (1.0 - _BACK_WEIGHT) * (1.0 + facing)
+    weights[(pool.areas == 0) & (facing > -0.1)] *= _EDGE_WEIGHT
+    reach = np.linalg.norm(placed - origins[groups], axis=1)
+    heads = np.unique(hand.link_group)
+    for group in np.setdiff1d(heads, np.append(parent_groups(hand)[heads], hand.link_group[0])):
+        members = groups == group
+        if members.any():
+            tip = members & (reach > 0.5 * reach[members].max())
+            weights[tip] = np.maximum(weights[tip], np.where(facing[tip] > -0.7, _TIP_WEIGHT, 1.0))
+    return weights, facing > -0.1
+
+
+def _farthest(
+    points: Float[np.ndarray, "points 3"],
+    groups: Int[np.ndarray, "points"],
+    weights: Float[np.ndarray, "points"],
+    chosen: Int[np.ndarray, "seeds"],
+    count: int,
+) -> Int[np.ndarray, "count"]:
+    """Farthest-point sampling of weighted distances; points of different groups are infinitely far from each other."""
+    members = {group: np.flatnonzero(groups == group) for group in np.unique(groups)}
+    gap = np.full(len(points), np.inf)
+    picked = [int(i) for i in chosen]
+
+    def include(index: int) -> None:
+        mates = members[groups[index]]
+        distance = np.linalg.norm(points[mates] - points[index], axis=1) * weights[mates]
+        gap[mates] = np.minimum(gap[mates], distance)
+
+    for index in picked:
+        include(index)
+    while len(picked) < min(count, len(points)):
+        picked.append(int(gap.argmax()))
+        include(picked[-1])
+    return np.array(picked, dtype=np.int64)

@@ -1,0 +1,1 @@
+"""Meshes: read, mended, measured; signed distance, convex parts, sharp features, authored shapes."""

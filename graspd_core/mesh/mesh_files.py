@@ -1,0 +1,236 @@
+"""Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch.quasirandom import SobolEngine
+
+from graspd_core.errors import MeshError
+from graspd_core.mesh.collada import read_dae
+from graspd_core.mesh.small_components import without_specks
+from graspd_core.mesh.topology import (
+    drop_degenerate,
+    drop_repeated,
+    is_closed,
+    is_oriented,
+    merge_vertices,
+    orient,
+)
+from graspd_core.mesh.units import LARGE, LARGEST, SMALL, SMALLEST, unit_advice
+from graspd_core.mesh.winding_number import winding_inside
+from graspd_core.types import TriangleMesh
+
+MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
+
+# Points for the volume of a mesh that is not one closed body: about 1 % of volume, 0.3 s. A Sobol sequence, because a
+# lattice aligned with a wall counts its layers wrong; it is evenest at powers of two.
+SPREAD_POINTS = 2**15
+
+
+def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
+    """Read a mesh file; the parts of a scene are joined in place, and coordinates multiplied by `scale`.
+
+    Raises:
+        MeshError: the file is missing, a directory, of an unknown ending, unreadable, or holds no finite surface.
+    """
+    path = Path(path)
+    _refuse_path(path)
+    if not (np.isfinite(scale) and scale > 0):
+        raise MeshError(f"scale {scale!r} for {path}: must be a positive number")
+    vertices, faces = _read(path)
+    mesh = TriangleMesh(vertices * scale, faces)
+    _refuse_unusable(mesh, str(path))
+    return mesh
+
+
+def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
+    """Write a mesh; the ending chooses the format. Raises MeshError for an ending that cannot be written."""
+    import trimesh
+
+    path = Path(path)
+    ending = path.suffix.lower().lstrip(".")
+    writable = [e for e in MESH_ENDINGS if e != "dae"]
+    if ending not in writable:
+        raise MeshError(f"{path}: cannot write ending {path.suffix!r}; valid endings: {', '.join(writable)}")
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+
+
+def check_mesh(
+    mesh: TriangleMesh, source: str, most_faces: int | None = None, *, scale: float = 1.0, dusty: bool = False
+) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """A cleaned mesh and what was found wrong with it, one sentence each.
+
+    Merges coincident vertices, drops degenerate and repeated faces, and makes neighbouring faces wind alike.
+    Position and scale are left alone.
+
+    Args:
+        most_faces: a mesh of more is simplified to about this many.
+        scale: factor that the file's coordinates were multiplied by, for the advice on its unit.
+        dusty: tiny pieces that float clear of the rest are dropped.
+
+    Raises:
+        MeshError: no usable faces, vertices that are not finite, or an extent outside 2 mm to 2 m.
+    """
+    _refuse_unusable(mesh, source)
+    _doubted_size(mesh, source, scale)
+    warnings: list[str] = []
+    mesh, dropped, repeated = _distinct(mesh, source)
+    if dropped:
+        warnings.append(f"{source}: dropped {dropped} faces without area")
+    if repeated:
+        warnings.append(f"{source}: dropped {repeated} repeated faces")
+    # Before any question about neighbours: a million faces take seconds for each.
+    given = mesh
+    if most_faces is not None and len(mesh.faces) > most_faces:
+        warnings.append(f"{source}: simplified from {len(mesh.faces)} to {most_faces} faces")
+        mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
+    if dusty:
+        # Before all else that is said of the mesh: its size and its holes could be the dust's.
+        mesh, specks = without_specks(mesh)
+        if specks:
+            warnings.append(f"{source}: dropped {specks} tiny pieces that float clear of the rest")
+    faces = mesh.faces
+    if not is_oriented(faces):
+        faces = orient(mesh.vertices, faces)
+        warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
+    used, compact = np.unique(faces, return_inverse=True)
+    clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
+    # Simplifying can tear a surface; that is no fault of the input, and the winding number bears it.
+    if not is_closed(clean) and not is_closed(given):
+        warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
+    return clean, (*_doubted_size(clean, source, scale), *warnings)
+
+
+def simplify(mesh: TriangleMesh, faces: int) -> TriangleMesh:
+    """At most about `faces` triangles, by quadric edge collapse; a smaller mesh is returned as it is."""
+    import fast_simplification
+
+    if len(mesh.faces) <= faces:
+        return mesh
+    centre = mesh.vertices.mean(0)
+    points, triangles = (mesh.vertices - centre).astype(np.float32), mesh.faces.astype(np.int32)
+    vertices, triangles = fast_simplification.simplify(points, triangles, target_count=int(faces))[:2]
+    return TriangleMesh(vertices.astype(float) + centre, triangles.astype(np.int64))
+
+
+def content_hash(mesh: TriangleMesh) -> str:
+    """SHA-256 of the vertices (float64) and faces (int64), hexadecimal."""
+    digest = hashlib.sha256(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
+    return digest.hexdigest()
+
+
+def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Volume [m³], centre of mass [m] and inertia about it per unit density [m⁵] of the enclosed solid.
+
+    Exact for one closed, consistently wound body; otherwise summed over points where the winding number says
+    inside (about 1 % of volume). A surface that encloses nothing counts as a solid of its bounding box.
+    """
+    import trimesh
+
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    if is_closed(mesh) and is_oriented(mesh.faces) and body.body_count == 1:
+        if body.volume < 0:
+            body.invert()
+        return float(body.volume), np.array(body.center_mass), np.array(body.moment_inertia)
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    # A flat sheet still needs a box of some thickness for its inertia to be positive.
+    size = np.maximum(high - low, 1e-3)
+    spread = SobolEngine(3, scramble=True, seed=0).draw(SPREAD_POINTS, dtype=torch.float64).numpy()
+    points = (spread - 0.5) * size + (low + high) / 2
+    inside = winding_inside(mesh, points)
+    share = inside.mean() or 1.0
+    return _moments(points[inside] if inside.any() else points, float(share * size.prod()))
+
+
+def surface_samples(
+    mesh: TriangleMesh, count: int, seed: int
+) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
+    """Points spread evenly by area, and the unit normals of their faces."""
+    rng = np.random.default_rng(seed)
+    corners = mesh.vertices[mesh.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    # One point per equal slice of the total area: as random as needed, with far fewer gaps than independent draws.
+    slices = (np.arange(count) + rng.random(count)) / count * area.sum()
+    chosen = np.minimum(np.searchsorted(np.cumsum(area), slices), len(area) - 1)
+    root, along = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+    a, b, c = corners[chosen].transpose(1, 0, 2)
+    points = (1 - root) * a + root * ((1 - along) * b + along * c)
+    return points, cross[chosen] / np.maximum(area[chosen], 1e-300)[:, None]
+
+
+def _read(path: Path):
+    import trimesh
+
+    try:
+        collada = path.suffix.lower() == ".dae"
+        mesh = read_dae(path) if collada else trimesh.load_scene(path, process=False).to_mesh()
+    except (MemoryError, KeyboardInterrupt):
+        raise
+    # The readers behind trimesh raise whatever their format's parser does, from KeyError to struct.error.
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error, IndexError) and "out of bounds" in reason:
+            reason = f"a face names a vertex that the file does not hold: {reason}"
+        raise MeshError(f"{path}: not a readable {path.suffix.lstrip('.')} mesh ({reason})") from error
+    return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
+
+
+def _refuse_path(path: Path) -> None:
+    endings = ", ".join(MESH_ENDINGS)
+    if path.is_dir():
+        raise MeshError(f"{path}: is a directory; give a mesh file ({endings})")
+    if not path.exists():
+        raise MeshError(f"{path}: no such mesh file")
+    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
+        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {endings}")
+
+
+def _refuse_unusable(mesh: TriangleMesh, source: str) -> None:
+    if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
+        raise MeshError(f"{source}: empty mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces)")
+    if not np.isfinite(mesh.vertices).all():
+        bad = int((~np.isfinite(mesh.vertices).all(1)).sum())
+        raise MeshError(f"{source}: {bad} of {len(mesh.vertices)} vertices are NaN or infinite")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise MeshError(f"{source}: faces name vertices outside 0 to {len(mesh.vertices) - 1}")
+
+
+def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
+    """A warning where a size is odd, none where it is usual, and MeshError where it is absurd."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    size = float(np.ptp(mesh.vertices[used], axis=0).max())
+    if not SMALLEST <= size <= LARGEST:
+        advice = unit_advice(size, scale) if size > 0 else "its vertices all lie in one point"
+        raise MeshError(f"{source}: {size:.4g} m across, outside {SMALLEST} to {LARGEST} m; {advice}")
+    if SMALL <= size <= LARGE:
+        return []
+    odd = "large" if size > LARGE else "small"
+    doubt = "not in metres" if scale == 1 else "in another unit"
+    return [f"{source}: {size:.3g} m across, {odd} for a hand; if the file is {doubt}, {unit_advice(size, scale)}"]
+
+
+def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
+    """Coincident vertices merged and degenerate and repeated faces dropped, and how many of each."""
+    vertices, faces = merge_vertices(mesh)
+    distinct = drop_degenerate(vertices, faces)
+    unique = drop_repeated(distinct)
+    if len(unique) == 0:
+        raise MeshError(f"{source}: no face has an area; a triangle mesh with a surface is needed")
+    return TriangleMesh(vertices, unique), len(faces) - len(distinct), len(distinct) - len(unique)
+
+
+def _moments(
+    points: Float[np.ndarray, "points 3"], volume: float
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Volume, centre and inertia of a solid evenly filled with points."""
+    centre = points.mean(0)
+    second = (points - centre).T @ (points - centre) * (volume / len(points))
+    return volume, centre, np.trace(second) * np.eye(3) - second

@@ -1,0 +1,188 @@
+"""Signed distance on a grid: built exactly at the nodes, sampled by trilinear interpolation.
+
+Negative inside, metres. Gradient: autograd of `sample_sdf` gives the derivative of the interpolated distance, which
+jumps between cells; the returned normal is interpolated by itself from exact directions and is the smoother of the two.
+Beyond the grid both are those of the distance to one extrapolated surface point. Building carries no gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from graspd_core.mesh.surface_queries import closest_points, make_surface
+from graspd_core.mesh.topology import is_closed
+from graspd_core.mesh.winding_number import winding_inside
+from graspd_core.se3 import EPSILON, safe_norm
+from graspd_core.types import TriangleMesh
+
+# Nearer to the surface than this share of a cell, the direction to it is rounding noise: the face's normal is taken.
+NEAR_SURFACE = 1e-3
+
+# Free space about the object that the grid covers [m]. Beyond it distances are extrapolated, off hollow things too long
+# by half a millimetre in the mean at 5 cm and by 1.3 at 8, by 10 and 20 at worst. Nothing touches there, and every cell
+# that is saved makes those at the surface finer.
+PADDING = 0.015
+
+
+@dataclass(frozen=True)
+class GridSDF:
+    """A box of nodes about an object, as many along each axis as the object is long there.
+
+    Attributes:
+        field: φ [m], then the unit normal ∇φ, at each node.
+        origin: the first node [m].
+        spacing: side of a cell, which is a cube [m], a scalar tensor.
+        half: half of the box's sides [m]; stored, because a count of nodes would have to go to the GPU at every sample.
+    """
+
+    field: Float[Tensor, "4 x y z"]
+    origin: Float[Tensor, "3"]
+    spacing: Float[Tensor, ""]
+    half: Float[Tensor, "3"]
+
+    def to(self, device: torch.device | str, dtype: torch.dtype) -> GridSDF:
+        """The same grid elsewhere."""
+        return GridSDF(*(x.to(device=device, dtype=dtype) for x in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """Where the nodes of a grid lie.
+
+    Attributes:
+        counts: nodes along each axis.
+        origin: the first node [m].
+        spacing: side of a cell [m].
+    """
+
+    counts: tuple[int, int, int]
+    origin: Float[np.ndarray, "3"]
+    spacing: float
+
+
+def build_sdf(
+    mesh: TriangleMesh,
+    *,
+    resolution: int = 48,
+    padding: float = PADDING,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> GridSDF:
+    """Sample a mesh's signed distance on at most `resolution`³ nodes, laid out by `grid_layout`.
+
+    The sign is the generalised winding number's, so open, overlapping, doubled and inverted surfaces are welcome; a
+    surface that encloses nothing has φ ≥ 0 everywhere (`is_solid` tells). Distances at the nodes are exact.
+
+    Args:
+        resolution: nodes along each side of a cube; another object has as many in all, and the finer cells.
+        padding: free space kept around the bounding box [m], at most half the object's extent.
+    """
+    layout = grid_layout(mesh, resolution, padding)
+    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    # Queries are about the centre: Open3D counts in float32.
+    centred = TriangleMesh(mesh.vertices - centre, mesh.faces)
+    axes = [x + layout.spacing * np.arange(n) for x, n in zip(layout.origin - centre, layout.counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    closest, normals = closest_points(make_surface(centred), nodes.reshape(-1, 3))
+    offset = nodes - closest.reshape(nodes.shape)
+    inside = _inside(centred, nodes, np.linalg.norm(offset, axis=-1), layout.spacing)
+    field = _field(offset, normals.reshape(nodes.shape), inside, layout.spacing)
+    half = (np.array(layout.counts) - 1) * layout.spacing / 2
+    return GridSDF(
+        *(torch.as_tensor(x, dtype=dtype, device=device) for x in (field, layout.origin, layout.spacing, half))
+    )
+
+
+def grid_layout(mesh: TriangleMesh, resolution: int, padding: float = PADDING) -> GridLayout:
+    """The finest cubic cells that cover the padded bounding box with at most `resolution`³ nodes."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    extent = float((high - low).max())
+    sides = high - low + 2 * min(padding, extent / 2)
+    # The last allowance keeps a side that is a whole number of cells from getting one more by rounding.
+    count = lambda spacing: np.ceil(sides / spacing - 1e-9).astype(int) + 1  # noqa: E731
+    fine, spacing = 0.0, float(sides.max())
+    # Between these the number of nodes falls in steps: halving finds where it comes to fit, to the last digit.
+    while (middle := (fine + spacing) / 2) not in (fine, spacing):
+        fine, spacing = (fine, middle) if count(middle).prod() <= resolution**3 else (middle, spacing)
+    counts = count(spacing)
+    x, y, z = counts.tolist()
+    return GridLayout((x, y, z), (low + high - (counts - 1) * spacing) / 2, spacing)
+
+
+def sample_sdf(
+    sdf: GridSDF, points: Float[Tensor, "*batch 3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    """Signed distance [m] and outward unit normal at points of the object frame, differentiable in the points.
+
+    Outside the grid: with b the point clamped to the grid, c = b − φ(b) n(b) is taken for the closest surface point x
+    has, which is continuous at the border and errs by less than the offset from the grid times the angle that the true
+    direction turns along it.
+    """
+    half = sdf.half
+    unit = points / half - (sdf.origin / half + 1)
+    clamped = unit.clamp(-1.0, 1.0)
+    # grid_sample takes x for the last axis of its input.
+    field = sdf.field[None].permute(0, 1, 4, 3, 2)
+    sampled = grid_sample(field, clamped.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border")
+    channels = sampled.reshape(4, -1)
+    phi, gradient = channels[0].reshape(points.shape[:-1]), channels[1:].T.reshape(points.shape)
+    # Inside the grid `from_surface` is the gradient times a positive number, so the two lengths cancel exactly
+    # and no branch is needed. Any positive reach does where φ is not; a millimetre keeps float32 clear of zero.
+    reach = phi.clamp_min(1e-3)
+    from_surface = (unit - clamped) * half + reach[..., None] * gradient
+    length = safe_norm(from_surface)
+    return phi + length - reach * safe_norm(gradient), from_surface / length.clamp_min(EPSILON)[..., None]
+
+
+def is_solid(sdf: GridSDF) -> bool:
+    """Whether any node is inside; an open sheet, or a wall much thinner than a cell, has none."""
+    return bool((sdf.field[0] < 0).any())
+
+
+def _inside(
+    mesh: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], distance: Float[np.ndarray, "x y z"], spacing: float
+) -> Bool[np.ndarray, "x y z"]:
+    """The nodes' side of the surface.
+
+    Around a closed surface the winding number is constant wherever one can walk without crossing it, and two
+    neighbouring nodes that are both half a cell away have none of it between them: one question answers for each such
+    region. Through the holes of an open surface the number changes in mid-air, so every node is asked.
+    """
+    from scipy.ndimage import label
+
+    if not is_closed(mesh):
+        return winding_inside(mesh, nodes.reshape(-1, 3)).reshape(distance.shape)
+    labelled: Any = label(distance > 0.51 * spacing)
+    region, regions = labelled
+    asked = region == 0
+    _, first = np.unique(region, return_index=True)
+    asked.ravel()[first] = True
+    inside = np.zeros(distance.shape, dtype=bool)
+    inside[asked] = winding_inside(mesh, nodes[asked])
+    answers = np.zeros(regions + 1, dtype=bool)
+    answers[region.ravel()[first]] = inside.ravel()[first]
+    return np.where(region > 0, answers[region], inside)
+
+
+def _field(
+    offset: Float[np.ndarray, "x y z 3"],
+    normals: Float[np.ndarray, "x y z 3"],
+    inside: Bool[np.ndarray, "x y z"],
+    spacing: float,
+) -> Float[np.ndarray, "4 x y z"]:
+    """φ and its unit gradient (x − c)/φ; on the surface the gradient is the face's normal, turned outwards."""
+    distance = np.linalg.norm(offset, axis=-1)
+    phi = np.where(inside, -distance, distance)
+    far = distance > NEAR_SURFACE * spacing
+    direction = offset / np.where(far, phi, 1.0)[..., None]
+    # An inverted mesh shows in its far nodes: there the face's normal points against the direction.
+    agree = np.sign((direction * normals).sum(-1)[far].sum()) or 1.0
+    gradient = np.where(far[..., None], direction, agree * normals)
+    return np.moveaxis(np.concatenate([phi[..., None], gradient], -1), -1, 0)

@@ -1,0 +1,76 @@
+"""Points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
+
+A hand sampled every few millimetres does not notice an edge that sinks in between its samples; these points do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.mesh.mesh_distance import make_distance_query, signed_distance
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.unique_rows import packed_rows
+from graspd_core.types import TriangleMesh
+
+# How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
+_PROBE, _SHARP = 0.003, 0.15
+_POOL = 6000
+
+
+def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> Float[np.ndarray, "points 3"]:
+    """At most `count` evenly spread surface points [m] with less than a probe's depth of material below them.
+
+    A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
+    nearer. Returns fewer points, possibly none, on a smooth object.
+    """
+    points, normals = _pool(mesh, seed)
+    depth = -signed_distance(make_distance_query(mesh), points - _PROBE * normals)
+    sharp = points[depth < (1 - _SHARP) * _PROBE]
+    return sharp[farthest_points(sharp, count)]
+
+
+def thin_share(mesh: TriangleMesh, seed: int = 0) -> float:
+    """Share of the surface with less than two probe depths of material below it: near one for cups and sheets."""
+    points, normals = surface_samples(mesh, _POOL // 6, seed)
+    depth = -signed_distance(make_distance_query(mesh), points - 2 * _PROBE * normals)
+    return float((depth < (1 - _SHARP) * 2 * _PROBE).mean())
+
+
+def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
+    """Indices of at most `count` points by farthest-point sampling, starting from the first."""
+    if len(points) == 0:
+        return np.zeros(0, dtype=int)
+    chosen = [0]
+    nearest = np.linalg.norm(points - points[0], axis=-1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=-1))
+    return np.array(chosen)
+
+
+def _pool(mesh: TriangleMesh, seed: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Vertices, points along edges, and surface samples, with normals: the places where something sharp may be."""
+    corners = mesh.vertices[mesh.faces]
+    scaled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertex_normals = np.zeros_like(mesh.vertices)
+    for corner in range(3):
+        np.add.at(vertex_normals, mesh.faces[:, corner], scaled)
+    vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=-1, keepdims=True), 1e-20)
+    rng = np.random.default_rng(seed)
+    pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]))
+    edges = pairs[np.unique(packed_rows(pairs), return_index=True)[1]]
+    lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=-1)
+    along = rng.choice(len(edges), size=_POOL, p=lengths / lengths.sum())
+    a = rng.random((_POOL, 1))
+    start, end = edges[along].T
+    # An edge point's normal is that of its two ends blended: on a sharp edge the bisector, on a flat one the face's.
+    on_edges = (1 - a) * mesh.vertices[start] + a * mesh.vertices[end]
+    edge_normals = (1 - a) * vertex_normals[start] + a * vertex_normals[end]
+    edge_normals /= np.maximum(np.linalg.norm(edge_normals, axis=-1, keepdims=True), 1e-20)
+    vertices = rng.permutation(len(mesh.vertices))[:_POOL]
+    samples, sample_normals = surface_samples(mesh, _POOL // 2, seed)
+    return (
+        np.concatenate([mesh.vertices[vertices], on_edges, samples]),
+        np.concatenate([vertex_normals[vertices], edge_normals, sample_normals]),
+    )

@@ -1,0 +1,87 @@
+"""What the vertices and faces of a triangle soup say of its surface, and how to tidy them."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from graspd_core.mesh.unique_rows import packed_rows
+from graspd_core.types import TriangleMesh
+
+Vertices = Float[np.ndarray, "vertices 3"]
+Faces = Int[np.ndarray, "faces 3"]
+
+# Vertices nearer than this are one [m]: far below any scanner's noise, far above float32 rounding at 2 m.
+MERGE_DISTANCE = 1e-6
+
+
+def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
+    """Vertices of one lattice cell of 1 µm become one."""
+    low = mesh.vertices.min(0)
+    cells = np.round((mesh.vertices - low) / MERGE_DISTANCE).astype(np.int64)
+    _, first, inverse = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
+    return np.asarray(mesh.vertices, dtype=float)[first], inverse[np.asarray(mesh.faces, dtype=np.int64)]
+
+
+def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
+    """The faces with an area (height above 1e-9 of the longest side)."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
+    return faces[area > 1e-9 * longest + 1e-30]
+
+
+def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:
+    """The first face on each set of three vertices, whatever its winding."""
+    _, first = np.unique(packed_rows(np.sort(faces, axis=1)), return_index=True)
+    return faces[np.sort(first)]
+
+
+def _edges(faces: Faces) -> Int[np.ndarray, "edges 2"]:
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def is_oriented(faces: Faces) -> bool:
+    """Whether every edge between just two faces is walked once in either direction."""
+    edges = _edges(faces)
+    low, high = edges.min(1), edges.max(1)
+    _, which, counts = np.unique(low * (int(faces.max()) + 1) + high, return_inverse=True, return_counts=True)
+    balance = np.bincount(which, weights=np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    return bool((balance[counts == 2] == 0).all())
+
+
+def is_closed(mesh: TriangleMesh) -> bool:
+    """Every edge has an even number of faces."""
+    edges = np.sort(_edges(mesh.faces), axis=1)
+    _, counts = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
+    return bool((counts % 2 == 0).all())
+
+
+def orient(vertices: Vertices, faces: Faces) -> Faces:
+    """Make each connected patch agree with itself, and face outwards as a whole."""
+    import igl
+
+    oriented, patch = igl.bfs_orient(np.ascontiguousarray(faces))
+    # The wheel says long long, which NumPy holds to be another type.
+    oriented, patch = np.asarray(oriented, dtype=np.int64), np.asarray(patch, dtype=np.int64)
+    a, b, c = (vertices - vertices.mean(0))[oriented].transpose(1, 0, 2)
+    volume = np.bincount(patch, weights=np.einsum("ij,ij->i", a, np.cross(b, c)))
+    return np.where((volume[patch] < 0)[:, None], oriented[:, ::-1], oriented)
+
+
+def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
+    """The same surface with no edge above `longest` [m], by halving longest edges; corners of faces no longer meet."""
+    corners = mesh.vertices[mesh.faces]
+    done = []
+    while len(corners):
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        which = lengths.argmax(1)
+        long = lengths.max(1) > longest
+        done.append(corners[~long])
+        # Turn each face so that its longest edge is a-b, then halve that.
+        order = (which[long, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(corners[long], order[..., None], axis=1).transpose(1, 0, 2)
+        middle = (a + b) / 2
+        corners = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+    soup = np.concatenate(done)
+    return TriangleMesh(soup.reshape(-1, 3), np.arange(3 * len(soup)).reshape(-1, 3))

@@ -1,0 +1,255 @@
+"""A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
+
+A chain's state is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, the mean over
+chosen places on the inside of the hand of their distance to the object and of how far they face away from it,
+
+    E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i the unit direction from the place to the object,
+
+and states in which the hand collides are refused. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛) for k from
+30,000 to 100,000, jumps drawn by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each
+chain is then closed until contact, and the best of those by ε are kept. ε is Ferrari and Canny's for forces that sum
+to one, over sampled wrenches instead of the hull's faces, so an upper bound. Batched over chains; no gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from graspd_core.config import AnnealingConfig
+from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
+from graspd_core.hands.collision_spheres import proxy_spheres
+from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.hands.kinematics import placement
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
+from graspd_core.methods.finger_closing import link_gaps, make_closing, sphere_overlap
+from graspd_core.methods.grasp_stages import Touches, find_touches
+from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.obstacle_distance import obstacle_gaps
+from graspd_core.methods.planner import Found, Task, problem_of, starts_of
+from graspd_core.methods.problem import Placed, Problem, place
+from graspd_core.se3 import transform_points
+
+# GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
+_T0, _COOLING, _DIMENSIONS, _FIRST, _LAST = 1e6, 7.0, 8, 30_000, 100_000
+# Energies are accepted at this many times the temperature [m].
+_ENERGY_SCALE = 1e3
+# Overlap of the hand's proxy spheres that is not yet a collision, beyond that of the open hand [m].
+_SELF_SLACK = 0.002
+_FEWEST_CHAINS, _FEWEST_KEPT = 16, 8
+
+
+@dataclass(frozen=True)
+class ChainState:
+    """States of a batch of chains and the best that each has seen.
+
+    Attributes:
+        x: base translation [m], base quaternion, amplitudes.
+        energy: [m]; infinite where the state collides.
+        best_x, best_energy: of the best legal state so far.
+    """
+
+    x: Float[Tensor, "batch variables"]
+    energy: Float[Tensor, "batch"]
+    best_x: Float[Tensor, "batch variables"]
+    best_energy: Float[Tensor, "batch"]
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """The annealing as a solver for the shared loop; build with `make_annealing`.
+
+    Attributes:
+        config: its settings.
+        seed: of the jumps.
+        center, basis, low, high: the space of postures, see `eigengrasps.PostureSpace`.
+        lower, upper: joint limits [rad] or [m].
+        contacts: places the chosen contact locations, see `hands.kinematics.placement`.
+        normals: places their outward normals likewise.
+        sphere_links: link of each proxy sphere of the problem.
+        self_overlap: depth of the hand's proxy spheres in each other that is allowed [m].
+    """
+
+    config: AnnealingConfig
+    seed: int
+    center: Float[Tensor, "joints"]
+    basis: Float[Tensor, "dimensions joints"]
+    low: Float[Tensor, "dimensions"]
+    high: Float[Tensor, "dimensions"]
+    lower: Float[Tensor, "joints"]
+    upper: Float[Tensor, "joints"]
+    contacts: Float[Tensor, "contacts columns"]
+    normals: Float[Tensor, "contacts columns"]
+    sphere_links: Int[Tensor, "spheres"]
+    self_overlap: float
+
+    @property
+    def steps(self) -> int:
+        return self.config.steps
+
+    def init(self, problem: Problem, starts: Poses) -> ChainState:
+        # The hand begins open: every amplitude is the one nearest to the start's joints.
+        amplitudes = (starts.joints - self.center) @ torch.linalg.pinv(self.basis)
+        x = torch.cat([starts.translation, starts.quaternion, amplitudes.clamp(self.low, self.high)], -1)
+        energy = self.energy(problem, x)
+        return ChainState(x, energy, x, energy)
+
+    def step(self, problem: Problem, state: ChainState, index: int) -> ChainState:
+        temperature = cooling(index / max(self.steps, 1))
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + index) % 2**63)
+        drawn = torch.rand(len(state.x), 7 + len(self.low), generator=generator).to(state.x)
+        tried = self.neighbour(state.x, jump(drawn[:, 1:], temperature))
+        energy = self.energy(problem, tried)
+        # From a start that collides every legal state is welcome.
+        rise = torch.where(torch.isfinite(state.energy), energy - state.energy, torch.where(energy < 1e3, -1.0, 1.0))
+        taken = drawn[:, 0] < (-rise / (_ENERGY_SCALE * temperature)).exp()
+        # The dear test last, of the few states that would be taken.
+        taken = taken.masked_scatter(taken, ~self.pierced(problem, tried[taken]))
+        better = taken & (energy < state.best_energy)
+        return ChainState(
+            torch.where(taken[:, None], tried, state.x),
+            torch.where(taken, energy, state.energy),
+            torch.where(better[:, None], tried, state.best_x),
+            torch.where(better, energy, state.best_energy),
+        )
+
+    def best(self, state: ChainState) -> tuple[Poses, Float[Tensor, "batch"]]:
+        return self.poses(state.best_x), state.best_energy
+
+    def poses(self, x: Float[Tensor, "batch variables"]) -> Poses:
+        """The hands of states."""
+        return Poses(x[:, :3], x[:, 3:7], (self.center + x[:, 7:] @ self.basis).clamp(self.lower, self.upper))
+
+    def neighbour(
+        self, x: Float[Tensor, "batch variables"], jumps: Float[Tensor, "batch jumps"]
+    ) -> Float[Tensor, "batch variables"]:
+        """States a jump away, jumps in units of the largest: three of place, three of turn, then amplitudes."""
+        config = self.config
+        translation = x[:, :3] + config.translation_jump * jumps[:, :3]
+        half = 0.5 * config.rotation_jump * jumps[:, 3:6]
+        turned = quaternion_product(torch.cat([torch.ones_like(half[:, :1]), half], -1), x[:, 3:7])
+        amplitudes = x[:, 7:] + config.posture_jump * (self.high - self.low) * jumps[:, 6:]
+        quaternion = turned / turned.norm(dim=-1, keepdim=True)
+        return torch.cat([translation, quaternion, amplitudes.clamp(self.low, self.high)], -1)
+
+    @torch.no_grad()
+    def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
+        """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
+        poses = self.poses(x)
+        placed = place(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
+        frames = (placed.link_rotations, placed.link_translations)
+        points = transform_points(placed.rotation, poses.translation, place_in_base(self.contacts, *frames))
+        outward = place_in_base(self.normals, *frames) @ placed.rotation.transpose(-1, -2)
+        distance, normal = sample_sdf(problem.sdf, torch.cat([placed.points, points], 1))
+        count = len(self.contacts)
+        away = 1.0 + (outward * normal[:, -count:]).sum(-1)
+        energy = (distance[:, -count:].abs() + self.config.normal_weight * away).mean(-1)
+        legal = (distance.amin(-1) >= 0.0) & self.clear(problem, placed, poses.translation)
+        return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
+
+    def clear(self, problem: Problem, placed: Placed, translation: Float[Tensor, "batch 3"]) -> Bool[Tensor, "batch"]:
+        """Whether the hand keeps clear of itself and of obstacles."""
+        clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
+        if problem.obstacles is None:
+            return clear
+        frames = (placed.link_rotations, placed.link_translations)
+        return clear & (obstacle_gaps(problem.obstacles, placed.rotation, translation, *frames).amin(-1) >= 0.0)
+
+    @torch.no_grad()
+    def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
+        """Whether object and hand overlap, by all of the hand's points and the object's sharp ones."""
+        if len(x) == 0:
+            return torch.zeros(0, dtype=torch.bool, device=x.device)
+        return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0
+
+
+def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, seed: int) -> Annealing:
+    """The annealing of one hand about one object."""
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values).to(problem.lower)
+
+    space = posture_space(hand, config.eigengrasps, seed)
+    chosen = inner_contacts(hand, config.contacts_per_link)
+    links = torch.as_tensor(hand.candidate_link[chosen]).to(problem.coarse.links)
+    points, normals = tensor(hand.candidate_points[chosen]), tensor(hand.candidate_normals[chosen])
+    stands = Poses(problem.center[None], torch.eye(4).to(problem.lower)[:1], tensor(hand.open_posture)[None])
+    opened = place(problem, problem.coarse, stands.translation, stands.quaternion, stands.joints)
+    return Annealing(
+        config=config,
+        seed=seed,
+        center=tensor(space.center),
+        basis=tensor(space.basis),
+        low=tensor(space.low),
+        high=tensor(space.high),
+        lower=problem.lower,
+        upper=problem.upper,
+        contacts=placement(hand.num_links, points, links),
+        normals=placement(hand.num_links, normals, links, directions=True),
+        sphere_links=torch.as_tensor(proxy_spheres(hand)[2]).to(links),
+        self_overlap=_SELF_SLACK + float(sphere_overlap(problem, opened).max()),
+    )
+
+
+def cooling(progress: float) -> float:
+    """GraspIt!'s default temperature at a share of its run."""
+    k = _FIRST + progress * (_LAST - _FIRST)
+    return _T0 * math.exp(-_COOLING * k ** (1 / _DIMENSIONS))
+
+
+def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
+    """Ingber's distribution of jumps (1989) from numbers in [0, 1): between −1 and 1, mostly of the size of T."""
+    side = 2 * uniform - 1
+    return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
+
+
+def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"]) -> Float[Tensor, "batch 4"]:
+    """Hamilton's product: the turn b, then the turn a."""
+    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(-1, keepdim=True)
+    v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])
+    return torch.cat([w, v], -1)
+
+
+def sampled_epsilon(
+    problem: Problem, touches: Touches, directions: Float[Tensor, "directions 6"]
+) -> Float[Tensor, "batch"]:
+    """Ferrari and Canny's ε for forces that sum to one, with hard contacts: min over directions of max over contacts.
+
+    An upper bound of the true radius, because only these directions are looked at; zero without force closure.
+    """
+    batch, slots = touches.active.shape
+    support = wrench_support(
+        ((touches.position - problem.center) / problem.length).reshape(-1, 1, 3),
+        touches.normal.reshape(-1, 1, 3),
+        touches.active.to(problem.lower).reshape(-1, 1),
+        directions,
+        problem.friction,
+    )
+    return support.reshape(batch, slots, -1).amax(1).amin(-1)
+
+
+def search_annealing(task: Task) -> Found:
+    """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
+    settings, hooks = task.config.annealing, task.hooks
+    problem = problem_of(task)
+    annealing = make_annealing(problem, task.hand, settings, task.seed)
+    starts = starts_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
+    annealed = minimise(annealing, problem, starts, hooks)
+    legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
+    if annealed.interrupted == "cancelled" or len(legal) == 0:
+        return Found(problem, annealed.poses[legal], annealed.interrupted)
+    # What the deadline cut short is closed all the same: open fingers would be no grasps.
+    closing = make_closing(problem, task.hand, settings.close_steps)
+    closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
+    touches = find_touches(problem, closed.poses, task.config.postures.touch_reach)
+    directions = disturbance_directions(settings.directions, task.seed).to(problem.lower)
+    epsilon = sampled_epsilon(problem, touches, directions)
+    kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
+    return Found(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)

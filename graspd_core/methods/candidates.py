@@ -1,0 +1,181 @@
+"""Candidates: draw starts, minimise, make the three postures, rank. No trial is run here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graspd_core.config import PlanConfig
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import deepest_overlap
+from graspd_core.methods.annealing.annealing import search_annealing
+from graspd_core.methods.closed_form.closed_form import ClosedForm
+from graspd_core.methods.grasp_stages import (
+    Squeeze,
+    Touches,
+    approach_depth,
+    find_touches,
+    open_clear,
+    self_overlap,
+    squeeze,
+)
+from graspd_core.methods.graspd2022.graspd2022 import search_graspd2022
+from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.obstacle_distance import intrusion
+from graspd_core.methods.planner import Found, Search, Task, problem_of, starts_of
+from graspd_core.methods.problem import Problem
+from graspd_core.methods.random_closure.random_closure import search_random_closure
+from graspd_core.scene.scene import Scene
+from graspd_core.types import Contact, Grasp, Posture
+
+# However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
+_FEWEST_STARTS, _FEWEST_KEPT = 16, 8
+# A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
+_DEEPEST = 0.0015
+# What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
+_KNOCK_COST = 100.0
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Grasps in rank order, best first, none tried yet; and how the optimiser ended ("" , "cancelled", "deadline")."""
+
+    grasps: tuple[Grasp, ...]
+    interrupted: str
+
+
+def search_closed_form(task: Task) -> Found:
+    """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
+    settings = task.config.closed_form
+    problem = problem_of(task)
+    count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
+    starts = starts_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
+    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
+    solution = minimise(solver, problem, starts, task.hooks)
+    return Found(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
+
+
+SEARCHES: dict[str, Search] = {
+    "closed_form": search_closed_form,
+    "graspd2022": search_graspd2022,
+    "annealing": search_annealing,
+    "random_closure": search_random_closure,
+}
+
+
+def synthesise(
+    scene: Scene,
+    hand: HandModel,
+    *,
+    count: int,
+    seed: int,
+    config: PlanConfig,
+    hooks: Hooks,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Candidates:
+    """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless."""
+    found = SEARCHES[config.method](Task(scene, hand, count, seed, config, hooks, device, dtype))
+    if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
+        return Candidates((), found.interrupted)
+    return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)
+
+
+def assemble(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
+) -> tuple[Grasp, ...]:
+    """Three postures and a score for every pose, best first.
+
+    Poses without a balanced squeeze are dropped, and those that reach through an obstacle on their way or at its end.
+    How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
+    to its pregrasp is refused by a trial before its first step.
+    """
+    touches = find_touches(problem, poses, config.postures.touch_reach)
+    effort = torch.as_tensor(hand.effort).to(problem.lower)
+    pressed = squeeze(problem, poses, touches, effort, config.postures)
+    opened, clearance = open_clear(problem, poses, config.postures, stop)
+    adjacent = torch.as_tensor(hand.adjacent, device=problem.lower.device)
+    overlap = self_overlap(problem, poses.joints, adjacent)
+    if any(primitive.kind == "hull" for primitive in hand.primitives):
+        depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
+        overlap = torch.maximum(overlap, depth.to(overlap))
+    scores = score(touches, pressed, clearance, overlap)
+    if problem.obstacles is not None:
+        ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
+        depth = intrusion(problem.obstacles, problem.kinematics, poses.quaternion, *ends)
+        knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
+        scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
+    order = scores.argsort(descending=True)
+    return tuple(
+        _grasp(problem, hand, int(i), poses, opened, pressed, touches, float(scores[i]))
+        for i in order
+        if scores[i] > -1e3
+    )
+
+
+def score(
+    touches: Touches,
+    pressed: Squeeze,
+    clearance: Float[Tensor, "batch"],
+    overlap: Float[Tensor, "batch"],
+) -> Float[Tensor, "batch"]:
+    """The optimiser's own measure of a grasp, larger is better; no trial goes into it.
+
+    A grasp is good when its squeeze balances and is spread over many contacts, nothing sinks in, and the way from the
+    pregrasp is clear. The weights are those of a logistic regression of hold trials on these five figures over 16
+    objects, 32 grasps each (docs/method.md); self-overlap beyond a millimetre counts more than it said, because the
+    trial forgives what a real hand does not.
+    """
+    force = pressed.forces.norm(dim=-1)
+    largest_share = force.amax(-1) / force.sum(-1).clamp_min(1e-9)
+    depth = (-touches.distance.amin(-1)).clamp_min(0.0) / 0.001
+    return (
+        -1.7 * (largest_share + 0.01).log()
+        - 1.3 * (pressed.imbalance + 1e-3).log10()
+        - 0.7 * depth
+        - 5.5 * (0.8 - clearance).clamp_min(0.0)
+        - 10.0 * (overlap / 0.001 - 1.0).clamp_min(0.0)
+    )
+
+
+def _grasp(
+    problem: Problem,
+    hand: HandModel,
+    row: int,
+    poses: Poses,
+    opened: Poses,
+    pressed: Squeeze,
+    touches: Touches,
+    value: float,
+) -> Grasp:
+    quaternion = poses.quaternion[row] / poses.quaternion[row].norm()
+
+    def posture(translation: Tensor, joints: Tensor) -> Posture:
+        # Rounding to float32 and back may step over a limit by an ulp.
+        inside = np.clip(joints.double().cpu().numpy(), hand.lower, hand.upper)
+        return Posture(translation.double().cpu().numpy(), quaternion.double().cpu().numpy(), inside)
+
+    # One contact a link: of its active slots, the one nearest to the surface.
+    active = torch.nonzero(touches.active[row]).flatten()
+    active = active[touches.distance[row, active].abs().argsort(descending=True)]
+    nearest = {int(touches.link[slot]): int(slot) for slot in active}
+    contacts = tuple(
+        Contact(
+            hand.link_names[link],
+            tuple(touches.position[row, slot].tolist()),
+            tuple(touches.normal[row, slot].tolist()),
+        )
+        for link, slot in sorted(nearest.items())
+    )
+    return Grasp(
+        pregrasp=posture(opened.translation[row], opened.joints[row]),
+        grasp=posture(poses.translation[row], poses.joints[row]),
+        squeeze=posture(poses.translation[row], pressed.joints[row]),
+        contacts=contacts,
+        score=value,
+    )

@@ -1,0 +1,108 @@
+"""Objects that a hand cannot hold anywhere are told before any search, in words that a user can act on.
+
+A necessary condition of every grasp, from statics alone: contact forces that cancel cannot all point into one open
+half-space. All contacts of a hand lie within its span of each other; where the surface normals of every such patch of
+the object stay so close together that no force in their friction cones opposes the others, nothing can be held. Rims,
+handles, walls and thin plates have opposing normals next to each other and pass.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.methods.problem import fingertip_groups
+from graspd_core.scene.scene import Scene
+
+# The roughest surface that a trial believes in; see `verify.world.at_friction`.
+_MOST_FRICTION = 0.6
+# Points of the surface; beside them go the middles of all faces, so that no small handle is missed.
+_SAMPLES = 4000
+# Directions that the object's width is looked at along.
+_DIRECTIONS = 400
+# Steps of the search for a direction that all forces of a patch point away from.
+_STEPS = 60
+
+
+def out_of_reach(scene: Scene, hand: HandModel) -> str:
+    """Why the hand can hold the object nowhere, as a sentence; empty where it may."""
+    span, opening = reach_of(hand)
+    points, normals = _surface(scene)
+    # A convex body is narrowest along a normal of its surface.
+    narrowest = float(np.ptp(scene.object.mesh.vertices @ normals[:: len(normals) // _DIRECTIONS + 1].T, axis=0).min())
+    if narrowest <= span:
+        return ""
+    angle = np.arctan(min(scene.object.friction, _MOST_FRICTION))
+    if not _one_sided(points, normals, span, float(np.sin(angle))):
+        return ""
+    return (
+        f"the object is {_centimetres(narrowest)} across where it is narrowest, without edge or handle to hold it by, "
+        f"and the fingertips of {hand.name} open to {_centimetres(opening)}: smaller things or a larger hand"
+    )
+
+
+def reach_of(hand: HandModel) -> tuple[float, float]:
+    """Of the open hand: the greatest distance of two points of it, and the widest gap between two fingertips [m]."""
+    frames = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
+    links = torch.as_tensor(hand.candidate_link)
+    rotations, translations = (frame[0, links] for frame in frames)
+    points = (rotations @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + translations
+    groups = hand.link_group[hand.candidate_link]
+    tips = [points[torch.as_tensor(groups == group)] for group in fingertip_groups(hand)]
+    gaps = [float(torch.cdist(a, b).min()) for k, a in enumerate(tips) for b in tips[:k] if len(a) and len(b)]
+    return float(torch.cdist(points, points).max()), max(gaps, default=0.0)
+
+
+def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of the object's surface and their outward unit normals."""
+    mesh = scene.object.mesh
+    points, normals = surface_samples(mesh, _SAMPLES, seed=0)
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(across, axis=-1)
+    # A face without area has no normal.
+    real = doubled > 1e-12
+    middles, across = corners[real].mean(1), across[real] / doubled[real, None]
+    return np.concatenate([points, middles]), np.concatenate([normals, across])
+
+
+def _one_sided(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, least: float
+) -> bool:
+    """Whether in every patch of `radius` [m] of the surface one direction separates all forces from their opposites.
+
+    The first patch in which none does ends the search.
+    """
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    _, first = np.unique(np.round(points / (radius / 4)).astype(np.int64), axis=0, return_index=True)
+    return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)
+
+
+def _separated(normals: Float[np.ndarray, "n 3"], least: float) -> bool:
+    """Whether one direction a has n·a > `least`, the sine of the friction angle, for all normals n.
+
+    The best one is along the point of their convex hull that is nearest to the origin; Gilbert's steps go there (SIAM
+    J. Control 1966), and end where its distance is too small for any direction.
+    """
+    nearest = normals.mean(0)
+    for _ in range(_STEPS):
+        along = normals @ nearest
+        worst, length = along.argmin(), float(np.linalg.norm(nearest))
+        if length <= least:
+            return False
+        if along[worst] > least * length:
+            return True
+        step = nearest - normals[worst]
+        share = float(nearest @ step) / max(float(step @ step), 1e-12)
+        nearest = nearest - min(max(share, 0.0), 1.0) * step
+    return False
+
+
+def _centimetres(metres: float) -> str:
+    return f"{metres * 100:.0f} cm"

@@ -1,0 +1,1 @@
+"""Grasp'D as published."""

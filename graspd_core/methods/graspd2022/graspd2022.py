@@ -1,0 +1,248 @@
+"""Grasp'D as published (Turpin et al., ECCV 2022): desired forces that stop the object, and a pose that supplies them.
+
+    min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
+
+by damped multipliers and Adamax, on contacts with the level set φ = r, r shrinking to zero (docs/method.md, §1).
+Gradients are exact, but that contacts leak (`contact.forces`), that the pose has no part in L_task, and that desired
+forces are projected into their cones where they have any.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graspd_core.config import Graspd2022Config
+from graspd_core.contact.free_body import FreeBody, make_body
+from graspd_core.contact.penalty_forces import contact_forces
+from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods import losses
+from graspd_core.methods.closed_form.closed_form import evaluate_distance, pack, unpack
+from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
+from graspd_core.methods.graspd2022.initial_poses_published import published_starts
+from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
+from graspd_core.methods.loop import Poses, minimise
+from graspd_core.methods.obstacle_distance import obstacle_gaps
+from graspd_core.methods.planner import Found, Task, problem_of, starts_of
+from graspd_core.methods.problem import OBSTACLE_MARGIN, PointSet, Problem, place
+
+# L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
+_ALL_MOTION = 60.0
+
+
+class Evaluation(NamedTuple):
+    """Terms of one evaluation, one value per start, and the outward normals at the hand's points."""
+
+    physics: Float[Tensor, "batch"]
+    task: Float[Tensor, "batch"]
+    motion: Float[Tensor, "batch"]
+    limit: Float[Tensor, "batch"]
+    range: Float[Tensor, "batch"]
+    inter: Float[Tensor, "batch"]
+    normals: Float[Tensor, "batch points 3"]
+
+
+@dataclass(frozen=True)
+class RelaxedState:
+    """Iterate and best iterate of every start.
+
+    Attributes:
+        pose: rows of translation, quaternion, joints.
+        forces: desired forces [N]; of no points without relaxation.
+        multipliers: of L_task and L_limit.
+        radius: level set at the start [m].
+        best: best pose on the true surface so far.
+        best_loss: its loss.
+        loss: of the last evaluation.
+    """
+
+    pose: Adamax
+    forces: Adamax
+    multipliers: Adamax
+    radius: Float[Tensor, "batch"]
+    best: Float[Tensor, "batch variables"]
+    best_loss: Float[Tensor, "batch"]
+    loss: Float[Tensor, "batch"]
+
+
+@dataclass(frozen=True)
+class Graspd2022:
+    """The solver of docs/method.md, §1.
+
+    Attributes:
+        config: hyper-parameters.
+        body: the object as a rigid body.
+    """
+
+    config: Graspd2022Config
+    body: FreeBody
+
+    @property
+    def steps(self) -> int:
+        return self.config.steps
+
+    @property
+    def velocities(self) -> Float[Tensor, "3 3"]:
+        """Initial velocities of the object in the three simulations [m/s]."""
+        speed = self.config.speed
+        return self.body.center.new_tensor([[0.0] * 3, [speed] * 3, [-speed] * 3])
+
+    @property
+    def time_step(self) -> float:
+        """Length of the one step [s]."""
+        config = self.config
+        if config.scaling == "published":
+            return config.time_step
+        return self.body.mass * config.speed * math.sqrt(3) / config.stopping_force
+
+    def points(self, problem: Problem) -> PointSet:
+        """The hand's points that may touch."""
+        return problem.fine if self.config.all_candidates else problem.coarse
+
+    def init(self, problem: Problem, starts: Poses) -> RelaxedState:
+        config = self.config
+        x = pack(starts)
+        points = len(self.points(problem).links) if config.relaxation else 0
+        components = 6 if config.desired == "wrench" else 3
+        radius = x.new_full((len(x),), config.radius_start)
+        if config.radius == "code":
+            with torch.no_grad():
+                radius = (evaluate_distance(problem, starts) - 0.01).clamp_min(0.0)
+        worst = x.new_full((len(x),), torch.inf)
+        return RelaxedState(
+            adamax(x),
+            adamax(x.new_zeros(len(x), points, 3, components)),
+            adamax(x.new_zeros(len(x), 2)),
+            radius,
+            x,
+            worst,
+            worst,
+        )
+
+    def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
+        config = self.config
+        remaining = max(0.0, 1.0 - index / config.coarse_steps) if config.coarse_steps else 0.0
+        pose, forces = (x.value.detach().requires_grad_(True) for x in (state.pose, state.forces))
+        found = self.evaluate(problem, pose, forces, remaining * state.radius)
+        task, limit = excess(found.task, config.task_bound), excess(found.limit, config.limit_bound)
+        broken = torch.stack([task, limit], -1)
+        cost = self.cost(found)
+        lagrangian = cost + damped(broken, state.multipliers.value, config.damping).sum(-1)
+        by_pose, by_force = torch.autograd.grad(lagrangian.sum(), (pose, forces), allow_unused=True)
+        broken, cost = broken.detach(), cost.detach()
+        loss = cost + damped(broken, torch.ones_like(broken), 1.0).sum(-1)
+        finite = torch.isfinite(by_pose).all(-1) & torch.isfinite(loss)
+        loss = torch.where(finite, loss, torch.inf)
+        # On a padded surface no iterate is judged.
+        better = (loss < state.best_loss) & (remaining == 0.0)
+        fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
+        count = index + 1
+        moved = adamax_step(state.pose, _clean(by_pose, finite), fade * config.pose_rate, count, config.memory)
+        x = moved.value
+        quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
+        pulled = state.forces
+        if config.relaxation:
+            pulled = adamax_step(pulled, _clean(by_force, finite), fade * config.force_rate, count, config.memory)
+            if config.desired == "cone":
+                pulled = replace(pulled, value=into_cone(pulled.value, found.normals.detach(), config.friction))
+        climbed = adamax_step(state.multipliers, _clean(broken, finite), -config.multiplier_rate, count)
+        return replace(
+            state,
+            pose=replace(moved, value=torch.cat([x[:, :3], quaternion, x[:, 7:]], -1)),
+            forces=pulled,
+            multipliers=climbed,
+            best=torch.where(better[:, None], state.pose.value, state.best),
+            best_loss=torch.where(better, loss, state.best_loss),
+            loss=loss,
+        )
+
+    def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
+        if self.config.keep == "last":
+            return unpack(state.pose.value), state.loss
+        judged = torch.isfinite(state.best_loss)
+        x = torch.where(judged[:, None], state.best, state.pose.value)
+        return unpack(x), torch.where(judged, state.best_loss, state.loss)
+
+    def cost(self, found: Evaluation) -> Float[Tensor, "batch"]:
+        """What is minimised: L_phys, or the motion itself without relaxation, with L_range and L_inter."""
+        config = self.config
+        goal = config.physics_weight * found.physics if config.relaxation else found.motion
+        return goal + config.range_weight * found.range + config.inter_weight * found.inter
+
+    def evaluate(
+        self,
+        problem: Problem,
+        pose: Float[Tensor, "batch variables"],
+        desired: Float[Tensor, "batch points simulations components"],
+        radius: Float[Tensor, "batch"],
+    ) -> Evaluation:
+        """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
+        config, body = self.config, self.body
+        poses = unpack(pose)
+        placed = place(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
+        distance, normals = sample_sdf(problem.sdf, placed.points)
+        arms = placed.points - body.center
+        velocities = self.velocities
+        supplied = contact_forces(
+            distance - radius[:, None],
+            normals,
+            velocities,
+            stiffness=config.stiffness,
+            friction_stiffness=config.friction_stiffness,
+            friction=config.friction,
+            leak=config.leak,
+        )
+        none = torch.zeros_like(radius)
+        if config.relaxation:
+            difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
+            # The pose answers to L_phys alone, as in the released code: L_task is a matter of the forces.
+            left = motion_left(body, desired, arms.detach(), velocities, self.time_step)
+            task, motion = _ALL_MOTION * left.mean(-1), none
+        else:
+            left = motion_left(body, supplied, arms, velocities, self.time_step)
+            difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
+        frames = (placed.link_rotations, placed.link_translations)
+        spheres = place_in_base(problem.sphere_matrix, *frames)
+        inter = losses.self_collision(spheres, problem.sphere_radii, problem.sphere_weight)
+        if problem.obstacles is not None:
+            gaps = obstacle_gaps(problem.obstacles, placed.rotation, poses.translation, *frames)
+            inter = inter + losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
+        beyond = (poses.joints - problem.upper).clamp_min(0.0) + (problem.lower - poses.joints).clamp_min(0.0)
+        return Evaluation(
+            difference,
+            task,
+            motion,
+            beyond.sum(-1),
+            losses.posture(poses.joints, problem.lower, problem.upper),
+            inter,
+            normals,
+        )
+
+
+def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
+    """A gradient that is zero for starts that are not finite."""
+    if finite.all():
+        return gradient
+    return torch.where(finite.view(-1, *[1] * (gradient.dim() - 1)), gradient, torch.zeros_like(gradient))
+
+
+def search_graspd2022(task: Task) -> Found:
+    """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
+    settings, thing = task.config.graspd2022, task.scene.object
+    problem = problem_of(task)
+    drawn = max(1, round(task.count * settings.starts_per_grasp))
+    if settings.starts == "published":
+        starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.standoff)
+    else:
+        starts = starts_of(task, drawn)
+    body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
+    solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
+    poses = solution.poses[torch.isfinite(solution.loss)]
+    inside = replace(poses, joints=poses.joints.clamp(problem.lower, problem.upper))
+    return Found(problem, inside, solution.interrupted)

@@ -1,0 +1,79 @@
+"""What every search for poses shares: its task, its result, the starts, and the problem that results are ranked in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from graspd_core.config import PlanConfig
+from graspd_core.hands.model import HandModel
+from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.methods.loop import Hooks, Poses
+from graspd_core.methods.problem import Problem, build_problem
+from graspd_core.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search ended with.
+
+    Attributes:
+        problem: scene and hand as tensors, in whose terms the poses are made into grasps.
+        poses: hand poses that the search believes in, at most a few times as many as asked for, in any order.
+        interrupted: why it ended early: "", "cancelled" or "deadline".
+    """
+
+    problem: Problem
+    poses: Poses
+    interrupted: str = ""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is searched for, and with what means.
+
+    Attributes:
+        scene, hand: what is to be grasped by what.
+        count: grasps asked for.
+        seed: of everything that is drawn.
+        config: settings of all methods.
+        hooks: how the run is followed and ended.
+        device, dtype: of the tensors.
+    """
+
+    scene: Scene
+    hand: HandModel
+    count: int
+    seed: int
+    config: PlanConfig
+    hooks: Hooks
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
+
+
+# How poses are found; one for every `config.Method`. Numerical trouble is a pose that is not there, never an exception.
+Search = Callable[[Task], Found]
+
+
+def problem_of(task: Task) -> Problem:
+    """The problem by the closed form's settings, in which every method's poses are made into grasps and ranked."""
+    settings = task.config.closed_form
+    return build_problem(
+        task.scene,
+        task.hand,
+        candidates=settings.candidates,
+        features=settings.features,
+        directions=settings.directions,
+        friction=min(settings.friction, task.scene.object.friction),
+        seed=task.seed,
+        device=task.device,
+        dtype=task.dtype,
+        trust_floor=settings.trust_floor,
+    )
+
+
+def starts_of(task: Task, count: int) -> Poses:
+    """`count` seeded starts on the object's hull."""
+    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype)

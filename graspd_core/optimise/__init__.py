@@ -1,1 +1,0 @@
-"""Optimisers: a scene and a hand in, candidate grasps out."""

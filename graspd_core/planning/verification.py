@@ -1,0 +1,148 @@
+"""The trials of a run: worlds built once, candidates tried in rank order, and those that held put in order."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+
+from graspd_core.config import RobustConfig
+from graspd_core.hands.model import HandModel
+from graspd_core.metrics.measure import measure
+from graspd_core.metrics.metrics_context import Judge, make_judge
+from graspd_core.planning.run_clock import Run
+from graspd_core.scene.scene import Scene, object_parts
+from graspd_core.trials.hold_trial import hold_trial, judge
+from graspd_core.trials.lift_trial import lift_trial
+from graspd_core.trials.noisy_trial import noisy_share, pose_errors
+from graspd_core.trials.world import PROTOCOLS, Protocol, World, at_friction, build_world
+from graspd_core.types import Grasp, Stage, TriangleMesh, Verdict
+
+Parts = Future[tuple[TriangleMesh, ...]]
+
+# How often stop and deadline are looked at while waiting for the collision parts [s].
+_POLL = 0.02
+
+# Objects are cut into convex parts one at a time.
+_CUTTING = threading.Lock()
+
+# Where verified grasps stand whose robustness nobody had the time to measure.
+_UNKNOWN = 0.5
+
+# Keeps the errors that grasps are ranked by apart from all others of the same seed.
+_NOISE = 0x6E6F697365
+
+
+@dataclass(frozen=True)
+class Court:
+    """What grasps are tried and measured with.
+
+    Attributes:
+        hand: that grasps.
+        protocol: physics of the trials.
+        alone: the object and the hand.
+        around: these, and what stands about them; None where nothing does.
+        judge: of the static metrics.
+    """
+
+    hand: HandModel
+    protocol: Protocol
+    alone: World
+    around: World | None
+    judge: Judge
+
+
+def parts_in_background(run: Run, scene: Scene) -> Parts:
+    """The object's convex parts, from a thread that only who asks for its result, and the process's end, waits for.
+
+    They take about as long as the optimiser does. One object is cut at a time, and none whose run is over before its
+    turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
+    """
+
+    def cut() -> tuple[TriangleMesh, ...]:
+        with _CUTTING:
+            return () if run.known_over() else object_parts(scene.object)
+
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
+    future = pool.submit(cut)
+    pool.shutdown(wait=False)
+    return future
+
+
+def open_court(run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str) -> Court | None:
+    """The worlds, as soon as the parts are there; None where the run ended first."""
+    while not run.over() and not wait([parts], timeout=_POLL).done:
+        pass
+    if run.over():
+        return None
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+    alone, around = build_world(hand, scene.object, parts.result(), protocol), None
+    if scene.support is not None or scene.neighbours:
+        around = build_world(hand, scene.object, parts.result(), protocol, scene.support, scene.neighbours)
+    return Court(hand, protocol, alone, around, make_judge(scene.object, hand))
+
+
+def try_in_order(
+    run: Run, court: Court, candidates: tuple[Grasp, ...], count: int, before: int
+) -> tuple[tuple[Grasp, ...], float | None]:
+    """Try candidates in rank order until `count` held; `before` did already.
+
+    Returns:
+        The grasps that were tried, verified ones first, and when the first of them had passed.
+    """
+    verified: list[Grasp] = []
+    failed: list[Grasp] = []
+    first = None
+    for index, grasp in enumerate(candidates):
+        if len(verified) == count or run.over():
+            break
+        hold = hold_trial(court.alone, grasp, court.protocol, stop=run.over)
+        lift = None
+        if court.around is not None and hold.passed:
+            lift = lift_trial(court.around, court.hand, grasp, court.protocol, stop=run.over)
+        passed = hold.passed and (lift is None or lift.passed)
+        if run.over() and not passed:
+            # A trial that was cut short says nothing of the grasp.
+            break
+        tried = judge(replace(grasp, metrics=measure(court.judge, grasp.grasp)), hold, lift)
+        if passed:
+            first = first or time.perf_counter()
+            verified.append(tried)
+        else:
+            failed.append(tried)
+        run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified))
+    return (*verified, *failed), first
+
+
+def by_robustness(
+    run: Run, court: Court, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
+) -> tuple[Grasp, ...]:
+    """The grasps with those first that still hold when the object is not quite where it was thought to be.
+
+    The share of noisy trials that a verified grasp held is written into its metrics. Where the run ends before all were
+    tried, those that were not stand between the good and the bad.
+    """
+    verified = [grasp for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
+    measured: list[Grasp] = []
+    # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
+    errors = pose_errors((_NOISE, seed), config.trials)
+    protocol = replace(court.protocol, hold_time=config.hold_time)
+    for index, grasp in enumerate(verified):
+        share = None if run.over() else noisy_share(court.alone, grasp, protocol, errors, stop=run.over)
+        if grasp.metrics is not None:
+            grasp = replace(grasp, metrics=replace(grasp.metrics, robustness=share))
+        measured.append(grasp)
+        run.report(Stage.VERIFY, index + 1, len(verified), 0.0, len(verified))
+    return (*most_robust_first(measured), *grasps[len(verified) :])
+
+
+def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
+    """Grasps by the share that they held out of place; where it is the same, or nobody measured it, in their order."""
+
+    def share(grasp: Grasp) -> float:
+        known = grasp.metrics.robustness if grasp.metrics else None
+        return _UNKNOWN if known is None else known
+
+    return sorted(verified, key=share, reverse=True)

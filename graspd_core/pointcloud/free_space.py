@@ -1,0 +1,176 @@
+"""What the cameras saw to be empty: the space before a seen surface, and beside the object's outline.
+
+Each view's own object points give a small depth image of it. A guessed point that falls before that surface, or beside
+the outline, contradicts the camera; one behind it is hidden, and may be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.se3 import perpendicular
+
+# Depth images of more cells than this across the object tell no more.
+MOST_CELLS = 160
+# Points, itself among them, that a point's spacing is taken from.
+SPACED = 5
+
+# Outlines and surfaces are seen to within the first [m]; a point the second deeper in empty space is impossible.
+SLACK, CONTRADICTION = 0.003, 0.01
+# A guessed point this near to a seen surface [m] confirms the guess.
+TOLERANCE = 0.004
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One camera's depth image of the object, in directions from the camera (a pinhole of focal length 1).
+
+    Attributes:
+        eye: where the camera stood [m].
+        frame: columns right, down and forward.
+        low: the first cell's direction; `cell`: the width of one.
+        depth: along forward [m], of the surface or, beside the outline, of the nearest cell of it.
+        nearest: the same, the smallest over the cell's neighbours.
+        beside: cells between this one and the outline, 0 within it.
+    """
+
+    eye: Float[np.ndarray, "3"]
+    frame: Float[np.ndarray, "3 3"]
+    low: Float[np.ndarray, "2"]
+    cell: float
+    depth: Float[np.ndarray, "x y"]
+    nearest: Float[np.ndarray, "x y"]
+    beside: Float[np.ndarray, "x y"]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that is known of where the object is not.
+
+    Attributes:
+        sights: one a camera; none where cameras are not known.
+        standing: the object stands on a support that fills z < 0.
+        lowest: height of the lowest points seen [m]: segmentation cuts the rest off with the support, so that outlines
+            end too high by up to this.
+    """
+
+    sights: tuple[Sight, ...]
+    standing: bool
+    lowest: float = 0.0
+
+
+def make_sights(views: Sequence[PointCloud]) -> tuple[Sight, ...]:
+    """The depth images that views' points make, of those that make any."""
+    return tuple(sight for view in views if (sight := _make_sight(view)) is not None)
+
+
+def _make_sight(view: PointCloud) -> Sight | None:
+    """The depth image that a view's points make; holes of a few cells are missing pixels, not the object's.
+
+    None where they make none: fewer than five before the camera, or all in one line of sight.
+    """
+    from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
+    from scipy.spatial import KDTree
+
+    frame = view_frame(view)
+    local = (view.points - view.viewpoint) @ frame
+    local = local[local[:, 2] > 1e-3]
+    if len(local) < SPACED:
+        return None
+    plane = local[:, :2] / local[:, 2:]
+    spacing = float(np.median(KDTree(plane).query(plane, k=SPACED)[0][:, -1]))
+    cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MOST_CELLS)
+    if cell < 1e-9:
+        return None
+    margin = 6
+    low = plane.min(0) - margin * cell
+    index = tuple(np.floor((plane - low) / cell).astype(int).T)
+    shape = tuple(int(i.max()) + margin + 1 for i in index)
+    total, count = np.zeros(shape), np.zeros(shape)
+    np.add.at(total, index, local[:, 2])
+    np.add.at(count, index, 1.0)
+    seen = count > 0
+    mask = np.asarray(binary_closing(seen, np.ones((3, 3)), iterations=2), dtype=bool)
+    _, at = distance_transform_edt(~seen, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    depth = (total / np.maximum(count, 1))[tuple(at)]
+    beside = np.asarray(distance_transform_edt(~mask))
+    return Sight(view.viewpoint, frame, low, cell, depth, minimum_filter(depth, 3), beside)
+
+
+def empty_depth(evidence: Evidence, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+    """How deep points lie in the support, or in space that a camera saw to be empty [m]; 0: nothing is against them."""
+    return _judge(evidence, points, None)[1]
+
+
+def weigh(
+    evidence: Evidence, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"]
+) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
+    confirmed, deep = _judge(evidence, points, normals)
+    return confirmed, np.clip((deep - SLACK) / CONTRADICTION, 0.0, 1.0)
+
+
+def on_seen(evidence: Evidence, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
+    """Whether points lie on, or a finger's breadth of noise off, a surface that was seen."""
+    found = np.zeros(points.shape[:-1], dtype=bool)
+    for sight in evidence.sights:
+        empty, behind = _look(sight, points)
+        found |= (empty < 1.5 * TOLERANCE) & (np.where(np.isfinite(behind), np.abs(behind), 0.0) < 1.5 * TOLERANCE)
+    return found
+
+
+def facing(
+    evidence: Evidence, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Cosine between normals and the way to the camera that they face most."""
+    most = np.full(len(points), -1.0)
+    for sight in evidence.sights:
+        way = sight.eye - points
+        most = np.maximum(most, (way * normals).sum(1) / np.linalg.norm(way, axis=1))
+    return most
+
+
+def _judge(
+    evidence: Evidence, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"] | None
+) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    confirmed = np.zeros(points.shape[:-1], dtype=bool)
+    deepest = np.zeros(points.shape[:-1])
+    for sight in evidence.sights:
+        empty, behind = _look(sight, points)
+        deepest = np.maximum(deepest, empty)
+        if normals is not None:
+            confirmed |= (np.abs(behind) < TOLERANCE) & (((sight.eye - points) * normals).sum(-1) > 0)
+    if evidence.standing:
+        height = points[..., 2]
+        deepest = np.maximum(deepest - np.clip(evidence.lowest - height, 0.0, evidence.lowest), -height)
+    return confirmed, np.maximum(deepest, 0.0)
+
+
+def _look(
+    sight: Sight, points: Float[np.ndarray, "*batch 3"]
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    """How deep points lie in empty space [m], and how far behind the seen surface (infinite beside the outline)."""
+    local = (points - sight.eye) @ sight.frame
+    forward = np.maximum(local[..., 2], 1e-6)
+    place = (local[..., :2] / forward[..., None] - sight.low) / sight.cell
+    inner = np.clip(place, 0, np.array(sight.depth.shape) - 1)
+    index = tuple(np.moveaxis(inner.astype(int), -1, 0))
+    # Beyond the image's edge, the way to the edge adds up.
+    beside = (sight.beside[index] + np.abs(place - inner).sum(-1)) * sight.cell * forward
+    before = np.maximum(sight.nearest[index] - local[..., 2], 0.0)
+    within = sight.beside[index] == 0
+    return np.where(within, before, beside), np.where(within, local[..., 2] - sight.depth[index], np.inf)
+
+
+def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:
+    """Columns: right, down and forward, towards the middle of the points; any, from there itself."""
+    forward = view.points.mean(0) - view.viewpoint
+    length = float(np.linalg.norm(forward))
+    forward = forward / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    right = perpendicular(forward)
+    return np.column_stack([right, np.cross(forward, right), forward])

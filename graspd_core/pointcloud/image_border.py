@@ -1,0 +1,51 @@
+"""Where a camera's picture ends: what reaches there may go on, and nobody saw that it does not."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from graspd_core.pointcloud.free_space import view_frame
+from graspd_core.pointcloud.point_cloud import PointCloud
+
+# Directions this near to the hull of all directions are on the border [rad]: two or three pixels.
+REACH = 0.004
+# So many points on one side of the hull, of the object and of other things each: an object that stands out alone
+# against nothing makes a hull of its own.
+FEWEST = 8
+# Shorter sides than this share of the outline's size are no border of a picture.
+LONG = 0.1
+# A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
+# of a thing to the corner of the table behind it has none between.
+PARTS, FILLED = 20, 0.6
+
+
+def reaches_border(
+    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"]
+) -> bool:
+    """Whether the points of an object lie on a side of the view's outline on which other points lie too."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if not mine.any():
+        return False
+    local = (points - eye) @ view_frame(PointCloud(points, eye))
+    ahead = local[:, 2] > 1e-3
+    plane, mine = local[ahead, :2] / local[ahead, 2:], mine[ahead]
+    try:
+        hull = ConvexHull(plane)
+    except (QhullError, ValueError):
+        return False
+    ends = plane[hull.simplices]
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > LONG * np.ptp(plane, axis=0).max()
+    for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
+        near = plane @ np.array(normal) + offset > -REACH
+        if min((near & mine).sum(), (near & ~mine).sum()) >= FEWEST and _filled(plane[near], start, end) >= FILLED:
+            return True
+    return False
+
+
+def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
+    """Share of a side's parts in which points lie."""
+    side = end - start
+    part = np.floor(PARTS * ((near - start) @ side) / (side @ side))
+    return len(np.unique(part[(part >= 0) & (part < PARTS)])) / PARTS

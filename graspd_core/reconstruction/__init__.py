@@ -1,0 +1,1 @@
+"""A closed mesh from what was seen of an object."""

@@ -1,0 +1,95 @@
+"""What joins an object to the support it stands on: walls beneath the outline seen from above, skirt and base."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.pointcloud.free_space import SLACK, Evidence, empty_depth, facing
+from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
+
+# A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
+OUTWARDS = 0.008
+# How level the surface must be there, and how much it must face a camera [cosines].
+LEVEL, FACING = 0.85, 0.3
+# Of the object's lowest points, the share that must be of walls for it to have a base; how steep [cosine] those are.
+WALLED, STEEP = 0.6, 0.25
+# The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
+LOW = 0.015
+# Share of the base's outline that walls must stand on.
+ENCLOSED = 0.6
+
+
+def extrude(seen: Surfels, evidence: Evidence, step: float) -> Surfels:
+    """Walls from the outline of what was seen from above, down to the support.
+
+    Only beneath outlines that are proven: outwards of them the cameras saw nothing; and only walls that they do not
+    contradict.
+    """
+    from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
+    from scipy.spatial import KDTree
+
+    margin = 6
+    low = seen.points[:, :2].min(0) - margin * step
+    index = tuple(np.floor((seen.points[:, :2] - low) / step).astype(int).T)
+    shape = tuple(int(i.max()) + margin + 1 for i in index)
+    top = np.full(shape, -np.inf)
+    np.maximum.at(top, index, seen.points[:, 2])
+    mask = np.asarray(binary_closing(np.isfinite(top), np.ones((3, 3)), iterations=3), dtype=bool)
+    _, at = distance_transform_edt(~np.isfinite(top), return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    top = np.where(mask, top[tuple(at)], -np.inf)
+    rim = mask & ~np.asarray(binary_erosion(mask), dtype=bool)
+    slope = np.stack([*np.gradient(gaussian_filter(mask.astype(float), 2.0))], -1)[rim]
+    outward = np.pad(-slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9), ((0, 0), (0, 1)))
+    height = maximum_filter(top, 3)[rim]
+    place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
+    _, nearest = KDTree(seen.points).query(place)
+    # A surface that turns away from the camera at the outline goes on behind it; one that is level there ends.
+    level = (seen.normals[nearest, 2] > LEVEL) & (facing(evidence, seen.points, seen.normals)[nearest] > FACING)
+    proven = (empty_depth(evidence, place + OUTWARDS * outward) > SLACK) & level
+    levels = np.arange(0.5 * step, max(float(height.max()), step), step)
+    row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
+    points = np.column_stack([place[row, :2], levels[level]])
+    wrong = empty_depth(evidence, points) > SLACK
+    bad = np.bincount(row, wrong, len(place)) > 0.15 * np.bincount(row, minlength=len(place))
+    return take(Surfels(points, outward[row]), ~bad[row])
+
+
+def stand(surfels: Surfels, evidence: Evidence, step: float) -> Surfels:
+    """What joins walls that end just above the support to it, and the base between them."""
+    lowest = float(np.percentile(surfels.points[:, 2], 1))
+    band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
+    wall = np.abs(band.normals[:, 2]) < STEEP
+    if lowest > LOW or wall.mean() < WALLED or wall.sum() < 10:
+        return nothing()
+    feet = take(band, wall)
+    # Down along the wall, for each metre of height.
+    down = feet.normals[:, 2:] * feet.normals - np.array([0.0, 0.0, 1.0])
+    down /= -down[:, 2:]
+    fall = np.arange(0.5 * step, lowest + 3 * step, step)
+    points = (feet.points[:, None] + down[:, None] * fall[:, None]).reshape(-1, 3)
+    skirt = Surfels(points, np.repeat(feet.normals, len(fall), 0))
+    skirt = thin(take(skirt, (points[:, 2] > 0) & (points[:, 2] < lowest)), step)
+    return join(skirt, _base((feet.points + down * feet.points[:, 2:])[:, :2], evidence, step))
+
+
+def _base(feet: Float[np.ndarray, "n 2"], evidence: Evidence, step: float) -> Surfels:
+    """The support within the feet's outline, facing down, where it is hidden."""
+    from scipy.spatial import ConvexHull, KDTree, QhullError
+
+    try:
+        hull = ConvexHull(feet)
+    except QhullError:
+        return nothing()
+    corners = feet[hull.vertices]
+    along = np.linspace(0, 1, 40, endpoint=False)[:, None, None]
+    rim = (corners + along * (np.roll(corners, -1, 0) - corners)).reshape(-1, 2)
+    length = np.tile(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1), 40)
+    if length[KDTree(feet).query(rim)[0] < 3 * step].sum() < ENCLOSED * length.sum():
+        return nothing()
+    axes = [np.arange(corners[:, k].min(), corners[:, k].max(), step) for k in (0, 1)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    within = grid[(grid @ hull.equations[:, :2].T + hull.equations[:, 2] < -0.5 * step).all(1)]
+    base = np.column_stack([within, np.zeros(len(within))])
+    base = base[empty_depth(evidence, base) < SLACK]
+    return Surfels(base, np.tile(np.array([0.0, 0.0, -1.0]), (len(base), 1)))

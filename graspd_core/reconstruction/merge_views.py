@@ -1,0 +1,136 @@
+"""Several views become one set of oriented points.
+
+Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours, and its
+normal turned to the camera that saw it. Both keep thin walls apart, which no orientation by neighbourhood does.
+
+Points and not truncated signed distances (Curless and Levoy 1996), because those wear thin walls and edges away: of 15
+rendered views, Open3D's on a grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of
+0.92, in 0.30 s instead of 0.53.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import CloudError
+from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
+from graspd_core.se3 import perpendicular
+
+# Points that a local plane is fitted to.
+NEIGHBOURS = 28
+# Points farther than this from their neighbours' plane [m], or seen flatter than this cosine, flew off an edge.
+STRAY, GRAZING = 0.006, 0.1
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """Points of a surface and its outward unit normals.
+
+    Attributes:
+        points: [m].
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+
+
+def join(*parts: Surfels) -> Surfels:
+    """All of them."""
+    return Surfels(np.concatenate([p.points for p in parts]), np.concatenate([p.normals for p in parts]))
+
+
+def take(surfels: Surfels, kept: np.ndarray) -> Surfels:
+    """Those that a mask or an index names."""
+    return Surfels(surfels.points[kept], surfels.normals[kept])
+
+
+def nothing() -> Surfels:
+    """No points."""
+    return Surfels(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def point_step(views: Sequence[PointCloud]) -> float:
+    """The spacing that all views together are thinned to [m]: an eightieth of the object's diagonal, 1 mm at least."""
+    points = np.concatenate([view.points for view in views])
+    low, high = np.percentile(points, [2, 98], axis=0)
+    return max(float(np.linalg.norm(high - low)) / 80, 1e-3)
+
+
+def merge_views(views: Sequence[PointCloud], step: float | None = None) -> Surfels:
+    """The oriented points of all views, strays dropped, noise smoothed, one per cube of side `step` and side of it.
+
+    Raises:
+        CloudError: fewer than 50 points are left.
+    """
+    step = point_step(views) if step is None else step
+    together = join(*(orient_view(view, step) for view in views))
+    if len(together.points) < FEWEST_POINTS:
+        raise CloudError(
+            f"cloud: only {len(together.points)} of its {sum(len(view.points) for view in views)} points lie on a "
+            f"surface; at least {FEWEST_POINTS} are needed: it is too sparse, or shows no surface"
+        )
+    return thin(together, step) if len(views) > 1 else together
+
+
+def orient_view(view: PointCloud, step: float) -> Surfels:
+    """One view's surface points, about `step` [m] apart, with normals towards its camera."""
+    from scipy.spatial import KDTree
+
+    points = _thin_by_sight(view, step)
+    if len(points) <= NEIGHBOURS:
+        return nothing()
+    distance, near = KDTree(points).query(points, k=NEIGHBOURS)
+    sight = points - view.viewpoint
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    centre, normals = points[near].mean(1), np.zeros_like(points)
+    weights = np.ones(near.shape)
+    # The second pass leaves out what lies across an edge from the first one's plane.
+    for _ in range(3):
+        total = weights.sum(1, keepdims=True)
+        centre = np.einsum("nk,nkd->nd", weights, points[near]) / total
+        spread = points[near] - centre[:, None]
+        _, axes = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weights, spread, spread))
+        normals = axes[:, :, 0]
+        off = np.einsum("nkd,nd->nk", spread, normals)
+        weights = np.exp(-np.square(off / (1.5 * step)) - np.square(distance / distance[:, -1:]))
+    normals *= -np.sign(np.einsum("nd,nd->n", normals, sight))[:, None]
+    slope = -np.einsum("nd,nd->n", normals, sight)
+    shift = np.einsum("nd,nd->n", points - centre, normals) / np.maximum(slope, 1e-3)
+    crowded = distance[:, -1] < 2.5 * np.median(distance[:, -1])
+    kept = (slope > GRAZING) & (np.abs(shift) < STRAY) & crowded
+    smooth = points + shift[:, None] * sight
+    return Surfels(smooth[kept], normals[kept])
+
+
+def thin(surfels: Surfels, step: float) -> Surfels:
+    """The mean of the points in each cube of side `step` [m] that face the same way, to the nearest of six."""
+    if len(surfels.points) == 0:
+        return surfels
+    facing = np.abs(surfels.normals).argmax(1)
+    side = 2 * facing + (np.take_along_axis(surfels.normals, facing[:, None], 1)[:, 0] > 0)
+    cells = np.column_stack([np.floor(surfels.points / step).astype(int), side])
+    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    which = which.reshape(-1)
+    mean = lambda x: np.column_stack([np.bincount(which, x[:, k]) for k in range(3)]) / count[:, None]  # noqa: E731
+    normals = mean(surfels.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    return Surfels(mean(surfels.points), normals)
+
+
+def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
+    """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
+    sight = view.points - view.viewpoint
+    distance = np.linalg.norm(sight, axis=1)
+    width = step / float(np.median(distance))
+    axis = sight.mean(0) / np.linalg.norm(sight.mean(0))
+    right = perpendicular(axis)
+    depth = np.maximum(sight @ axis, 1e-6)
+    cells = np.floor(np.column_stack([sight @ right, sight @ np.cross(axis, right)]) / depth[:, None] / width)
+    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    order = np.lexsort([distance, which.reshape(-1)])
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    return view.points[order[first + (count - 1) // 2]]

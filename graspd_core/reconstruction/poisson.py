@@ -1,0 +1,177 @@
+"""Oriented points to a closed surface: screened Poisson (Kazhdan and Hoppe 2013), cut back to what the cameras allow.
+
+Where points are missing Poisson's surface balloons or runs off. It is sampled on a grid, cut by the space that was seen
+to be empty and by the support, and surfaced again, which closes it whatever it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.errors import CloudError
+from graspd_core.mesh.surface_queries import closest_points, make_surface
+from graspd_core.pointcloud.free_space import SLACK, Evidence, empty_depth
+from graspd_core.reconstruction.merge_views import Surfels
+from graspd_core.types import TriangleMesh
+
+# Cells of the grid along the object's longest side, and the least width of one [m].
+CELLS, FINEST = 60, 0.0017
+# Cells that a wall is made thick, if it is thinner.
+THINNEST = 2.2
+# Poisson's own finest cells are wider than this [m]: twice the noise.
+COARSEST = 0.0022
+# Beyond so many cells from the Poisson surface a node's side is its region's.
+BAND = 2
+# Distances that are kept at a time.
+MOST_DISTANCES = 2_000_000
+
+
+def fit_poisson(surfels: Surfels) -> TriangleMesh:
+    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size."""
+    size = float(np.ptp(surfels.points, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(1.2 * size / COARSEST)), 5, 7))
+    vertices, faces = _fit(surfels.points, surfels.normals, depth)
+    if len(faces) == 0:
+        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
+    return TriangleMesh(vertices, faces)
+
+
+def _fit(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: int
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth, scale=1.2, n_threads=1)
+    return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
+
+
+def grid_cell(surfels: Surfels) -> float:
+    """Width of the cells that a surface through these points is closed on [m]."""
+    return max(float(np.ptp(surfels.points, axis=0).max()) / CELLS, FINEST)
+
+
+def part_walls(surfels: Surfels) -> Surfels:
+    """The two sides of walls too thin for the grid moved apart, for they would cancel; by a millimetre or two."""
+    from scipy.spatial import KDTree
+
+    points, normals = surfels.points, surfels.normals
+    thinnest = THINNEST * grid_cell(surfels)
+    # Nearest in place and in opposite normal: the other side of a wall.
+    tree = KDTree(np.hstack([points, thinnest * normals]))
+    _, other = tree.query(np.hstack([points, -thinnest * normals]))
+    offset = points - points[other]
+    thickness = (offset * normals).sum(1)
+    beside = np.linalg.norm(offset - thickness[:, None] * normals, axis=1)
+    opposite = (normals * normals[other]).sum(1) < -0.7
+    wall = opposite & (np.abs(thickness) < thinnest) & (beside < thinnest)
+    return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
+
+
+def close_surface(surface: TriangleMesh, surfels: Surfels, evidence: Evidence) -> TriangleMesh:
+    """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
+    from scipy.ndimage import gaussian_filter
+
+    low, high = surfels.points.min(0), surfels.points.max(0)
+    cell = grid_cell(surfels)
+    axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    value = _signed(surface, nodes, cell)
+    inner = value < BAND * cell
+    beyond = np.maximum(empty_depth(evidence, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell)) - SLACK
+    value[inner] = np.maximum(value[inner], beyond)
+    value = gaussian_filter(value, 0.5)
+    if evidence.standing:
+        value = np.maximum(value, -nodes[..., 2])
+    return march(_one_solid(value, cell), axes)
+
+
+def march(value: Float[np.ndarray, "x y z"], axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
+    """The zero surface of a field on a grid of cubes, outwards where it grows."""
+    import igl
+
+    cell = float(axes[0][1] - axes[0][0])
+    # Kept off zero at the nodes, where the surface would pinch to nothing.
+    value = np.where(np.abs(value) < 0.02 * cell, np.where(value < 0, -0.02, 0.02) * cell, value)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    # igl counts the first coordinate fastest.
+    columns = nodes.transpose(2, 1, 0, 3).reshape(-1, 3)
+    marching: Any = igl.marching_cubes
+    vertices, faces = marching(value.ravel(order="F"), columns, *value.shape, 0.0)[:2]
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:
+        faces = faces[:, ::-1]
+    return TriangleMesh(np.asarray(vertices), np.asarray(faces, dtype=np.int64))
+
+
+def _signed(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Float[np.ndarray, "x y z"]:
+    """Signed distance at the nodes near the surface, and a signed `BAND` of cells elsewhere.
+
+    The surface has no border within the grid, so it parts it into regions; those away from it take the side that most
+    of their nodes next to the surface are on, by the nearest face's normal.
+    """
+    from scipy.ndimage import label
+
+    near = _touched(surface, nodes, cell)
+    closest, normals = closest_points(make_surface(surface), nodes[near])
+    offset = nodes[near] - closest
+    side = np.where((offset * normals).sum(1) < 0, -1.0, 1.0)
+    value = np.full(near.shape, BAND * cell)
+    value[near] = np.linalg.norm(offset, axis=1)
+    signs = np.zeros(near.shape)
+    signs[near] = side
+    labelled: Any = label(value > 0.9 * cell)
+    region, count = labelled
+    votes = np.bincount(region.ravel(), signs.ravel(), count + 1)
+    return value * np.where(region > 0, np.where(votes[region] < 0, -1.0, 1.0), signs)
+
+
+def _touched(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Bool[np.ndarray, "x y z"]:
+    """Nodes within some two cells of the surface, whose faces are smaller than a cell or two."""
+    from scipy.ndimage import binary_dilation
+
+    points = np.concatenate([surface.vertices, surface.vertices[surface.faces].mean(1)])
+    index = np.round((points - nodes[0, 0, 0]) / cell).astype(int)
+    index = index[((index >= 0) & (index < nodes.shape[:3])).all(1)]
+    touched = np.zeros(nodes.shape[:3], dtype=bool)
+    touched[tuple(index.T)] = True
+    return np.asarray(binary_dilation(touched, np.ones((3, 3, 3)), iterations=BAND), dtype=bool)
+
+
+def _outside_hull(
+    points: Float[np.ndarray, "n 3"], nodes: Float[np.ndarray, "m 3"], cell: float
+) -> Float[np.ndarray, "m"]:
+    """How far nodes lie outside the convex hull of points [m], in which any surface through them may close."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
+    except QhullError:
+        return np.zeros(len(nodes))
+    # In parts: all nodes by all facets would take half a gigabyte.
+    parts = np.array_split(nodes, 1 + len(nodes) * len(hull.equations) // MOST_DISTANCES)
+    beyond = [(part @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1) for part in parts]
+    return np.maximum(np.concatenate(beyond), 0.0)
+
+
+def _one_solid(value: Float[np.ndarray, "x y z"], cell: float) -> Float[np.ndarray, "x y z"]:
+    """The largest part alone, without bubbles, free of the grid's border."""
+    from scipy.ndimage import label
+
+    border = np.ones(value.shape, dtype=bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    value = np.where(border, np.maximum(value, 0.5 * cell), value)
+    labelled: Any = label(value < 0)
+    part, count = labelled
+    if count == 0:
+        raise CloudError("cloud: its points enclose nothing; more views are needed")
+    size = np.bincount(part.ravel())
+    value = np.where((part > 0) & (part != 1 + size[1:].argmax()), 0.5 * cell, value)
+    bubbles: Any = label(value >= 0)
+    return np.where((value >= 0) & (bubbles[0] != bubbles[0][0, 0, 0]), -0.5 * cell, value)

@@ -1,0 +1,185 @@
+"""From one or more views of an object to a closed mesh, saying how it was made and how far each part was seen.
+
+What was seen is surfaced by screened Poisson with normals towards each view's camera; what was not is completed first,
+by the symmetry, revolution or extrusion that the evidence favours; what the cameras saw to be empty is cut away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import CloudError, MeshError
+from graspd_core.mesh.mesh_files import check_mesh, simplify
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
+from graspd_core.mesh.topology import is_closed
+from graspd_core.pointcloud.free_space import Evidence, make_sights
+from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
+from graspd_core.reconstruction.extrusion import LOW, stand
+from graspd_core.reconstruction.merge_views import NEIGHBOURS, Surfels, join, merge_views, point_step
+from graspd_core.reconstruction.poisson import close_surface, fit_poisson, part_walls
+from graspd_core.reconstruction.shape_completion import OPEN, complete
+from graspd_core.reconstruction.unposed_cloud import is_all_round, orient_all_round
+from graspd_core.se3 import perpendicular
+from graspd_core.types import Plane, TriangleMesh
+
+# Seen surface is trusted fully to the first distance from a seen point [m], guessed surface not at all past the second.
+TRUSTED, GUESSED = 0.004, 0.02
+# Faces of the result at most.
+MOST_FACES = 16_000
+# Share of the seen points that must lie within this [m] of the result.
+FITTED, FIT = 0.85, 0.004
+# Points of all views together that are looked at.
+MOST_POINTS = 160_000
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A closed surface and how it came about.
+
+    Attributes:
+        mesh: closed, in the frame of the views [m].
+        trust: of each vertex, 1 where the surface was seen, falling to 0 at 2 cm from it.
+        method: "poisson", and what completed it, e.g. "poisson, revolution".
+        warnings: what was guessed, one sentence each.
+    """
+
+    mesh: TriangleMesh
+    trust: Float[np.ndarray, "vertices"]
+    method: str
+    warnings: tuple[str, ...]
+
+
+def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) -> Reconstruction:
+    """The closed surface of the object that the views show.
+
+    Args:
+        views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
+            cloud that shows it from all round may stand for many views.
+        support: what the object stands on, in the same frame.
+
+    Raises:
+        CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
+    """
+    views = _clean(views)
+    rotation, origin = _frame(views, support)
+    local = [PointCloud((v.points - origin) @ rotation, (v.viewpoint - origin) @ rotation) for v in views]
+    step = point_step(local)
+    standing = support is not None
+    method, warnings = "poisson", ()
+    if len(local) == 1 and is_all_round(local[0]):
+        seen, evidence = orient_all_round(local[0], step), Evidence((), standing)
+        known = seen
+    else:
+        seen = merge_views(local, step)
+        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
+        evidence = Evidence(make_sights(local), standing, lowest)
+        guess = complete(seen, evidence, step)
+        known = join(seen, guess.surfels)
+        known = join(known, stand(known, evidence, step)) if standing else known
+        method += f", {guess.method}" if guess.method else ""
+        if guess.method or guess.openness > OPEN:
+            warnings = (_sentence(len(views), guess.method),)
+    known = part_walls(known)
+    mesh = _finished(close_surface(fit_poisson(known), known, evidence), seen)
+    trust = _trust(mesh, np.concatenate([view.points for view in local]))
+    return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), trust, method, warnings)
+
+
+def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
+    """Finite points, near where most are, of the views that have enough of them for a surface."""
+    from scipy.spatial import KDTree
+
+    if len(views) == 0:
+        raise CloudError("cloud: no view at all; at least one is needed")
+    for view in views:
+        if not np.isfinite(view.viewpoint).all():
+            raise CloudError("cloud: the place of a view's camera (viewpoint) is not finite")
+    most = MOST_POINTS // len(views)
+    kept = [_some(view, most) for view in views]
+    clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
+    tree = KDTree(clean.points)
+    near = 3 * float(np.median(tree.query(clean.points, k=2)[0][:, 1]))
+    result = []
+    for points, view in zip(kept, views, strict=True):
+        points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
+        # Among a thousand: one place sent often is no surface, and its sight would call all else empty.
+        if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > NEIGHBOURS:
+            result.append(PointCloud(points, view.viewpoint.astype(float)))
+    if not result:
+        raise CloudError(f"cloud: none of its {len(views)} views shows more than {NEIGHBOURS} points of the object")
+    return result
+
+
+def _some(view: PointCloud, most: int) -> Float[np.ndarray, "n 3"]:
+    """A view's measured points, some `most` of them at most; where none is, all, for the message that says so."""
+    points = view.points[:: 1 + len(view.points) // most].astype(float)
+    good = measured(points, view.viewpoint)
+    return points[good] if good.any() else points
+
+
+def _frame(
+    views: Sequence[PointCloud], support: Plane | None
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
+    points = np.concatenate([view.points for view in views])
+    centre = points.mean(0)
+    view = views[0].viewpoint - centre
+    if support is None:
+        up = view if np.linalg.norm(view) > 1e-6 else np.eye(3)[2]
+        view = np.linalg.svd(points[:: 1 + len(points) // 2000] - centre, full_matrices=False)[2][0]
+    else:
+        up = np.asarray(support.normal, dtype=float)
+        centre = centre - (centre @ up - support.offset) * up
+    up = up / np.linalg.norm(up)
+    level = view - (view @ up) * up
+    if np.linalg.norm(level) < 1e-3 * np.linalg.norm(view):
+        level = perpendicular(up)
+    level = level / np.linalg.norm(level)
+    return np.column_stack([level, np.cross(up, level), up]), centre
+
+
+def _finished(mesh: TriangleMesh, seen: Surfels) -> TriangleMesh:
+    """Few faces, closed, and through the points that were seen."""
+    try:
+        mesh = _fewer(check_mesh(mesh, "reconstruction")[0])
+    except MeshError as error:
+        raise CloudError(f"cloud: no usable surface fits its {len(seen.points)} points ({error})") from None
+    fitted = float((surface_distance(make_surface(mesh), seen.points) < FIT).mean())
+    if not is_closed(mesh) or fitted < FITTED:
+        raise CloudError(
+            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed"
+        )
+    return mesh
+
+
+def _fewer(mesh: TriangleMesh) -> TriangleMesh:
+    """At most `MOST_FACES`; the slower of two simplifiers where the quicker one tears the surface."""
+    import open3d as o3d
+
+    quick, _ = check_mesh(simplify(mesh, MOST_FACES), "reconstruction")
+    if is_closed(quick):
+        return quick
+    whole = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    ).simplify_quadric_decimation(MOST_FACES)
+    slow = TriangleMesh(np.asarray(whole.vertices), np.asarray(whole.triangles, dtype=np.int64))
+    slow, _ = check_mesh(slow, "reconstruction")
+    return slow if is_closed(slow) else mesh
+
+
+def _trust(mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "vertices"]:
+    """1 near seen points, less the farther from them."""
+    from scipy.spatial import KDTree
+
+    distance, _ = KDTree(seen).query(mesh.vertices)
+    return np.clip((GUESSED - distance) / (GUESSED - TRUSTED), 0.0, 1.0)
+
+
+def _sentence(views: int, method: str) -> str:
+    seen = "one side only" if views == 1 else f"{views} sides, not all round"
+    by = method or "closing the surface smoothly within the cameras' outlines"
+    return f"cloud: seen from {seen}; the rest is guessed by {by}"

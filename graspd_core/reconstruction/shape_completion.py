@@ -1,0 +1,109 @@
+"""The unseen side of an object, guessed by whichever rule the evidence favours.
+
+Guesses: a body of revolution, one or two mirror planes, a centre of symmetry; beside each, the outline seen from above
+extruded to the support. A guessed point that lies in seen empty space, in the support, or where the surface itself was
+seen is dropped; a rule is used only where the cameras confirm much of it and contradict next to nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graspd_core.pointcloud.free_space import SLACK, Evidence, empty_depth
+from graspd_core.reconstruction.extrusion import extrude, stand
+from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
+from graspd_core.reconstruction.revolution import find_revolution
+from graspd_core.reconstruction.symmetry import find_centre, find_mirrors, image
+
+# A body of revolution accounts for this share of what was seen (the rest is a handle), less so much of its faults.
+WHOLE, FAULTS = 0.8, 5.0
+# Symmetries that are worth less than this, or contradicted by more, are chance.
+WORTH, DOUBTED = 0.5, 0.02
+# Two rules' guesses keep this far from each other [m].
+APART = 0.008
+# A surface that is open by no more than this share needs no further guess.
+OPEN = 0.12
+
+
+@dataclass(frozen=True)
+class Completion:
+    """Guessed surface.
+
+    Attributes:
+        method: the rule, e.g. "mirror and extrusion"; empty where none applied.
+        surfels: without what contradicts or repeats what was seen.
+        openness: share of the surface that was missing before.
+    """
+
+    method: str
+    surfels: Surfels
+    openness: float
+
+
+def complete(seen: Surfels, evidence: Evidence, step: float) -> Completion:
+    """The guess that the evidence favours: of rules that explain what was seen, the one that says most."""
+    from scipy.spatial import KDTree
+
+    known = join(seen, stand(seen, evidence, step)) if evidence.standing else seen
+    missing = openness(known, step)
+    turned = find_revolution(seen, evidence, step)
+    if turned is not None and turned.share - FAULTS * turned.wrong > WHOLE:
+        guess = plausible(turned.surfels, seen, evidence, step)
+        # What a handle hides of itself, and the like, is left to Poisson.
+        return Completion("revolution" if _counts(guess, seen) else "", guess, missing)
+    methods, guess = [], nothing()
+    if missing < OPEN:
+        return Completion("", guess, missing)
+    if evidence.standing:
+        guess = plausible(extrude(seen, evidence, step), seen, evidence, step)
+        methods = ["extrusion"] if _counts(guess, seen) else []
+    known = join(seen, guess)
+    if openness(join(known, stand(known, evidence, step)) if evidence.standing else known, step) > OPEN:
+        name, raw = _symmetric(seen, evidence)
+        images = plausible(raw, known, evidence, step)
+        if len(guess.points):
+            # Where both speak, walls beneath seen outlines are the surer.
+            apart = KDTree(guess.points).query(images.points)[0] > APART
+            images = take(images, apart)
+        methods += [name] if _counts(images, seen) else []
+        guess = join(guess, images)
+    return Completion(" and ".join(methods), guess, missing)
+
+
+def openness(surfels: Surfels, step: float) -> float:
+    """How much of a surface is missing: the normals of a closed one, evenly sampled, add up to nothing."""
+    return float(np.linalg.norm(thin(surfels, 2 * step).normals.mean(0)))
+
+
+def _counts(guess: Surfels, seen: Surfels) -> bool:
+    return len(guess.points) > 0.03 * len(seen.points)
+
+
+def plausible(guess: Surfels, known: Surfels, evidence: Evidence, step: float) -> Surfels:
+    """The guess, thinned, less what the cameras speak against and what lies where the surface is known."""
+    from scipy.spatial import KDTree
+
+    guess = take(guess, empty_depth(evidence, guess.points) < SLACK)
+    distance, nearest = KDTree(known.points).query(guess.points)
+    alike = (guess.normals * known.normals[nearest]).sum(1) > 0
+    return thin(take(guess, distance > np.where(alike, 2.5, 1.2) * step), step)
+
+
+def _symmetric(seen: Surfels, evidence: Evidence) -> tuple[str, Surfels]:
+    mirrors, centre = find_mirrors(seen, evidence), find_centre(seen, evidence)
+    value = {"mirror": 0.0, "point symmetry": 0.0}
+    if mirrors and mirrors[0].wrong < DOUBTED:
+        value["mirror"] = mirrors[0].worth
+    if centre.wrong < DOUBTED:
+        value["point symmetry"] = centre.worth
+    best = max(value, key=lambda name: value[name])
+    if value[best] < WORTH:
+        return "", nothing()
+    if best == "point symmetry":
+        return best, image(centre, seen)
+    images = [image(m, seen) for m in mirrors]
+    if len(mirrors) == 2:
+        images.append(image(mirrors[1], images[0]))
+    return best, join(*images)

@@ -1,0 +1,1 @@
+"""Pictures and depth images of meshes, and authored tabletop scenes whose truth is known."""

@@ -1,0 +1,130 @@
+"""Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
+
+A process that serves calls `work_elsewhere` once; from then on what goes through `elsewhere` is done in a child. All
+others, the command line among them, do it themselves.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import threading
+import traceback
+from collections.abc import Callable
+from multiprocessing import get_context, resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+from graspd_core.runtime.heap import give_memory_back, share_arenas
+
+T = TypeVar("T")
+
+
+class OwnProcess:
+    """Calls functions in a child process, which starts at once and ends with this one, however that ends.
+
+    Calls come one at a time. A child that has died is replaced. Functions must be importable by their names;
+    arguments, results and errors are pickled.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._start()
+
+    def __call__(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
+        """What the work gives or raises; MemoryError where two children died over it, as when memory is short."""
+        # pickle's own way with tensors, by value: that of multiprocessing shares memory that outlives nobody's death.
+        call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
+        with self._lock:
+            for _ in range(2):
+                if not self._process.is_alive():
+                    self._start()
+                try:
+                    self._pipe.send_bytes(call)
+                    told = self._pipe.recv_bytes()
+                    break
+                except (EOFError, OSError):
+                    self._process.join()
+                except BaseException:
+                    # Ctrl-C while waiting: the answer, left in the pipe, would be taken for the next call's.
+                    self._process.kill()
+                    self._process.join()
+                    raise
+            else:
+                # Not called here instead: what killed them would kill this process.
+                raise MemoryError(f"{work.__name__}: the process that it is done in died twice")
+        failed, answer = pickle.loads(told)
+        if failed:
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """End the child."""
+        self._pipe.close()
+        self._process.join()
+
+    def _start(self) -> None:
+        # spawn: a fork would copy locks that other threads hold. Only the child's end of the pipe goes to the child, so
+        # that it reads an end of file when this process dies.
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True, name="graspd_own_process")
+        # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
+        # blocked, since it needs a second for its imports before it could ignore it.
+        resource_tracker.ensure_running()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()
+
+
+_child: OwnProcess | None = None
+
+
+def work_elsewhere() -> None:
+    """From now on do what goes through `elsewhere` in a child process, so that threads beside do not stand still."""
+    global _child
+    _child = _child or OwnProcess()
+
+
+def elsewhere(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
+    """What the work gives or raises; done in the child where there is one, else here."""
+    return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
+
+
+def _serve(pipe: Connection) -> None:
+    # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    share_arenas()
+    while True:
+        try:
+            call = pipe.recv_bytes()
+        except (EOFError, OSError):
+            return
+        answer = _answer(call)
+        del call
+        try:
+            pipe.send_bytes(answer)
+        except OSError:
+            return
+        del answer
+        give_memory_back()
+
+
+def _answer(call: bytes) -> bytes:
+    """Whether the work failed, and what it gave or raised."""
+    try:
+        work, arguments, named = pickle.loads(call)
+        return pickle.dumps((False, work(*arguments, **named)), pickle.HIGHEST_PROTOCOL)
+    except Exception as error:
+        # A traceback stays behind, a note goes along.
+        error.add_note("".join(traceback.format_exception(error)))
+        try:
+            answer = pickle.dumps((True, error))
+            pickle.loads(answer)
+        except Exception:  # an error that cannot travel
+            answer = pickle.dumps((True, RuntimeError(f"{type(error).__name__}: {error}")))
+        return answer

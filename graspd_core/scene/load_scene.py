@@ -1,0 +1,76 @@
+"""A scene from whatever names an object: a mesh file, a cloud file, an authored shape, or a mesh."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from graspd_core.errors import MeshError
+from graspd_core.mesh.mesh_files import MESH_ENDINGS, load_mesh
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.surface_queries import load_library
+from graspd_core.pointcloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.scene.scene import Scene, build_scene, refuse_numbers
+from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.segmentation.target_selection import Target
+from graspd_core.types import TriangleMesh
+
+SHAPE_PREFIX = "shape:"
+
+
+def load_scene(
+    source: str | Path | TriangleMesh,
+    *,
+    mass: float | None = 0.1,
+    friction: float = 0.6,
+    scale: float = 1.0,
+    resolution: int = 48,
+    device: torch.device | str = "cpu",
+    target: Target | None = None,
+    alone: bool = False,
+) -> Scene:
+    """Build the scene of one object.
+
+    Args:
+        source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
+        mass: [kg]; None takes 300 kg/m³ times the volume.
+        friction: Coulomb coefficient between hand and object.
+        scale: factor on the file's coordinates to make them metres.
+        resolution: the distance grid has at most the cube of it in nodes.
+        target: which of the things in a cloud is meant.
+        alone: a cloud shows the object and nothing else.
+
+    Raises:
+        MeshError: the mesh cannot be read or used, or a number is out of range.
+        CloudError: the cloud cannot be read or shows no object.
+    """
+    started = time.perf_counter()
+    given = "mesh" if isinstance(source, TriangleMesh) else str(source)
+    numbers = {"mass": mass, "friction": friction, "resolution": resolution}
+    refuse_numbers(given, scale=scale, **numbers)
+    if not isinstance(source, TriangleMesh) and is_cloud_file(source):
+        views = [
+            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
+        ]
+        scene = scene_from_views(views, target=target, alone=alone, source=given, device=device, **numbers)
+        return replace(scene, object=replace(scene.object, scale=scale))
+    mesh = _read_mesh(source, scale)
+    # A distance grid that is remembered needs no Open3D, but the plan does.
+    load_library()
+    return build_scene(mesh, source=given, scale=scale, device=device, started=started, **numbers)
+
+
+def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> TriangleMesh:
+    if isinstance(source, TriangleMesh):
+        return TriangleMesh(source.vertices * scale, source.faces)
+    name = str(source)
+    if name.startswith(SHAPE_PREFIX):
+        shape = make_shape(name.removeprefix(SHAPE_PREFIX))
+        return TriangleMesh(shape.vertices * scale, shape.faces)
+    endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
+    if Path(source).is_file() and Path(source).suffix.lower().lstrip(".") not in endings:
+        raise MeshError(f"{name}: unknown ending {Path(source).suffix!r}; valid endings: {', '.join(endings)}")
+    return load_mesh(source, scale=scale)

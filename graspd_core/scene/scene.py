@@ -1,0 +1,198 @@
+"""The frozen scene: the object's mesh, its mass and its signed distance, and what stands around it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.errors import MeshError
+from graspd_core.mesh.convex_parts import convex_parts
+from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
+from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
+from graspd_core.runtime import disk_cache as cache
+from graspd_core.runtime.worker_process import elsewhere
+from graspd_core.scene.confidence import trust_grid
+from graspd_core.types import Plane, TriangleMesh
+
+# Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.
+MOST_FACES = 25_000
+
+# Mean density of household things [kg/m³], for callers that know no mass: between wood-like solids and hollow ware.
+DENSITY = 300.0
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """The thing to grasp, in its own frame (that of its mesh as loaded, after scaling).
+
+    Attributes:
+        source: where it came from, for messages.
+        sha256: hash of the cleaned mesh's content.
+        mesh: the cleaned surface [m].
+        volume: enclosed volume [m³].
+        mass: [kg].
+        center_of_mass: [m].
+        inertia: about the centre of mass, mesh axes [kg·m²].
+        friction: Coulomb coefficient against the hand.
+        scale: factor that the file's coordinates were multiplied by.
+        radius: distance from the centre of mass to the farthest vertex [m].
+        warnings: what was found wrong with the input, one sentence each.
+    """
+
+    source: str
+    sha256: str
+    mesh: TriangleMesh
+    volume: float
+    mass: float
+    center_of_mass: Float[np.ndarray, "3"]
+    inertia: Float[np.ndarray, "3 3"]
+    friction: float
+    scale: float
+    radius: float
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """A thing that the hand must not touch.
+
+    Attributes:
+        mesh: its closed surface, in the object's frame [m].
+        sdf: its signed distance.
+    """
+
+    mesh: TriangleMesh
+    sdf: GridSDF
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a grasp is planned against; all in the object's frame.
+
+    Attributes:
+        object: the thing to grasp.
+        sdf: its signed distance.
+        timing: seconds taken by loading and by the distance field.
+        support: what the object stands on, if anything; gravity points against its normal.
+        neighbours: other things, only those that the hand could reach.
+        trust: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it is known.
+    """
+
+    object: ObjectModel
+    sdf: GridSDF
+    timing: tuple[float, float]
+    support: Plane | None = None
+    neighbours: tuple[Neighbour, ...] = ()
+    trust: Float[torch.Tensor, "x y z"] | None = None
+
+
+def build_scene(
+    mesh: TriangleMesh,
+    *,
+    source: str = "mesh",
+    mass: float | None = 0.1,
+    friction: float = 0.6,
+    scale: float = 1.0,
+    resolution: int = 48,
+    device: torch.device | str = "cpu",
+    warnings: tuple[str, ...] = (),
+    started: float | None = None,
+    support: Plane | None = None,
+    neighbours: tuple[Neighbour, ...] = (),
+    trust: Float[np.ndarray, "vertices"] | None = None,
+) -> Scene:
+    """The scene of a mesh already in metres; `scale` is what its file was multiplied by, for the record and for advice.
+
+    Args:
+        support: what the object stands on.
+        neighbours: other things near it.
+        trust: how far each of the mesh's vertices was seen, 1, or guessed, 0; None: all of it is known.
+
+    Raises:
+        MeshError: see `load_scene`; or there is not one trust for every vertex.
+    """
+    if trust is not None and len(trust) != len(mesh.vertices):
+        raise MeshError(f"{source}: {len(trust)} values of trust for {len(mesh.vertices)} vertices; valid: one each")
+    started = time.perf_counter() if started is None else started
+    refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
+    clean, found = check_mesh(mesh, source, MOST_FACES, scale=scale, dusty=trust is None)
+    model = _object_model(clean, source, mass, friction, scale, warnings + found)
+    loaded = time.perf_counter()
+    sdf = object_sdf(model, resolution)
+    if not is_solid(sdf):
+        cell = float(sdf.spacing) * 1000
+        note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; it counts as a sheet"
+        model = ObjectModel(**{**vars(model), "warnings": (*model.warnings, note)})
+    sdf = sdf.to(device, sdf.field.dtype)
+    known = None if trust is None else trust_grid(mesh.vertices, trust, sdf)
+    timing = (loaded - started, time.perf_counter() - loaded)
+    return Scene(model, sdf, timing, support, neighbours, known)
+
+
+def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
+    """The object's signed distance (float32, CPU) on at most `resolution`³ nodes, remembered by content."""
+
+    def build() -> cache.Arrays:
+        sdf = build_sdf(model.mesh, resolution=resolution)
+        return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
+
+    def valid(arrays: cache.Arrays) -> bool:
+        shapes = {
+            "field": (4, *grid_layout(model.mesh, resolution).counts),
+            "origin": (3,),
+            "spacing": (),
+            "half": (3,),
+        }
+        return {name: array.shape for name, array in arrays.items()} == shapes
+
+    arrays = cache.remember(f"sdf-{model.sha256}-{resolution}", build, valid)
+    return GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()})
+
+
+def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
+    """Convex parts that together fill the object and leave its hollows hollow, remembered by content."""
+
+    def build() -> cache.Arrays:
+        # A second or two of Python's own work, beside the optimiser.
+        parts = elsewhere(convex_parts, model.mesh)
+        return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
+
+    def valid(arrays: cache.Arrays) -> bool:
+        names = {f"{kind}{i}" for i in range(len(arrays) // 2) for kind in ("vertices", "faces")}
+        return bool(names) and set(arrays) == names and all(a.shape[1:] == (3,) for a in arrays.values())
+
+    arrays = cache.remember(f"parts-{model.sha256}", build, valid)
+    return tuple(TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
+
+
+def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:
+    volume, center, unit_inertia = mass_properties(mesh)
+    mass = DENSITY * volume if mass is None else mass
+    return ObjectModel(
+        source=source,
+        sha256=content_hash(mesh),
+        mesh=mesh,
+        volume=volume,
+        mass=float(mass),
+        center_of_mass=center,
+        inertia=unit_inertia * (mass / volume),
+        friction=float(friction),
+        scale=float(scale),
+        radius=float(np.linalg.norm(mesh.vertices - center, axis=1).max()),
+        warnings=warnings,
+    )
+
+
+def refuse_numbers(source: str, *, mass: float | None, friction: float, resolution: int, scale: float = 1.0) -> None:
+    if not (np.isfinite(scale) and scale > 0):
+        raise MeshError(f"{source}: scale {scale!r} must be a positive number")
+    if mass is not None and not (np.isfinite(mass) and mass > 0):
+        raise MeshError(f"{source}: mass {mass!r} kg must be a positive number")
+    if not (np.isfinite(friction) and friction > 0):
+        raise MeshError(f"{source}: friction {friction!r} must be a positive number")
+    if not 8 <= resolution <= 256:
+        raise MeshError(f"{source}: resolution {resolution!r} must be between 8 and 256 nodes")

@@ -1,0 +1,64 @@
+"""From what depth cameras saw to a scene: the object cut out and made whole, and what stands in the hand's way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import torch
+
+from graspd_core.config import SegmentConfig
+from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.reconstruction.reconstruct import reconstruct
+from graspd_core.scene.obstacles import make_neighbours
+from graspd_core.scene.scene import Scene, build_scene, refuse_numbers
+from graspd_core.segmentation.segment import Segmentation, segment
+from graspd_core.segmentation.target_selection import Target
+
+
+def scene_from_views(
+    views: Sequence[PointCloud],
+    *,
+    target: Target | None = None,
+    alone: bool = False,
+    settings: SegmentConfig | None = None,
+    mass: float | None = 0.1,
+    friction: float = 0.6,
+    source: str = "cloud",
+    resolution: int = 48,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """The scene that one or several views show, in their common frame; what was guessed is in the object's warnings.
+
+    Args:
+        views: what each camera saw [m]; points may be NaN.
+        target: which of the things seen is meant; without it, the one nearest the first view's axis.
+        alone: the views show the object and nothing else, so that all they show is taken.
+        settings: of the segmentation.
+        mass: [kg]; None takes 300 kg/m³ times the volume.
+        friction: Coulomb coefficient between hand and object.
+        source: name of the views, for messages.
+        resolution: the distance grid has at most the cube of it in nodes.
+
+    Raises:
+        CloudError: the views show no usable object; NoObjectError where what was asked for is not in them.
+        MeshError: the object they show is too small or too large, or a number is out of range.
+    """
+    started = time.perf_counter()
+    refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
+    settings = settings or SegmentConfig()
+    seen = Segmentation(tuple(views), None, (), ()) if alone else segment(views, target=target, settings=settings)
+    whole = reconstruct(seen.views, support=seen.support)
+    return build_scene(
+        whole.mesh,
+        source=source,
+        mass=mass,
+        friction=friction,
+        resolution=resolution,
+        device=device,
+        warnings=seen.warnings + whole.warnings,
+        started=started,
+        support=seen.support,
+        neighbours=make_neighbours(seen.neighbours, seen.support, whole.mesh, settings.neighbour_reach),
+        trust=whole.trust,
+    )

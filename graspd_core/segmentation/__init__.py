@@ -1,0 +1,1 @@
+"""One object cut out of a scene: planes, clusters, the support plane, the target."""

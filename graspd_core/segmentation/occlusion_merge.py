@@ -1,0 +1,130 @@
+"""Pieces of one thing that occlusion set apart: the far wall of a cup behind the near one, a rim over its bottom.
+
+Two pieces are one thing only if they touch in some camera's image, for the edge between them is then an occlusion, and
+if they are near enough, or one stands within the other's outline on the support.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from graspd_core.segmentation.clusters import extent, renumber
+from graspd_core.segmentation.planes import FlatPart
+
+# Beyond so many pieces the rest is noise.
+MOST_PIECES = 40
+# What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
+FLOATING, COVERED = 0.5, 0.5
+# A hanging piece, a cup's far wall or its handle, belongs to what is this near [m].
+HANGING = 0.03
+# Without a support nothing tells one thing behind another from one thing's two sides: this near, they are one [m].
+UNSUPPORTED = 0.15
+# Outlines this many link lengths apart touch in an image: pixels at edges are lost.
+IMAGE_GAP = 1.5
+# Share of a piece that lies within another's outline.
+WITHIN = 0.6
+
+
+def join_pieces(
+    points: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    label: Int[np.ndarray, "n"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    *,
+    link: float,
+    largest: float,
+    support: FlatPart | None,
+) -> Int[np.ndarray, "n"]:
+    """The clusters with such pieces joined, numbered from the largest; -1: a stray.
+
+    Args:
+        points: evenly dense [m].
+        distance: of each from its camera [m].
+        label: their clusters, numbered from the largest; -1: a stray.
+        viewpoints: where the cameras stood [m].
+        link: distance at which points were linked [m].
+        largest: pieces that would be longer than this together are not one thing [m].
+        support: what the things stand on; pieces that end well above it hang on others.
+    """
+    many = min(int(label.max(initial=-1)) + 1, MOST_PIECES)
+    pieces = [points[label == k] for k in range(many)]
+    small = [k for k in range(many) if extent(pieces[k]) <= largest]
+    hangs = [
+        support is not None and _hangs(pieces[k], distance[label == k], support, viewpoints, link) for k in range(many)
+    ]
+    owner = list(range(many))
+    for a, b in combinations(small, 2):
+        group = [pieces[k] for k in small if owner[k] in (owner[a], owner[b])]
+        if owner[a] == owner[b] or extent(np.vstack(group)) > largest:
+            continue
+        reach = UNSUPPORTED if support is None else HANGING if hangs[a] or hangs[b] else link
+        one = _apart(pieces[a], pieces[b]) <= reach
+        one = one or (support is not None and _share_within(pieces[b], pieces[a], support) >= WITHIN)
+        if one and any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP * link) for eye in viewpoints):
+            root, leaf = sorted((owner[a], owner[b]))
+            owner = [root if k == leaf else k for k in owner]
+    joined = label.copy()
+    known = (label >= 0) & (label < many)
+    joined[known] = np.asarray(owner, dtype=int)[label[known]]
+    return renumber(joined)
+
+
+def _hangs(
+    piece: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    support: FlatPart,
+    viewpoints: Float[np.ndarray, "views 3"],
+    link: float,
+) -> bool:
+    """Whether a piece ends above the support and does not itself hide, from all cameras, what it might stand on."""
+    height = support.height(piece)
+    if (height - support.tolerance(distance)).min() <= FLOATING * link:
+        return False
+    below = piece - height[:, None] * support.plane.normal
+    for eye in viewpoints:
+        (seen, near), (foot, far) = _directions(piece, eye), _directions(below, eye)
+        apart, which = _tree(seen).query(foot)
+        if np.mean((apart * near[which] <= link) & (near[which] < far)) >= COVERED:
+            return False
+    return True
+
+
+def _touch_in_image(
+    a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"], eye: Float[np.ndarray, "3"], gap: float
+) -> bool:
+    """Whether a camera there sees less than `gap` between them, at the distance of the nearer one [m]."""
+    (one, near), (other, far) = _directions(a, eye), _directions(b, eye)
+    return _apart(one, other) <= gap / min(float(np.median(near)), float(np.median(far)))
+
+
+def _directions(
+    points: Float[np.ndarray, "n 3"], eye: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Unit vectors from a camera to points, and how far they are [m]."""
+    away = np.linalg.norm(points - eye, axis=1).clip(1e-6)
+    return (points - eye) / away[:, None], away
+
+
+def _apart(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"]) -> float:
+    """Least distance between two sets of points."""
+    return float(_tree(a).query(b)[0].min())
+
+
+def _tree(points: Float[np.ndarray, "n 3"]):
+    from scipy.spatial import KDTree
+
+    return KDTree(points)
+
+
+def _share_within(small: Float[np.ndarray, "n 3"], large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:
+    """Share of a piece that is inside the other's convex outline on the support."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        edges = ConvexHull(large @ support.axes).equations
+    except (QhullError, ValueError):
+        return 0.0
+    return float(((small @ support.axes) @ edges[:, :2].T + edges[:, 2] <= 0).all(1).mean())

@@ -1,0 +1,220 @@
+"""An object cut out of what depth cameras saw: crop, thin, support, clusters, choice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.config import SegmentConfig
+from graspd_core.errors import CloudError, NoObjectError
+from graspd_core.pointcloud.image_border import reaches_border
+from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
+from graspd_core.pointcloud.voxel_downsample import ThinScene, thin_scene
+from graspd_core.segmentation.clusters import extent, link_length, link_points, renumber
+from graspd_core.segmentation.occlusion_merge import join_pieces
+from graspd_core.segmentation.planes import find_planes
+from graspd_core.segmentation.support_plane import Ground, find_ground, stands_on, voxels_of
+from graspd_core.segmentation.target_selection import Target, check_target, choose, seen
+from graspd_core.types import Plane
+
+# Scenes nearer than this to their cameras are in another unit than metres [m].
+CLOSEST = 0.02
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """An object and what is around it, in the frame of the clouds.
+
+    Attributes:
+        views: the object's points as each camera saw them, at full density; views that do not show it are left out.
+        support: what it stands on; None where none was seen.
+        neighbours: the points of each other thing near it, thinned [m].
+        warnings: what was doubtful.
+    """
+
+    views: tuple[PointCloud, ...]
+    support: Plane | None
+    neighbours: tuple[Float[np.ndarray, "_ 3"], ...]
+    warnings: tuple[str, ...]
+
+
+def segment(
+    views: Sequence[PointCloud], *, target: Target | None = None, settings: SegmentConfig | None = None
+) -> Segmentation:
+    """Find the object in one or several views of a scene, or take a cloud of an object alone as it is.
+
+    Args:
+        views: what each camera saw, in one frame; points may be NaN.
+        target: what tells the object from other things; without it, the thing nearest the first view's axis is taken
+            (towards the middle of its points where the axis is not known).
+        settings: sizes and tolerances.
+
+    Raises:
+        CloudError: empty, all NaN, too few points, or a target that cannot be meant.
+        NoObjectError: the scene is seen, and what was asked for is not in it.
+    """
+    settings, target = settings or SegmentConfig(), target or Target()
+    scene = thin_scene(views, settings)
+    check_target(target, views)
+    eyes = np.array([view.viewpoint for view in views], dtype=float)
+    parts = find_planes(
+        scene.mean, scene.mean_distance, eyes, least=settings.plane_tolerance, smallest=settings.support_size
+    )
+    ground = find_ground(scene, parts, eyes, settings)
+    label = _things(scene, ground, eyes, settings)
+    free = _candidates(scene, label, ground, settings)
+    marked = target.box is not None or target.mask is not None
+    if not free and not (marked and label.max(initial=-1) >= 0):
+        raise NoObjectError(_nothing(scene, label, ground, settings))
+    chosen = choose(scene, label, free, target, views, reach=settings.target_reach)
+    found = _cut_out(views, scene, chosen, ground)
+    total = sum(len(view.points) for view in found)
+    if total < FEWEST_POINTS:
+        raise CloudError(f"cloud: only {total} points show the object; at least {FEWEST_POINTS} are needed")
+    support = None if ground.support is None else ground.support.plane
+    neighbours = _neighbours(scene, label, chosen, ground, settings)
+    return Segmentation(found, support, neighbours, _doubts(scene, eyes, chosen, ground, bool(neighbours), settings))
+
+
+def _things(
+    scene: ThinScene, ground: Ground, eyes: Float[np.ndarray, "views 3"], settings: SegmentConfig
+) -> Int[np.ndarray, "voxels"]:
+    """The thing that each voxel is part of, numbered from the largest; -1: background or noise."""
+    points = scene.mean[ground.left]
+    link = link_length(points, settings.gap)
+    label = link_points(points, scene.weight[ground.left], link)
+    label = join_pieces(
+        points,
+        scene.mean_distance[ground.left],
+        label,
+        eyes,
+        link=link,
+        largest=settings.largest_object,
+        support=ground.support,
+    )
+    label = voxels_of(label, ground.left)
+    many = int(label.max(initial=-1)) + 1
+    for k in range(many):
+        rows = np.flatnonzero(label == k)
+        if scene.count[rows].sum() < settings.min_points or _tiny(scene, rows, ground, settings):
+            label[rows] = -1
+    return renumber(label)
+
+
+def _tiny(scene: ThinScene, rows: Int[np.ndarray, "rows"], ground: Ground, settings: SegmentConfig) -> bool:
+    """Whether a cluster is no larger than noise: a speck, or a bump of the support."""
+    points = scene.mean[rows]
+    if extent(points) < settings.smallest_object:
+        return True
+    return ground.support is not None and float(ground.support.height(points).max()) < settings.smallest_object
+
+
+def _candidates(
+    scene: ThinScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentConfig
+) -> list[int]:
+    """Things of a size to be grasped: those that stand on the support, else all."""
+    things = range(int(label.max(initial=-1)) + 1)
+    fits = [k for k in things if extent(scene.mean[label == k]) <= settings.largest_object]
+    if ground.support is None:
+        return fits
+    part, distance = ground.support, scene.mean_distance
+    standing = [k for k in fits if stands_on(part, scene.mean[label == k], distance[label == k], settings)]
+    return standing or fits
+
+
+def _cut_out(
+    views: Sequence[PointCloud], scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], ground: Ground
+) -> tuple[PointCloud, ...]:
+    """The object's points of every view that shows it."""
+    wanted = chosen[scene.voxel]
+    if ground.support is not None:
+        rows = np.flatnonzero(wanted)
+        height = ground.support.height(scene.points[rows])
+        wanted[rows] = height > ground.support.tolerance(scene.distance[rows])
+    found = []
+    for k, view in enumerate(views):
+        part = scene.of_view(k)
+        if wanted[part].any():
+            found.append(PointCloud(scene.points[part][wanted[part]], view.viewpoint, view.forward))
+    return tuple(found)
+
+
+def _neighbours(
+    scene: ThinScene,
+    label: Int[np.ndarray, "voxels"],
+    chosen: Bool[np.ndarray, "voxels"],
+    ground: Ground,
+    settings: SegmentConfig,
+) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    """Other things and large flat parts, as far as they are within reach of the object's bounding box."""
+    mine = scene.mean[chosen]
+    low, high = mine.min(0) - settings.neighbour_reach, mine.max(0) + settings.neighbour_reach
+    near = ((scene.mean >= low) & (scene.mean <= high)).all(1) & ~chosen
+    masks = [near & (label == k) for k in range(int(label.max()) + 1)]
+    masks += [near & part.inliers & (label < 0) for part in ground.background]
+    return tuple(scene.mean[mask] for mask in masks if mask.any())
+
+
+def _doubts(
+    scene: ThinScene,
+    eyes: Float[np.ndarray, "views 3"],
+    chosen: Bool[np.ndarray, "voxels"],
+    ground: Ground,
+    crowded: bool,
+    settings: SegmentConfig,
+) -> tuple[str, ...]:
+    """What the user should know of how the object was found."""
+    doubts = []
+    if scene.size > 0.5 * settings.gap:
+        doubts.append(
+            f"cloud: {len(scene.points)} points thinned by {1e3 * scene.size:.1f} mm; finer gaps are not seen"
+        )
+    blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
+    if blind:
+        doubts.append(f"cloud: of {len(scene.rows)} views these show nothing near enough: {', '.join(blind)}")
+    if ground.support is None and crowded:
+        doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken as part")
+    # A thing alone makes the outline itself.
+    surrounded = ground.support is not None or len(ground.background) > 0
+    for k in range(len(scene.rows) if surrounded else 0):
+        part = scene.of_view(k)
+        if reaches_border(scene.points[part], eyes[k], chosen[scene.voxel[part]]):
+            doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
+    if _cut_off(scene, chosen, settings):
+        doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
+    return tuple(doubts)
+
+
+def _cut_off(scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], settings: SegmentConfig) -> bool:
+    mine = scene.mean[chosen]
+    cut = bool((scene.mean_distance[chosen] > settings.max_range - 2 * scene.size).any())
+    if settings.roi_low is not None:
+        cut |= bool((mine < np.asarray(settings.roi_low, dtype=float) + scene.size).any())
+    if settings.roi_high is not None:
+        cut |= bool((mine > np.asarray(settings.roi_high, dtype=float) - scene.size).any())
+    return cut
+
+
+def _nothing(scene: ThinScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentConfig) -> str:
+    """What was seen instead of an object."""
+    if label.max(initial=-1) >= 0:
+        sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
+        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        each = f"{sizes[0]:.2f} m long:" if len(sizes) == 1 else f"the shortest {min(sizes):.2f} m long: each is"
+        limit = f"larger than largest_object={settings.largest_object:g} m"
+        return f"{told}, {each} {limit}; a box or a mask as target says what part is meant"
+    flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
+    if not flat:
+        near = float(np.median(scene.mean_distance))
+        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
+        return told + unit if near < CLOSEST else told
+    part = flat[0]
+    away = float(np.median(scene.mean_distance[part.inliers]))
+    return (
+        f"cloud: no object among {len(scene.points)} points: a plane of {part.sides[0]:.2f} by {part.sides[1]:.2f} m "
+        f"at {away:.2f} m from the camera, and nothing on it that is higher than {1e3 * part.least:.0f} mm"
+    )

@@ -1,0 +1,1 @@
+"""Physics trials in MuJoCo. They share no code with the methods."""

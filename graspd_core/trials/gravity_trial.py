@@ -1,0 +1,62 @@
+"""The drop trial: how far gravity moves an object in a hand that squeezes it, after 2 s in MuJoCo.
+
+Stands beside the papers' displacement (`displacement`), which knows neither motors nor effort limits: its hand is
+frozen, and 0.15 s are over before a slow slip shows. Same hand, object and physics as the hold trial.
+"""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from graspd_core.trials.hold_trial import DIRECTIONS, close_hand, diverged
+from graspd_core.trials.world import Protocol, World
+from graspd_core.types import Grasp
+
+GRAVITY, DURATION = 9.8, 2.0
+# A trial along one direction ends here, and what never was in the hand counts as this too [m].
+LOST = 0.1
+_CHECK_EVERY = 25
+
+
+def drop_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False) -> float:
+    """Displacement [m] of the object's centre of mass from the start of the trial, mean over six gravity directions.
+
+    The hand closes and squeezes as in the hold trial; then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
+    At most 10 cm: an object that moved so far is lost, and one that the hold trial would refuse is lost from the start.
+    Directions that `stop` cut short count with what they came to.
+    """
+    import mujoco
+
+    data = mujoco.MjData(world.model)
+    if close_hand(world, data, grasp, protocol, np.zeros(2)):
+        return LOST
+    held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+    mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+    weight = GRAVITY * float(world.model.body_mass[world.object_body])
+    moved = np.empty(len(DIRECTIONS))
+    for index, direction in enumerate(DIRECTIONS):
+        mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+        data.xfrc_applied[world.object_body, :3] = weight * direction
+        moved[index] = _fall(world, data, protocol, stop)
+    return float(moved.mean())
+
+
+def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool]) -> float:
+    """Simulate 2 s, or until the object is lost; returns its displacement then [m]."""
+    import mujoco
+
+    moved = 0.0
+    for _ in range(round(DURATION / protocol.timestep / _CHECK_EVERY)):
+        if stop():
+            break
+        mujoco.mj_step(world.model, data, _CHECK_EVERY)
+        moved = float(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))
+        if diverged(data) or not moved < LOST:
+            return LOST
+    return moved

@@ -1,0 +1,168 @@
+"""The hold trial: close on a free object, pull it along ±x, ±y, ±z in turn, and see whether it stays.
+
+After DexGraspBench's floating protocol, re-implemented from its parameters. Travel and turn of the object are measured
+from its pose at the start of the trial, so that what the closing fingers do to it counts too.
+"""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from graspd_core.trials.world import Protocol, World
+from graspd_core.types import Grasp, HoldResult, LiftResult, Posture, Verdict
+
+DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
+_CHECK_EVERY = 25
+
+
+def hold_trial(
+    world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
+) -> HoldResult:
+    """Run one hold trial of `protocol`; ends at the first breach.
+
+    Returns:
+        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions.
+        A simulation that diverges is a failure with that reason.
+    """
+    import mujoco
+
+    data = mujoco.MjData(world.model)
+    worst = np.zeros(2)
+    reason = close_hand(world, data, grasp, protocol, worst)
+    if reason:
+        return _result(worst, reason)
+    held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+    mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+    mass = float(world.model.body_mass[world.object_body])
+    for direction in DIRECTIONS:
+        mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+        data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
+        for _ in range(round(protocol.hold_time / protocol.timestep / _CHECK_EVERY)):
+            if stop():
+                return _result(worst, "stopped before the trial ended")
+            mujoco.mj_step(world.model, data, _CHECK_EVERY)
+            reason = breach(world, data, protocol, worst)
+            if reason:
+                return _result(worst, f"{reason} under a pull along {axis_name(direction)}")
+    return _result(worst, "")
+
+
+def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst: np.ndarray) -> str:
+    """From the pregrasp over the grasp to the squeeze; returns why the trial is over, empty if it is not.
+
+    `worst` travel [m] and turn [rad] of the object are brought up to date.
+    """
+    import mujoco
+
+    place_hand(world, data, grasp.pregrasp)
+    mujoco.mj_forward(world.model, data)
+    depth = start_penetration(world, data)
+    if depth > protocol.max_start_penetration:
+        return f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm"
+    for stage, (start, end) in {
+        "closing": (grasp.pregrasp, grasp.grasp),
+        "squeezing": (grasp.grasp, grasp.squeeze),
+    }.items():
+        reason = _move(world, data, start, end, protocol, worst)
+        if reason:
+            return f"{reason} while {stage}"
+    return ""
+
+
+def _result(worst: np.ndarray, reason: str) -> HoldResult:
+    return HoldResult(not reason, float(worst[0]), float(worst[1]), reason)
+
+
+def judge(grasp: Grasp, hold: HoldResult, lift: LiftResult | None = None) -> Grasp:
+    """The grasp with its verdict written down: verified when it passed every trial that was run."""
+    failed = [trial.reason for trial in (hold, lift) if trial is not None and not trial.passed]
+    verdict = Verdict.FAILED if failed else Verdict.VERIFIED
+    return replace(grasp, hold=hold, lift=lift, verdict=verdict, reason=failed[0] if failed else "")
+
+
+def start_penetration(world: World, data: Any) -> float:
+    """Deepest overlap of hand and object in the current state [m]."""
+    bodies = world.model.geom_bodyid
+    contact = data.contact
+    on_object = (bodies[contact.geom1] == world.object_body) != (bodies[contact.geom2] == world.object_body)
+    return float(-min(contact.dist[on_object], default=0.0)) if data.ncon else 0.0
+
+
+def axis_name(direction: np.ndarray) -> str:
+    return f"{'-' if direction.min() < 0 else '+'}{'xyz'[int(np.abs(direction).argmax())]}"
+
+
+def place_hand(world: World, data: Any, posture: Posture) -> None:
+    """Put base, joints and targets where a posture says; `mj_forward` is the caller's."""
+    set_joints(world, data, posture.joint_positions)
+    data.mocap_pos[0] = posture.position
+    data.mocap_quat[0] = posture.quaternion_wxyz
+    data.ctrl[:] = posture.joint_positions
+
+
+def set_joints(world: World, data: Any, values: np.ndarray) -> None:
+    """Put the actuated joints at `values` [rad] or [m], and those coupled to them where they belong."""
+    data.qpos[world.joint_addresses] = values
+    for address, mimic in zip(world.coupled_addresses, world.mimics, strict=True):
+        data.qpos[address] = mimic.multiplier * values[mimic.joint] + mimic.offset
+
+
+def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
+    """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
+    import mujoco
+
+    steps = round(protocol.stage_time / protocol.timestep)
+    for step in range(1, steps + 1):
+        set_targets(data, start, end, step / steps)
+        mujoco.mj_step(world.model, data)
+        if step % _CHECK_EVERY == 0:
+            reason = breach(world, data, protocol, worst)
+            if reason:
+                return reason
+    return ""
+
+
+def set_targets(data: Any, start: Posture, end: Posture, a: float) -> None:
+    """Base pose and joint targets at a share `a` of the straight way from start to end."""
+    # The shorter way round for the base: wxyz and its negative are the same rotation.
+    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
+    quaternion = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
+    data.mocap_pos[0] = (1 - a) * start.position + a * end.position
+    data.mocap_quat[0] = quaternion / np.linalg.norm(quaternion)
+    data.ctrl[:] = (1 - a) * start.joint_positions + a * end.joint_positions
+
+
+def diverged(data: Any) -> bool:
+    """Whether MuJoCo met a bad state. Its other warnings, such as a full contact buffer, leave the state sound."""
+    import mujoco
+
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    return any(data.warning[int(warning)].number for warning in bad)
+
+
+def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
+    """Update the worst travel and turn; name the limit that is broken, if any."""
+    pose = data.qpos[world.object_address : world.object_address + 7]
+    if diverged(data) or not np.isfinite(pose).all():
+        worst[:] = np.inf
+        return "the simulation diverged"
+    travel = float(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))
+    turn = 2.0 * float(np.arctan2(np.linalg.norm(pose[4:]), abs(pose[3])))
+    worst[:] = np.maximum(worst, [travel, turn])
+    return broken_limit(protocol, travel, turn)
+
+
+def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
+    """Which limit a travel [m] and a turn [rad] break, as a sentence; empty for none."""
+    if travel > protocol.max_displacement:
+        return f"the object moved {travel * 100:.1f} cm"
+    if turn > protocol.max_rotation:
+        return f"the object turned {np.rad2deg(turn):.0f}°"
+    return ""

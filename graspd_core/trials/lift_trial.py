@@ -1,0 +1,153 @@
+"""The lift trial: come from a retreat, close on an object that stands on its support, lift it, and hold it.
+
+Two questions, in this order. Do the commanded postures, from the retreat over the pregrasp to the grasp, reach into the
+support or a neighbour? That is geometry, asked of MuJoCo's distances, because a base that follows its commands passes
+through fixed things. Then, in the simulation under gravity: does the object rise with the hand and stay with it?
+
+The lift is seen from the hand: the base stands still, everything else sinks, and the object feels the acceleration as
+weight. MuJoCo gives bodies that follow commands no velocity, so a base that really rose would not carry by friction.
+"""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.hands.model import HandModel
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.trials.hold_trial import breach, place_hand, set_joints, set_targets
+from graspd_core.trials.world import Protocol, World
+from graspd_core.types import Grasp, LiftResult, Posture
+
+_CHECK_EVERY = 25
+_COMING, _CLOSING, _LIFTING = "while the hand came", "while closing", "while lifting"
+# Shares of each way at which the hand's commanded postures are held against the obstacles.
+_SHARES = (0.0, 0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True)
+class LiftSettings:
+    """What happens in a lift trial, beside the physics and limits of `world.Protocol`.
+
+    Attributes:
+        retreat: how far back along the hand's approach the trial begins [m].
+        approach_time: from the retreat to the pregrasp [s].
+        lift_height: [m].
+        lift_time: [s].
+        hold_time: [s].
+        max_reach_through: deepest that a commanded posture may lie in the support or a neighbour [m].
+    """
+
+    retreat: float = 0.1
+    approach_time: float = 0.4
+    lift_height: float = 0.2
+    lift_time: float = 1.0
+    hold_time: float = 3.0
+    max_reach_through: float = 0.002
+
+
+def retreat_posture(hand: HandModel, pregrasp: Posture, distance: float = LiftSettings.retreat) -> Posture:
+    """The pregrasp moved straight back against the hand's approach direction by `distance` [m]."""
+    rotation = rotation_from_quaternion(torch.as_tensor(pregrasp.quaternion_wxyz, dtype=torch.float64)).numpy()
+    return replace(pregrasp, position=pregrasp.position - distance * rotation @ hand.approach)
+
+
+def lift_trial(
+    world: World,
+    hand: HandModel,
+    grasp: Grasp,
+    protocol: Protocol,
+    *,
+    settings: LiftSettings = LiftSettings(),
+    stop: Callable[[], bool] = lambda: False,
+) -> LiftResult:
+    """Run one lift trial in a world built with a support or neighbours; ends at the first breach.
+
+    While the hand comes and closes, and until it first touches the object, that rests as it was seen, because a
+    reconstructed bottom may not stand. From then on it is free.
+
+    The object has to stay within the protocol's limits (5 cm, 15°) of where it stood, as carried along by the lift, at
+    all times. Without a support there is no gravity, and the hand takes the object back the way it came.
+    """
+    import mujoco
+
+    data = mujoco.MjData(world.model)
+    begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
+    through, reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
+    if reason:
+        return LiftResult(False, 0.0, 0.0, through, reason)
+    away = (begin.position - grasp.pregrasp.position) / settings.retreat
+    stages = (
+        (_COMING, begin, grasp.pregrasp, settings.approach_time),
+        (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
+        ("while squeezing", grasp.grasp, grasp.squeeze, protocol.stage_time),
+        (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
+        ("while held up", grasp.squeeze, grasp.squeeze, settings.hold_time),
+    )
+    place_hand(world, data, begin)
+    worst, touched = np.zeros(2), False
+    for name, start, end, duration in stages:
+        steps = round(duration / protocol.timestep)
+        for step in range(1, steps + 1):
+            set_targets(data, start, end, step / steps)
+            if name == _LIFTING:
+                _sink(world, data, away if world.up is None else world.up, step / steps, settings)
+            mujoco.mj_step(world.model, data)
+            if not touched and name in (_COMING, _CLOSING):
+                touched = _touches(world, data)
+                _rest(world, data)
+            if step % _CHECK_EVERY == 0 or step == steps:
+                reason = breach(world, data, protocol, worst)
+                if reason or stop():
+                    said = f"{reason} {name}" if reason else "stopped before the trial ended"
+                    return LiftResult(False, float(worst[0]), float(worst[1]), through, said)
+    return LiftResult(True, float(worst[0]), float(worst[1]), through)
+
+
+def _touches(world: World, data: Any) -> bool:
+    """Whether hand and object are in contact."""
+    bodies = world.model.geom_bodyid
+    first, second = data.contact.geom1, data.contact.geom2
+    hand = np.isin(first, world.hand_geoms) | np.isin(second, world.hand_geoms)
+    return bool((hand & ((bodies[first] == world.object_body) | (bodies[second] == world.object_body))).any())
+
+
+def _rest(world: World, data: Any) -> None:
+    """Put the object back to where it was seen."""
+    data.qpos[world.object_address : world.object_address + 7] = [0, 0, 0, 1, 0, 0, 0]
+    data.qvel[world.object_velocity : world.object_velocity + 6] = 0
+
+
+def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, settings: LiftSettings) -> None:
+    """Everything but hand and object at a share `a` of the lift, which starts and ends at rest."""
+    data.mocap_pos[1:] = -settings.lift_height * a * a * (3 - 2 * a) * up
+    acceleration = settings.lift_height * (6 - 12 * a) / settings.lift_time**2 if a < 1 else 0.0
+    data.xfrc_applied[world.object_body, :3] = -acceleration * world.model.body_mass[world.object_body] * up
+
+
+def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> tuple[float, str]:
+    """Greatest depth [m] of the hand in any obstacle along the straight ways between postures; why that is too much."""
+    import mujoco
+
+    worst, reason = 0.0, ""
+    names = ("while coming", "while closing")
+    for (start, end), name in zip(pairwise(postures), names, strict=True):
+        for a in (*_SHARES, 1.0):
+            set_targets(data, start, end, a)
+            set_joints(world, data, data.ctrl)
+            mujoco.mj_kinematics(world.model, data)
+            for geom, said in world.obstacles:
+                depth = max(-mujoco.mj_geomDistance(world.model, data, geom, g, 0.0, None) for g in world.hand_geoms)
+                if depth > worst:
+                    worst = depth
+                    reason = f"the hand reaches {depth * 1e3:.1f} mm into {said} {name}" if depth > limit else ""
+    return worst, reason

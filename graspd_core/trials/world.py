@@ -1,0 +1,267 @@
+"""The judge's world: a hand of primitives on a position-controlled base, and a free object of convex parts.
+
+With a support there are gravity and a table, with neighbours there are these; without, neither costs anything. They are
+mocap bodies after the hand's own, so that a trial can lower them all away from the hand.
+
+Contact and solver settings follow the floating protocol of DexGraspBench (Chen et al., BODex, ICRA 2025), from its
+published parameters. Nothing here is differentiable and nothing is shared with the optimiser.
+"""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.hands.model import HandModel, Mimic
+from graspd_core.scene.scene import Neighbour, ObjectModel
+from graspd_core.se3 import quaternion_from_rotation
+from graspd_core.trials.bodies import (
+    OBJECT,
+    TABLE,
+    add_neighbour,
+    add_object,
+    add_primitive,
+    add_support,
+    full_inertia,
+)
+from graspd_core.types import Plane, TriangleMesh
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Physics of a trial. Defaults are the `standard` hold trial.
+
+    Attributes:
+        friction: sliding, torsional and rolling coefficients.
+        noslip_iterations: iterations of MuJoCo's slip suppression.
+        impratio: frictional-to-normal impedance.
+        timestep: [s].
+        stiffness: position gain of every revolute joint [N·m/rad].
+        damping: of every revolute joint [N·m·s/rad].
+        slide_stiffness: of every prismatic joint [N/m]: what `stiffness` comes to at the end of a 5 cm link.
+        slide_damping: of every prismatic joint, likewise [N·s/m].
+        armature: rotor inertia of every joint [kg·m²] or [kg].
+        stage_time: duration of pregrasp → grasp and of grasp → squeeze [s].
+        hold_time: duration of each of the six pulls [s].
+        pull: force per object mass [N/kg].
+        max_displacement: allowed travel of the object's centre of mass [m].
+        max_rotation: allowed turn of the object [rad].
+        max_start_penetration: deeper starts are refused [m].
+    """
+
+    friction: tuple[float, float, float] = (0.6, 0.02, 1e-4)
+    noslip_iterations: int = 2
+    impratio: float = 10.0
+    timestep: float = 0.004
+    stiffness: float = 5.0
+    damping: float = 0.1
+    slide_stiffness: float = 2000.0
+    slide_damping: float = 40.0
+    armature: float = 1e-4
+    stage_time: float = 0.4
+    hold_time: float = 2.0
+    pull: float = 10.0
+    max_displacement: float = 0.05
+    max_rotation: float = float(np.deg2rad(15.0))
+    max_start_penetration: float = 0.01
+
+
+PROTOCOLS: dict[str, Protocol] = {
+    "standard": Protocol(),
+    "hard": Protocol(friction=(0.3, 0.002, 1e-4), noslip_iterations=0, impratio=1.0),
+}
+
+
+def at_friction(protocol: Protocol, friction: float) -> Protocol:
+    """The trial of an object more slippery than the 0.6 that protocols suppose: their coefficients in proportion.
+
+    A rougher object is tried as the protocol says, so that no grasp passes by friction that nobody measured.
+    """
+    share = min(friction / Protocol.friction[0], 1.0)
+    sliding, torsional, rolling = protocol.friction
+    return replace(protocol, friction=(sliding * share, torsional * share, rolling * share))
+
+
+@dataclass(frozen=True)
+class World:
+    """A compiled model and where things are in it. The model is never written to after compilation.
+
+    Attributes:
+        model: the `mujoco.MjModel`.
+        joint_addresses: index into `qpos` of each actuated hand joint, in the hand's order.
+        object_address: index into `qpos` of the object's free joint (position, then wxyz).
+        object_velocity: index into `qvel` of its free joint.
+        object_body: body id of the object.
+        center_of_mass: of the object, in its own frame [m].
+        hand_geoms: ids of the hand's geoms.
+        obstacles: id and name of the geom of every obstacle to the hand.
+        up: unit direction against gravity; None where there is none.
+        coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
+        mimics: the coupled joints.
+    """
+
+    model: Any
+    joint_addresses: np.ndarray
+    object_address: int
+    object_velocity: int
+    object_body: int
+    center_of_mass: Float[np.ndarray, "3"]
+    hand_geoms: tuple[int, ...] = ()
+    obstacles: tuple[tuple[int, str], ...] = ()
+    up: Float[np.ndarray, "3"] | None = None
+    coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    mimics: tuple[Mimic, ...] = ()
+
+
+def build_world(
+    hand: HandModel,
+    target: ObjectModel,
+    parts: Sequence[TriangleMesh],
+    protocol: Protocol,
+    support: Plane | None = None,
+    neighbours: Sequence[Neighbour] = (),
+) -> World:
+    """Compile the world of one hand and one object.
+
+    Args:
+        hand: any loaded hand.
+        target: gives mass, centre of mass and inertia.
+        parts: convex collision parts of the object, object frame [m].
+        protocol: physics settings.
+        support: a table, with gravity onto it. The hand meets it where it is; the object rests on a plane of its own
+            through its lowest point, because a reconstructed bottom hovers or sinks by millimetres.
+        neighbours: fixed, as their convex hulls. Those that the object touches already let it pass.
+    """
+    import mujoco
+
+    # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
+    mujoco.set_mju_user_warning(_ignore)
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = protocol.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = protocol.impratio
+    option.noslip_iterations = protocol.noslip_iterations
+    option.gravity = [0.0, 0.0, 0.0]
+    # Several contact points between flat faces: on one point each, a box between two plates rolls out. Later versions
+    # of MuJoCo have no such switch, because it is always on.
+    option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
+    _add_hand(spec, hand, protocol)
+    add_object(spec, target, parts, protocol.friction)
+    obstacles = [TABLE] if support is not None else []
+    if support is not None:
+        add_support(spec, hand, parts, protocol.friction, support)
+    for index, neighbour in enumerate(neighbours):
+        obstacles.append(f"neighbour {index + 1}")
+        add_neighbour(spec, obstacles[-1], neighbour, target, protocol.friction)
+    model = spec.compile()
+    return World(
+        model=model,
+        joint_addresses=_joint_addresses(model, hand.joint_names),
+        object_address=int(model.joint(OBJECT).qposadr[0]),
+        object_velocity=int(model.joint(OBJECT).dofadr[0]),
+        object_body=int(model.body(OBJECT).id),
+        center_of_mass=target.center_of_mass,
+        hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
+        obstacles=tuple((int(model.geom(name).id), name) for name in obstacles),
+        up=None if support is None else support.normal,
+        coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
+        mimics=hand.mimics,
+    )
+
+
+def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:
+    return np.array([model.joint(f"joint:{name}").qposadr[0] for name in names], dtype=np.int64)
+
+
+def _ignore(message: str) -> None:
+    del message
+
+
+def _add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:
+    quaternions = quaternion_from_rotation(torch.as_tensor(hand.link_offset_rotation, dtype=torch.float64)).numpy()
+    bodies: list[Any] = []
+    coupled = {mimic.link: mimic for mimic in hand.mimics}
+    for link, name in enumerate(hand.link_names):
+        parent = hand.link_parent[link]
+        if parent < 0:
+            body = spec.worldbody.add_body(name=f"link:{name}", mocap=True)
+        else:
+            body = bodies[parent].add_body(
+                name=f"link:{name}", pos=hand.link_offset_translation[link], quat=quaternions[link]
+            )
+        bodies.append(body)
+        if link in coupled:
+            _add_coupled_joint(spec, body, hand, coupled[link], protocol)
+        elif hand.link_joint[link] >= 0:
+            _add_joint(spec, body, hand, link, protocol)
+        body.explicitinertial = True
+        body.mass = max(float(hand.link_mass[link]), 1e-3)
+        body.ipos = hand.link_com[link]
+        body.fullinertia = full_inertia(hand.link_inertia[link], floor=1e-7)
+    for index, primitive in enumerate(hand.primitives):
+        add_primitive(spec, bodies[primitive.link], primitive, f"hand:{index}", protocol.friction)
+    first, second = np.nonzero(np.triu(hand.adjacent, 1))
+    for a, b in zip(first, second, strict=True):
+        spec.add_exclude(bodyname1=f"link:{hand.link_names[a]}", bodyname2=f"link:{hand.link_names[b]}")
+
+
+def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Protocol) -> None:
+    import mujoco
+
+    joint = int(hand.link_joint[link])
+    name = f"joint:{hand.joint_names[joint]}"
+    body.add_joint(
+        name=name,
+        **_joint_physics(hand, link, protocol),
+        range=[hand.lower[joint], hand.upper[joint]],
+        limited=True,
+        # A joint's stop is as hard as the time step allows (two steps), not MuJoCo's soft default of five.
+        solref_limit=[2 * protocol.timestep, 1.0],
+    )
+    effort = float(hand.effort[joint])
+    actuator = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+    actuator.set_to_position(kp=protocol.slide_stiffness if hand.slides[joint] else protocol.stiffness)
+    actuator.forcelimited = True
+    actuator.forcerange = [-effort, effort]
+
+
+def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, protocol: Protocol) -> None:
+    """A joint without motor or stops of its own, that an equality holds to its leader: loads on it reach the motor."""
+    import mujoco
+
+    name = f"joint:{mimic.name}"
+    body.add_joint(name=name, limited=False, **_joint_physics(hand, mimic.link, protocol))
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_JOINT,
+        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+        name1=name,
+        name2=f"joint:{hand.joint_names[mimic.joint]}",
+        data=[mimic.offset, mimic.multiplier, *[0.0] * 9],
+        # As stiff as gears: two time steps and hardly any softness, or a loaded finger would lag behind its leader.
+        solref=[2 * protocol.timestep, 1.0],
+        solimp=[0.9999, 0.9999, 1e-3, 0.5, 2.0],
+    )
+
+
+def _joint_physics(hand: HandModel, link: int, protocol: Protocol) -> dict[str, Any]:
+    """What joints with and without a motor share."""
+    import mujoco
+
+    slides = hand.joint_kind[link] == "prismatic"
+    return {
+        "type": mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
+        "axis": hand.joint_axis[link],
+        "damping": protocol.slide_damping if slides else protocol.damping,
+        "armature": protocol.armature,
+    }

@@ -1,1 +1,0 @@
-"""Physics trials in MuJoCo. A judge: shares no code with the optimiser."""

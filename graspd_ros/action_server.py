@@ -1,0 +1,109 @@
+"""The action `~/synthesize`: goals go the way of all requests, and hear of progress and end as its listeners do.
+
+A goal that is refused is accepted by the action server and aborted at once, so that its client is told why. Nothing
+here waits: the worker's word starts and ends a goal, and the executor only carries it out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from graspd_msgs.action import SynthesizeGrasps
+from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
+from rclpy.action.server import ActionServer, CancelResponse, RCLError, ServerGoalHandle
+from rclpy.node import Node
+from rclpy.task import Future
+
+from graspd_ros.inputs.requests import Listener
+
+RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result; rclpy's 900 keep a lot in memory
+
+
+class GoalServer:
+    """The action server.
+
+    Args:
+        node: the node that it is part of.
+        submit: takes a request for a listener; gives the id that the request goes by.
+        cancel: cancels a request by its id; says whether there was one.
+    """
+
+    def __init__(
+        self, node: Node, submit: Callable[[GraspRequest, Listener], str], cancel: Callable[[str], bool]
+    ) -> None:
+        self._node = node
+        self._submit = submit
+        self._cancel = cancel
+        self._ids: dict[bytes, str] = {}
+        self._server = ActionServer(
+            node,
+            SynthesizeGrasps,
+            "~/synthesize",
+            execute_callback=_no_execution,
+            handle_accepted_callback=self._on_accepted,
+            cancel_callback=self._on_cancel,
+            result_timeout=RESULT_TIMEOUT,
+        )
+
+    def _on_accepted(self, handle: ServerGoalHandle) -> None:
+        key = bytes(handle.goal_id.uuid)
+        goal = Goal(self._node, handle, on_end=lambda: self._ids.pop(key, None))
+        self._ids[key] = ""
+        self._ids[key] = self._submit(handle.request.request, goal)
+
+    def idle(self) -> bool:
+        """Whether every goal has got its end."""
+        return not self._ids
+
+    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        request_id = self._ids.get(bytes(handle.goal_id.uuid))
+        return CancelResponse.ACCEPT if request_id and self._cancel(request_id) else CancelResponse.REJECT
+
+
+class Goal:
+    """A request's listener that tells an action client."""
+
+    def __init__(self, node: Node, handle: ServerGoalHandle, on_end: Callable[[], object]) -> None:
+        self._node = node
+        self._handle = handle
+        self._on_end = on_end
+        self._answer = Future()
+        self._begun = False
+
+    def progressed(self, message: GraspProgress) -> None:
+        """Feedback; the first that is not of waiting tells that the goal is executed."""
+        if message.stage != "queued":
+            self._begin()
+        self._handle.publish_feedback(SynthesizeGrasps.Feedback(progress=message))
+
+    def ended(self, message: GraspArray) -> None:
+        """The goal's end, and its result."""
+        self._begin()
+        self._answer.set_result(message)
+        if self._node.executor is not None:
+            self._node.executor.wake()  # it looks at the future only when something happens
+
+    def _begin(self) -> None:
+        if not self._begun:
+            self._begun = True
+            try:
+                self._handle.execute(self._conclude)
+            except RCLError:  # its client cancelled it after rclpy had looked for that: the second look finds it
+                self._handle.execute(self._conclude)
+
+    async def _conclude(self, handle: ServerGoalHandle) -> SynthesizeGrasps.Result:
+        message: GraspArray = await self._answer  # pyright: ignore[reportAssignmentType]
+        try:
+            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+                handle.succeed()
+            elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
+                handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
+            else:
+                handle.abort()
+        finally:
+            self._on_end()
+        return SynthesizeGrasps.Result(result=message)
+
+
+def _no_execution(handle: ServerGoalHandle) -> SynthesizeGrasps.Result:
+    raise RuntimeError("a goal was executed without its own callback")

@@ -1,0 +1,270 @@
+"""The node: three-line callbacks that hand requests to the worker, and the worker's reports as messages.
+
+Every request ends in exactly one GraspArray on `~/grasps`, one terminal event on `~/status`, and one result of its
+goal where it came as one. Callbacks run in the executor's thread, everything heavy in the worker's; rclpy publishes
+from both.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from graspd_msgs.msg import GraspRequest
+from graspd_msgs.srv import ListHands
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from graspd_core import all_joint_names, give_memory_back, hand_names, load_hand, warm_up
+from graspd_core.config import load_preset
+from graspd_core.errors import GraspdError
+from graspd_core.transforms import TransformBuffer
+from graspd_ros.action_server import GoalServer
+from graspd_ros.diagnostics import health_message, resident_memory
+from graspd_ros.inputs.depth_stream import ImagePairs
+from graspd_ros.inputs.frames import TransformListener, wait_for_transform
+from graspd_ros.inputs.request_builder import SOURCES, Intake
+from graspd_ros.inputs.requests import Listener, Request
+from graspd_ros.inputs.sensor_frames import Sighting, cloud_sighting, depth_sighting, nanoseconds
+from graspd_ros.outputs.error_codes import RequestError, sentence_of
+from graspd_ros.outputs.responses import Answers
+from graspd_ros.parameters import Settings, declare_settings, read_settings
+from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
+from graspd_ros.worker import BusyPolicy, StopHook, Worker
+
+TRANSFORM_PATIENCE = 1.0  # seconds that the worker waits for a transform
+GOAL_PATIENCE = 0.3  # seconds that the executor has at the end to tell clients how their goals ended
+RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
+OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline passed while they waited
+# A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
+REQUEST_DEPTH = 500
+
+
+class GraspNode(Node):
+    """Takes objects, answers with grasps. `on_failure` is called when the node cannot serve at all.
+
+    Raises:
+        GraspdError: the hand or a parameter is unusable.
+    """
+
+    def __init__(self, on_failure: Callable[[], None]) -> None:
+        super().__init__("graspd")
+        settings = declare_settings(self)
+        # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
+        torch.set_num_threads(settings.torch_threads)
+        # As many contact candidates as the command line loads, so that both find the same grasps.
+        self._hand = load_hand(settings.hand, candidates=load_preset(settings.preset).closed_form.fine_candidates)
+        self._on_failure = on_failure
+        self._ready = False
+        self._announcing = threading.Lock()
+        self._transforms = TransformBuffer()
+        self._listener = TransformListener(self, self._transforms)
+        self._pairs = ImagePairs()
+        self._intake = Intake(self._hand.name, self._now, self._transform)
+        self._answers = Answers(self, self._hand)
+        self._planner = Planner(self._hand, self._transform_in_time)
+        self._worker: Worker[Request, Planned] = Worker(
+            work=self._work, finish=self._answers.finished, prepare=self._prepare, queue_size=settings.queue_size
+        )
+        self._create_inlets()
+        self._goals = GoalServer(self, self._on_goal, lambda request_id: self._worker.cancel(request_id) > 0)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # health does not stop where simulated time does
+        self.create_timer(1.0, self._on_diagnostics_due, clock=steady)
+        self.create_timer(OVERDUE_PERIOD, self._end_overdue, clock=steady)
+        self._worker.start()
+
+    def _create_inlets(self) -> None:
+        def listen(kind: type, topic: str, callback: Callable, qos: QoSProfile | int) -> None:
+            options = QoSOverridingOptions.with_default_policies()
+            self.create_subscription(kind, topic, callback, qos, qos_overriding_options=options)
+
+        listen(GraspRequest, "~/request", self._on_request, REQUEST_DEPTH)
+        listen(String, "~/mesh", self._on_mesh, 10)
+        listen(String, "~/cancel", self._on_cancel, REQUEST_DEPTH)
+        listen(PointCloud2, "points", self._on_points, qos_profile_sensor_data)
+        listen(Image, "depth/image_rect", self._on_image, qos_profile_sensor_data)
+        listen(CameraInfo, "depth/camera_info", self._on_camera_info, qos_profile_sensor_data)
+        self.create_service(ListHands, "~/list_hands", self._on_list_hands)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/add_view", self._on_add_view)
+        self.create_service(Trigger, "~/reset_views", self._on_reset_views)
+
+    def close(self, timeout: float) -> bool:
+        """Cancel everything and publish no more; True when the worker ended within `timeout` seconds.
+
+        The executor must still spin: goals end there.
+        """
+        ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
+        if not self._goals.idle():
+            end = time.monotonic() + GOAL_PATIENCE
+            while not self._goals.idle() and time.monotonic() < end:
+                time.sleep(0.01)
+        time.sleep(RESULT_PATIENCE)
+        self._answers.outlets.close()
+        return ended
+
+    # Callbacks: short, in the executor's thread.
+
+    def _on_mesh(self, message: String) -> None:
+        self._take(
+            "mesh", self._intake.new_id("mesh"), lambda name, given: self._intake.from_mesh(name, given, message.data)
+        )
+
+    def _on_request(self, message: GraspRequest) -> None:
+        self._take_request(message, "request", None)
+
+    def _on_goal(self, message: GraspRequest, listener: Listener) -> str:
+        return self._take_request(message, "goal", listener)
+
+    def _on_points(self, message: PointCloud2) -> None:
+        try:
+            self._see(cloud_sighting(message, nanoseconds(self._now())))
+        except RequestError as error:  # too large to keep
+            self._answers.cloud_not_taken(self._intake.new_id("cloud"), error)
+
+    def _on_image(self, message: Image) -> None:
+        if pair := self._pairs.add_image(message):
+            self._see(depth_sighting(*pair, nanoseconds(self._now())))
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        if pair := self._pairs.add_info(message):
+            self._see(depth_sighting(*pair, nanoseconds(self._now())))
+
+    def _on_cancel(self, message: String) -> None:
+        if not self._worker.cancel(message.data) and message.data:
+            culprit = GraspdError(f"cancel: no request {message.data!r} is waiting or running")
+            self._answers.tell_error(message.data, "cancel", culprit)
+
+    def _on_list_hands(self, _: ListHands.Request, response: ListHands.Response) -> ListHands.Response:
+        response.names, response.current = list(hand_names()), self._hand.name
+        response.joint_names, response.base_link = list(all_joint_names(self._hand)), self._hand.base_link
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        cancelled, views = self._worker.cancel(""), len(self._intake.views.clouds)
+        self._intake.forget()
+        self._answers.forget()
+        response.success, response.message = True, f"cancelled {cancelled} requests, dropped {views} views"
+        return response
+
+    def _on_add_view(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            self._intake.add_view(read_settings(self))
+            views = self._intake.views
+            response.success, response.message = True, f"{len(views.clouds)} views in {views.frame!r}"
+        except Exception as error:  # whatever the cloud holds, the executor goes on
+            response.success, response.message = False, sentence_of(error)
+        return response
+
+    def _on_reset_views(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, f"dropped {len(self._intake.views.clouds)} views"
+        self._intake.forget_views()
+        return response
+
+    def _on_diagnostics_due(self) -> None:
+        running, waiting = self._worker.state()
+        health = self._answers.tally.health(
+            name=self.get_fully_qualified_name(),
+            hand=self._hand.name,
+            ready=self._ready,
+            worker_alive=self._worker.alive(),
+            running=running or "",
+            waiting=waiting,
+            queue_size=self._worker.queue_size,
+            transforms=self._listener.available,
+        )
+        self._diagnostics.publish(health_message(health, self._now(), resident_memory()))
+
+    def _end_overdue(self) -> None:
+        self._worker.end_waiting(lambda request: request.time_left() <= 0, overdue())
+
+    # From messages to the worker.
+
+    def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None) -> str:
+        request_id = message.id or self._intake.new_id(kind)
+        self._take(
+            SOURCES.get(message.source, "request"),
+            request_id,
+            lambda name, settings: self._intake.from_message(name, settings, message, listener),
+            listener,
+        )
+        return request_id
+
+    def _take(
+        self, source: str, request_id: str, make: Callable[[str, Settings], Request], listener: Listener | None = None
+    ) -> None:
+        try:
+            request = make(request_id, read_settings(self))
+        except Exception as error:  # whatever a message holds, the executor goes on
+            self._answers.not_made(request_id, source, error, listener)
+        else:
+            self._submit(request)
+
+    def _see(self, sighting: Sighting) -> None:
+        self._answers.tally.count("clouds_received")
+        self._intake.newest, settings = sighting, read_settings(self)
+        if settings.cloud_policy == "off":
+            return
+        request_id = self._intake.new_id("cloud")
+        try:
+            request = self._intake.from_sighting(request_id, settings, sighting)
+        except GraspdError as error:
+            self._answers.cloud_not_taken(request_id, error)
+        else:
+            self._submit(request)
+
+    def _submit(self, request: Request) -> None:
+        with self._announcing:  # the worker starts only once the answer is out
+            admission = self._worker.submit(request, BusyPolicy(request.settings.busy_policy))
+            self._answers.admitted(request, admission)
+
+    def _now(self) -> Time:
+        return self.get_clock().now().to_msg()
+
+    def _transform(self, target: str, source: str, stamp: Time) -> np.ndarray:
+        return self._transforms.lookup(target, source, nanoseconds(stamp) or None)
+
+    # The worker's side.
+
+    def _transform_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> np.ndarray:
+        at = nanoseconds(stamp) or None
+        return wait_for_transform(self._transforms, target, source, at, TRANSFORM_PATIENCE, stop)
+
+    def _prepare(self) -> None:
+        torch.set_num_threads(read_settings(self).torch_threads)
+        try:
+            warm_up(self._hand, stop=self._worker.stopping)
+        except BaseException as error:  # without this the node would stand there deaf
+            self._answers.tell_error("", "node", error)
+            self._on_failure()
+            return
+        if self._worker.stopping():
+            return
+        # What is there now stays: looking through all of it for garbage again would take 0.2 s each time.
+        gc.collect()
+        gc.freeze()
+        # The first line of the log takes 0.1 s of looking through all modules for its place.
+        self.get_logger().info(f"ready: {self._hand.name} waits for objects")
+        self._ready = True
+        self._answers.outlets.tell("ready", "", "node", hand=self._hand.name, base_link=self._hand.base_link)
+
+    def _work(self, request: Request, stop: StopHook) -> Planned:
+        with self._announcing:
+            self._answers.started(request)
+        try:
+            return self._planner.plan(request, stop, self._answers.progress_hook(request))
+        finally:
+            give_memory_back()

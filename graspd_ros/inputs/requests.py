@@ -1,0 +1,151 @@
+"""What the worker works off, and the checks that a GraspRequest message must pass to become one."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose
+from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
+from jaxtyping import Float
+
+from graspd_core import Scene
+from graspd_core.config import preset_names
+from graspd_ros.inputs.frames import matrix_of_pose
+from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
+
+MOST_ID = 128
+MOST_CLOUD_BYTES = 2**27  # 128 MiB: 4 million points of 32 bytes
+_ID = re.compile(rf"[A-Za-z0-9_.:@+-]{{1,{MOST_ID}}}")
+_FARTHEST = 1e3  # metres; what is farther away is a mistake, and costs precision
+
+
+class Listener(Protocol):
+    """One more who wants to know of one request, beside the topics; called in the thread that publishes."""
+
+    def progressed(self, message: GraspProgress) -> None: ...
+    def ended(self, message: GraspArray) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """One object to grasp.
+
+    Attributes:
+        id: names the request in every answer.
+        source: mesh, cloud, latest_cloud or views.
+        frame: the frame that the results are told in, unless the settings name an output_frame.
+        stamp: when the object was as it was given.
+        settings: the parameters at the time of the request, with what the request itself asks for.
+        load: reads the object, for a distance grid of that many nodes a side; slow, may raise a GraspdError.
+        T_frame_object: pose of the object's own frame in `frame`; None where they are one.
+        only_newest: whether a newer request of this kind takes its place while it waits.
+        listener: who is told of it beside the topics; None where nobody is.
+        timeless: whether it came without a time of its own: then the newest transforms are meant.
+        accepted: when the request came, by the monotonic clock [s].
+    """
+
+    id: str
+    source: str
+    frame: str
+    stamp: Time
+    settings: Settings
+    load: Callable[[int], Scene]
+    T_frame_object: Float[np.ndarray, "4 4"] | None = None
+    only_newest: bool = False
+    listener: Listener | None = None
+    timeless: bool = False
+    accepted: float = field(default_factory=time.monotonic)
+
+    @property
+    def frame_out(self) -> str:
+        """The frame that the results are told in."""
+        return self.settings.output_frame or self.frame
+
+    def elapsed(self) -> float:
+        """Seconds since the request came."""
+        return time.monotonic() - self.accepted
+
+    def time_left(self) -> float:
+        """Seconds until its deadline."""
+        return self.settings.deadline - self.elapsed()
+
+
+def check_request(message: GraspRequest, hand: str) -> None:
+    """Refuse what no settings can make good.
+
+    Raises:
+        RequestError: the field, what it holds and what is valid.
+    """
+    if message.id and not _ID.fullmatch(message.id):
+        shown = message.id[:MOST_ID]
+        raise _bad(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
+    if message.source > GraspRequest.VIEWS:
+        raise _bad(f"source: {message.source}; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3")
+    if message.hand not in ("", hand):
+        raise RequestError(
+            ErrorCode.WRONG_HAND, f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
+        )
+    if message.num_grasps > MOST_GRASPS:
+        raise _bad(f"num_grasps: {message.num_grasps}; valid: 1 to {MOST_GRASPS}, 0 for the parameter")
+    # Presets by path are for the node's owner: a message must not have files read.
+    if message.preset not in ("", *preset_names()):
+        raise _bad(f"preset: {message.preset[:MOST_ID]!r}; valid: {', '.join(preset_names())}, empty for the parameter")
+    if message.seed < -1:
+        raise _bad(f"seed: {message.seed}; valid: 0 or more, -1 for the parameter")
+    _check_range("time_budget", message.time_budget, BUDGETS, "s, 0 for the parameter")
+    _check_range("mesh_scale", message.mesh_scale, SCALES, "m, 0 for 1")
+    if len(message.cloud.data) > MOST_CLOUD_BYTES:
+        raise _bad(f"cloud: {len(message.cloud.data)} bytes; at most {MOST_CLOUD_BYTES} are taken")
+    if message.use_target_point:
+        point_of(message)
+
+
+def settings_of(message: GraspRequest, settings: Settings) -> Settings:
+    """The settings with what a checked request asks for itself."""
+    return replace(
+        settings,
+        num_grasps=message.num_grasps or settings.num_grasps,
+        preset=message.preset or settings.preset,
+        seed=settings.seed if message.seed < 0 else message.seed,
+        deadline=message.time_budget or settings.deadline,
+        mesh_scale=message.mesh_scale or 1.0,
+    )
+
+
+def point_of(message: GraspRequest) -> Float[np.ndarray, "3"]:
+    """The target point, in the request's own frame [m]. Raises RequestError: not a place within 1 km."""
+    point = np.array([message.target_point.x, message.target_point.y, message.target_point.z])
+    if not (np.abs(point) <= _FARTHEST).all():
+        raise _bad(f"target_point: {point.tolist()}; it must be finite, within {_FARTHEST:g} m")
+    return point
+
+
+def pose_matrix(pose: Pose) -> Float[np.ndarray, "4 4"]:
+    """A pose as a matrix; an all-zero quaternion turns nothing. Raises RequestError: no pose within 1 km."""
+    position = np.array([pose.position.x, pose.position.y, pose.position.z])
+    if not (np.abs(position) <= _FARTHEST).all():
+        raise _bad(f"object_pose: position {position.tolist()}; it must be finite, within {_FARTHEST:g} m")
+    turn = pose.orientation
+    length = float(np.linalg.norm([turn.w, turn.x, turn.y, turn.z]))
+    if length == 0:
+        pose = Pose(position=pose.position)
+    elif not abs(length - 1) < 0.01:
+        raise _bad(f"object_pose: a quaternion of length {length:.3g}; it must be 1 (or 0, for no turn)")
+    return matrix_of_pose(pose)
+
+
+def _check_range(name: str, value: float, limits: tuple[float, float], unit: str) -> None:
+    low, high = limits
+    if not (value == 0 or low <= value <= high):
+        raise _bad(f"{name}: {value!r}; valid: {low:g} to {high:g} {unit}")
+
+
+def _bad(message: str) -> RequestError:
+    return RequestError(ErrorCode.BAD_REQUEST, message)

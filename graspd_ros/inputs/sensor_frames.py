@@ -1,0 +1,153 @@
+"""What cameras showed the node: the newest cloud or depth image, and the views that were kept of one scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from jaxtyping import Float, Int
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from graspd_core import PointCloud, Scene, Target, cloud_from_depth, elsewhere, scene_from_views, transform_cloud
+from graspd_core.bags.messages import points_from_message
+from graspd_ros.inputs.depth_stream import frame_of
+from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
+from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_ros.parameters import Settings
+
+MOST_VIEWS = 64
+MOST_VIEW_POINTS = 200_000  # kept of each view: 64 views take 300 MB at most
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One cloud or depth image as it came.
+
+    Attributes:
+        kind: cloud or depth.
+        frame: the frame it was seen in.
+        stamp: when it was seen, by the sensor's word; zero where it has none.
+        arrived: when it came, by the node's clock [ns].
+        read: its points, in its frame; takes some milliseconds, may raise a CloudError.
+    """
+
+    kind: str
+    frame: str
+    stamp: Time
+    arrived: int
+    read: Callable[[], PointCloud]
+
+    def check_age(self, now: int, limit: float) -> None:
+        """Refuse what is older than `limit` seconds at `now` [ns]; 0 is no limit. Raises RequestError."""
+        age = (now - (nanoseconds(self.stamp) or self.arrived)) * 1e-9
+        if limit and age > limit:
+            raise RequestError(
+                ErrorCode.STALE_CLOUD,
+                f"the {self.kind} in {self.frame!r} is {age:.1f} s old, more than cloud_max_age={limit:g} s "
+                "(a bag's needs use_sim_time, or cloud_max_age 0)",
+            )
+
+
+def cloud_sighting(message: PointCloud2, arrived: int) -> Sighting:
+    """A cloud message; it is read only when it is used. The camera is taken to stand at the origin of its frame.
+
+    Raises:
+        RequestError: it is too large to keep.
+    """
+    if len(message.data) > MOST_CLOUD_BYTES:
+        told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
+        raise RequestError(ErrorCode.BAD_CLOUD, told)
+    header = message.header
+    return Sighting("cloud", header.frame_id, header.stamp, arrived, lambda: _origin_view(points_from_message(message)))
+
+
+def depth_sighting(image: Image, info: CameraInfo, arrived: int) -> Sighting:
+    """A depth image with its calibration; it is read only when it is used."""
+
+    def read() -> PointCloud:
+        frame = frame_of(image, info)
+        return cloud_from_depth(frame.depth, frame.camera)
+
+    return Sighting("depth image", image.header.frame_id, image.header.stamp, arrived, read)
+
+
+@dataclass(frozen=True)
+class Views:
+    """Clouds of one scene, all in one frame. Immutable: `add` returns new ones."""
+
+    frame: str = ""
+    stamp: Time = field(default_factory=Time)
+    clouds: tuple[PointCloud, ...] = ()
+
+    def add(self, sighting: Sighting, settings: Settings, lookup: Callable[[str, str, Time], np.ndarray]) -> Views:
+        """With one more view, moved to the frame of the others (the settings' fixed_frame, or that of the first).
+
+        Args:
+            sighting: the view.
+            settings: workspace, thinning and frame.
+            lookup: `T_target_source` of two frames at a time; may raise a TransformError.
+
+        Raises:
+            RequestError: as many views as there may be.
+            GraspdError: the view cannot be read or moved.
+        """
+        if len(self.clouds) >= MOST_VIEWS:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"{MOST_VIEWS} views are kept already; call ~/reset_views first")
+        frame = self.frame or settings.fixed_frame or sighting.frame
+        cloud = trimmed(sighting.read(), settings)
+        if len(cloud.points) > MOST_VIEW_POINTS:
+            every = -(-len(cloud.points) // MOST_VIEW_POINTS)
+            cloud = PointCloud(cloud.points[::every], cloud.viewpoint, cloud.forward)
+        if frame != sighting.frame:
+            cloud = transform_cloud(cloud, lookup(frame, sighting.frame, sighting.stamp))
+        return Views(frame, sighting.stamp, (*self.clouds, cloud))
+
+
+def scene_of_views(
+    views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None, resolution: int
+) -> Scene:
+    """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m]."""
+    return elsewhere(
+        scene_from_views,
+        views,
+        target=None if target is None else Target(point=target),
+        alone=not settings.segment,
+        mass=settings.mass,
+        friction=settings.friction,
+        resolution=resolution,
+    )
+
+
+def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
+    """The points inside the workspace, one a voxel where the settings give a voxel its size."""
+    low, high = np.array(settings.roi_min), np.array(settings.roi_max)
+    points = cloud.points[((cloud.points >= low) & (cloud.points <= high)).all(1)]
+    if not len(points):
+        raise RequestError(
+            ErrorCode.BAD_CLOUD,
+            f"none of {len(cloud.points)} points lies in the workspace, roi_min={settings.roi_min} to "
+            f"roi_max={settings.roi_max}",
+        )
+    if settings.voxel_size > 0:
+        cells = np.floor(points / settings.voxel_size).astype(np.int64)
+        points = points[np.unique(_packed(cells), axis=0, return_index=True)[1]]
+    return PointCloud(points, cloud.viewpoint, cloud.forward)
+
+
+def _packed(cells: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n ..."]:
+    """Cells in the same order as one number each, which sort seven times as fast; as they are where it has no room."""
+    cells = cells - cells.min(0)
+    sides = tuple(map(int, cells.max(0) + 1))
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), sides)) if math.prod(sides) < 2**62 else cells
+
+
+def nanoseconds(stamp: Time) -> int:
+    """A stamp as one number."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def _origin_view(points: Float[np.ndarray, "n 3"]) -> PointCloud:
+    return PointCloud(points, np.zeros(3))

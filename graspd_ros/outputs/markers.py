@@ -1,0 +1,141 @@
+"""A result for RViz: the hand at its grasp, where it touches, the axes of its base link, and what it is worth.
+
+Namespaces are `hand`, `contacts`, `axes` and `text`, so that each can be switched off in RViz; ids start at
+`IDS_OF_A_GRASP` times the rank. Markers stay until the next result deletes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, Vector3
+from jaxtyping import Float
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from graspd_core import HandModel, link_poses
+from graspd_core.types import Contact, Grasp, Verdict
+from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
+from graspd_ros.outputs.status_json import pose_of
+
+IDS_OF_A_GRASP = 1000
+COLOURS = {
+    Verdict.VERIFIED: (0.20, 0.70, 0.30),
+    Verdict.UNVERIFIED: (0.95, 0.70, 0.15),
+    Verdict.FAILED: (0.85, 0.20, 0.20),
+}
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_AXIS_LENGTH = 0.05
+_ARROW_LENGTH = 0.03
+_TEXT_HEIGHT = 0.015
+_TEXT_ABOVE = 0.12
+
+Matrix = Float[np.ndarray, "4 4"]
+
+
+def result_markers(grasps: Sequence[Grasp], hand: HandModel, frame: str, stamp: Time, shown: int = 1) -> MarkerArray:
+    """The best `shown` grasps; the first marker deletes what was shown before, so none leaves an empty scene."""
+    header = Header(frame_id=frame, stamp=stamp)
+    markers = [Marker(header=header, action=Marker.DELETEALL)]
+    for rank, grasp in enumerate(grasps[:shown]):
+        T_frame_base = matrix_of_pose(pose_of(grasp.grasp))
+        colour = COLOURS[grasp.verdict]
+        for namespace, made in (
+            ("hand", _hand(hand, grasp, T_frame_base, colour)),
+            ("contacts", (_contact(contact) for contact in grasp.contacts)),
+            ("axes", _axes(T_frame_base)),
+            ("text", [_text(grasp, rank, T_frame_base)]),
+        ):
+            for number, marker in enumerate(made):
+                marker.header, marker.action, marker.ns = header, Marker.ADD, namespace
+                marker.id = rank * IDS_OF_A_GRASP + number
+                markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+def _hand(hand: HandModel, grasp: Grasp, T_frame_base: Matrix, colour: tuple[float, float, float]) -> Iterator[Marker]:
+    """The collision solids; a capsule is a cylinder and two balls."""
+    rotations, translations = link_poses(hand, grasp.grasp.joint_positions)
+    for solid in hand.primitives:
+        T_base_link = _matrix(rotations[solid.link], translations[solid.link])
+        T = T_frame_base @ T_base_link @ _matrix(solid.rotation, solid.translation)
+        pose, size = pose_of_matrix(T), solid.size
+        if solid.kind == "hull":
+            corners = [_point(corner) for corner in solid.vertices[solid.faces.reshape(-1)]]
+            yield Marker(
+                type=Marker.TRIANGLE_LIST, pose=pose, scale=_vector(1, 1, 1), color=_colour(colour), points=corners
+            )
+        elif solid.kind == "box":
+            yield _solid(Marker.CUBE, pose, 2 * np.array(size), colour)
+        elif solid.kind == "sphere":
+            yield _solid(Marker.SPHERE, pose, np.full(3, 2 * size[0]), colour)
+        else:
+            yield _solid(Marker.CYLINDER, pose, np.array([2 * size[0], 2 * size[0], 2 * size[1]]), colour)
+            if solid.kind == "capsule":
+                for end in (-size[1], size[1]):
+                    ball = pose_of_matrix(T @ _matrix(np.eye(3), np.array([0.0, 0.0, end])))
+                    yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
+
+
+def _contact(contact: Contact) -> Marker:
+    """An arrow that ends where the link touches and goes the way it presses: against the object's normal."""
+    tip = np.array(contact.position)
+    tail = tip + _ARROW_LENGTH * np.array(contact.normal)
+    return _arrow(tail, tip, (0.1, 0.3, 0.9))
+
+
+def _axes(T_frame_base: Matrix) -> Iterator[Marker]:
+    """x red, y green, z blue."""
+    origin = T_frame_base[:3, 3]
+    for axis, colour in enumerate(AXES):
+        yield _arrow(origin, origin + _AXIS_LENGTH * T_frame_base[:3, axis], colour)
+
+
+def _text(grasp: Grasp, rank: int, T_frame_base: Matrix) -> Marker:
+    lines = [f"#{rank} {grasp.verdict}"]
+    if grasp.metrics is not None:
+        lines.append(f"ε {grasp.metrics.epsilon:.3f}")
+    if grasp.reason:
+        lines.append(grasp.reason)
+    above = _matrix(np.eye(3), T_frame_base[:3, 3] + [0.0, 0.0, _TEXT_ABOVE])
+    return Marker(
+        type=Marker.TEXT_VIEW_FACING,
+        pose=pose_of_matrix(above),
+        scale=_vector(0, 0, _TEXT_HEIGHT),
+        color=_colour((1.0, 1.0, 1.0), 1.0),
+        text="\n".join(lines),
+    )
+
+
+def _solid(kind: int, pose: Pose, size: np.ndarray, colour: tuple[float, float, float]) -> Marker:
+    return Marker(type=kind, pose=pose, scale=_vector(*size), color=_colour(colour))
+
+
+def _arrow(tail: np.ndarray, tip: np.ndarray, colour: tuple[float, float, float]) -> Marker:
+    # Points are in the header's frame; RViz wants the pose beside them to be a rotation all the same.
+    marker = Marker(type=Marker.ARROW, scale=_vector(0.004, 0.008, 0.01), color=_colour(colour, 1.0))
+    marker.pose.orientation.w = 1.0
+    marker.points = [_point(tail), _point(tip)]
+    return marker
+
+
+def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Matrix:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, translation
+    return T
+
+
+def _point(position: np.ndarray) -> Point:
+    x, y, z = map(float, position)
+    return Point(x=x, y=y, z=z)
+
+
+def _vector(x: float, y: float, z: float) -> Vector3:
+    return Vector3(x=float(x), y=float(y), z=float(z))
+
+
+def _colour(rgb: tuple[float, float, float], alpha: float = 0.8) -> ColorRGBA:
+    r, g, b = rgb
+    return ColorRGBA(r=r, g=g, b=b, a=alpha)

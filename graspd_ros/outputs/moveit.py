@@ -1,0 +1,108 @@
+"""A grasp as a moveit_msgs/Grasp, for MoveIt's pick pipelines. moveit_msgs is imported on use: it is not on PyPI.
+
+MoveIt's `grasp_pose` is that of the end effector's parent link, the last link of the arm, not of a link of the hand:
+`T_parent_base` says where the hand's base link is in it.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, Vector3
+from graspd_msgs.msg import Grasp
+from jaxtyping import Float
+from trajectory_msgs.msg import JointTrajectory
+
+from graspd_core.errors import ConfigError, GraspdError
+from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
+
+# A hand that comes this much of the way is near enough to go on, as MoveIt asks for a least distance.
+_LEAST_APPROACH = 0.5
+
+
+class MoveItMissing(GraspdError):
+    """moveit_msgs cannot be imported."""
+
+
+def moveit_grasp(
+    grasp: Grasp,
+    *,
+    retreat: tuple[float, float, float],
+    retreat_frame: str,
+    retreat_distance: float = 0.1,
+    T_parent_base: Float[np.ndarray, "4 4"] | None = None,
+    messages: ModuleType | None = None,
+) -> Any:
+    """The moveit_msgs/Grasp of a graspd_msgs/Grasp.
+
+    Args:
+        grasp: as on ~/grasps.
+        retreat: direction to lift in, of any length, in `retreat_frame`: usually up.
+        retreat_frame: frame of `retreat`.
+        retreat_distance: how far to lift [m].
+        T_parent_base: pose of the hand's base link in the end effector's parent link; None: as the hand is mounted by
+            its description, and where that has no mount, they are one.
+        messages: module with the message classes; None: moveit_msgs.msg.
+
+    Raises:
+        MoveItMissing: moveit_msgs is not installed.
+        ConfigError: a failed grasp, or a retreat without direction.
+    """
+    if grasp.verdict == Grasp.FAILED:
+        raise ConfigError(f"grasp {grasp.id!r}: it failed its trial ({grasp.reason}) and must not be executed")
+    up = np.array(retreat, dtype=float)
+    if not (np.isfinite(up).all() and up.any()):
+        raise ConfigError(f"retreat: {retreat}; it must be a direction")
+    messages = messages or _moveit_messages()
+    pregrasp = matrix_of_pose(grasp.pregrasp_pose)
+    way = matrix_of_pose(grasp.grasp_pose)[:3, 3] - pregrasp[:3, 3]
+    pose = grasp.mount_grasp_pose if grasp.mount_link else grasp.grasp_pose
+    if T_parent_base is not None:
+        pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ np.linalg.inv(T_parent_base))
+    first, *closing = deepcopy(grasp.trajectory.points)
+    quality = grasp.epsilon if grasp.epsilon >= 0 else 0.0
+    return messages.Grasp(
+        id=grasp.id,
+        pre_grasp_posture=_posture(grasp, [first]),
+        grasp_posture=_posture(grasp, closing, since=first),
+        grasp_pose=PoseStamped(header=grasp.header, pose=pose),
+        grasp_quality=quality,
+        pre_grasp_approach=_translation(messages, way, grasp.header.frame_id, float(np.linalg.norm(way))),
+        post_grasp_retreat=_translation(messages, up, retreat_frame, retreat_distance),
+    )
+
+
+def _posture(grasp: Grasp, points: list[Any], since: Any = None) -> JointTrajectory:
+    """Some points of the trajectory, times counted from `since`."""
+    began = _nanoseconds(since.time_from_start) if since else 0
+    for point in points:
+        seconds, nanoseconds = divmod(_nanoseconds(point.time_from_start) - began, 1_000_000_000)
+        point.time_from_start.sec, point.time_from_start.nanosec = seconds, nanoseconds
+    return JointTrajectory(
+        header=grasp.trajectory.header, joint_names=list(grasp.trajectory.joint_names), points=points
+    )
+
+
+def _translation(messages: ModuleType, direction: np.ndarray, frame: str, distance: float) -> Any:
+    length = math.hypot(*direction)
+    x, y, z = (float(value) for value in (direction / length if length else direction))
+    translation = messages.GripperTranslation(desired_distance=distance, min_distance=_LEAST_APPROACH * distance)
+    translation.direction.header.frame_id = frame
+    translation.direction.vector = Vector3(x=x, y=y, z=z)
+    return translation
+
+
+def _nanoseconds(duration: Any) -> int:
+    return duration.sec * 1_000_000_000 + duration.nanosec
+
+
+def _moveit_messages() -> ModuleType:
+    try:
+        return import_module("moveit_msgs.msg")
+    except ImportError:
+        raise MoveItMissing("moveit_msgs is not installed; try: sudo apt install ros-jazzy-moveit-msgs") from None

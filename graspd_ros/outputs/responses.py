@@ -1,0 +1,201 @@
+"""What becomes of a request, in messages: exactly one GraspArray for each, and events for those without graspd_msgs.
+
+Clouds that come unasked are the exception: those that gave way to a newer one before their turn are only counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import traceback
+
+from builtin_interfaces.msg import Time
+from graspd_msgs.msg import GraspArray, GraspProgress
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+from graspd_core import HandModel
+from graspd_core.errors import GraspdError
+from graspd_core.types import Progress, ProgressHook
+from graspd_ros.counters import Tally
+from graspd_ros.inputs.requests import MOST_ID, Listener, Request
+from graspd_ros.outputs import messages
+from graspd_ros.outputs import status_json as convert
+from graspd_ros.outputs.error_codes import ErrorCode, code_of, sentence_of
+from graspd_ros.outputs.markers import result_markers
+from graspd_ros.outputs.publishers import Outlets
+from graspd_ros.outputs.trajectory import Pace
+from graspd_ros.request_planner import Planned, limited
+from graspd_ros.worker import Admission, Ending, Refusal, Report
+
+COUNT_PERIOD = 1.0  # seconds between two counts of superseded clouds, and between two complaints about clouds
+_REFUSALS = {
+    Refusal.BUSY: ErrorCode.BUSY,
+    Refusal.DUPLICATE: ErrorCode.DUPLICATE_ID,
+    Refusal.STOPPING: ErrorCode.SHUTTING_DOWN,
+}
+_ENDINGS = {
+    Ending.CANCELLED: messages.Ending(GraspArray.CANCELLED, ErrorCode.CANCELLED, "cancelled"),
+    Ending.SUPERSEDED: messages.Ending(GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, "a newer request took its place"),
+}
+
+
+class Answers:
+    """Tells of requests through `outlets`, and counts them in `tally`."""
+
+    def __init__(self, node: Node, hand: HandModel) -> None:
+        self.outlets = Outlets(node)
+        self.tally = Tally()
+        self._node = node
+        self._hand = hand
+        self._superseded = 0
+        self._superseded_told = self._complained = -float("inf")
+
+    def forget(self) -> None:
+        """As after a start: no counts, and late joiners get nothing from before now but the last answer."""
+        self.outlets.publish(result_markers((), self._hand, "", self._now()))
+        self.outlets.forget()
+        self.tally.clear()
+
+    # Taken or not.
+
+    def admitted(self, request: Request, admission: Admission) -> None:
+        """A request was taken, or not."""
+        if admission.refusal is not None:
+            code, message = _REFUSALS[admission.refusal], admission.reason
+            self.outlets.tell("refused", request.id, request.source, code=code, message=message)
+            self._log().warning(f"{request.id}: refused: {message}")
+            self._publish(self._answer(request, messages.Ending(GraspArray.REFUSED, code, message)), request.listener)
+        elif not request.only_newest:
+            self._accepted(request, admission.ahead)
+
+    def not_made(self, request_id: str, source: str, error: Exception, listener: Listener | None = None) -> None:
+        """A message that is no valid request."""
+        self.tell_error(request_id[:MOST_ID], source, error)
+        ending = messages.Ending(GraspArray.REFUSED, code_of(error), sentence_of(error))
+        header = Header(stamp=self._now())
+        self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
+
+    def cloud_not_taken(self, request_id: str, error: Exception) -> None:
+        """A cloud that came unasked and is no use; cameras repeat themselves, complaints do only once a second."""
+        if time.monotonic() - self._complained >= COUNT_PERIOD:
+            self._complained = time.monotonic()
+            self.not_made(request_id, "cloud", error)
+
+    def _accepted(self, request: Request, ahead: int) -> None:
+        self.tally.count("accepted")
+        self.outlets.tell("accepted", request.id, request.source, ahead=ahead)
+        if ahead:
+            self._report(request, messages.queued_message(request.id, request.frame_out, self._now(), ahead))
+
+    # On the way.
+
+    def started(self, request: Request) -> None:
+        """The worker begins; a cloud that waited for that is told of only now."""
+        if request.only_newest:
+            self._tell_superseded(request.id)
+            self._accepted(request, 0)
+
+    def progress_hook(self, request: Request) -> ProgressHook:
+        """Tells of the request's progress, not too often."""
+
+        def tell(progress: Progress) -> None:
+            elapsed = request.elapsed()
+            event = {**convert.progress_event(progress), "elapsed": elapsed}
+            self.outlets.tell("progress", request.id, request.source, **event)
+            message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
+            self._report(request, message)
+
+        return limited(tell, request.settings.progress_rate)
+
+    def _report(self, request: Request, message: GraspProgress) -> None:
+        self.outlets.publish(message)
+        if request.listener is not None:
+            request.listener.progressed(message)
+
+    # Over.
+
+    def finished(self, request: Request, report: Report[Planned]) -> None:
+        """A request that was taken has ended; never raises."""
+        try:
+            self._finished(request, report)
+        except Exception as error:  # whatever is wrong with a result, its client is not left waiting
+            try:
+                self._finished(request, Report(Ending.FAILED, error=error))
+            except Exception as again:  # and the worker's thread goes on
+                self._log().error(f"{request.id}: not answered:\n{''.join(traceback.format_exception(again))}")
+
+    def _finished(self, request: Request, report: Report[Planned]) -> None:
+        if report.error is not None:
+            self.tell_error(request.id, request.source, report.error)
+            code, message = code_of(report.error), sentence_of(report.error)
+            self._publish(self._answer(request, messages.Ending(GraspArray.FAILED, code, message)), request.listener)
+        elif report.ending is Ending.DONE and report.value is not None:
+            self._result(request, report.value)
+        elif report.ending is Ending.SUPERSEDED and request.only_newest and report.value is None:
+            self._superseded += 1
+            self.tally.count("clouds_superseded")
+            if time.monotonic() - self._superseded_told >= COUNT_PERIOD:
+                self._tell_superseded(request.id)
+        else:
+            found = report.value.result if report.value else None
+            answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], result=found))
+            self.outlets.tell(report.ending.value, request.id, request.source)
+            self._publish(answer, request.listener)
+
+    def _result(self, request: Request, planned: Planned) -> None:
+        result, hand = planned.result, self._hand
+        # Everything is made before anything is published: a result that cannot be told is an error as a whole.
+        answer = self._answer(request, messages.ending_of(result))
+        event = convert.result_event(result)
+        shown = []
+        best = convert.presentable(result)
+        if best is not None:
+            shown.append(convert.joint_message(best.grasp, hand, request.stamp))
+            shown.append(convert.pose_message(best, request.frame_out, request.stamp))
+        if request.settings.publish_markers and planned.worked_on:
+            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp))
+        for message in shown:
+            self.outlets.publish(message)
+        self.outlets.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
+        self._log().info(f"{request.id}: {event['verified']} of {event['grasps']} verified: {event['message']}")
+        self.tally.planned(result, request.elapsed())
+        self._publish(answer, request.listener)
+
+    def _answer(self, request: Request, ending: messages.Ending) -> GraspArray:
+        settings = request.settings
+        pace = Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
+        header = Header(frame_id=request.frame_out, stamp=request.stamp)
+        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, pace)
+
+    def _publish(self, message: GraspArray, listener: Listener | None) -> None:
+        self.tally.answered(message)
+        self.outlets.publish(message)
+        if listener is not None:
+            try:
+                listener.ended(message)
+            except Exception as error:  # the answer is out: it must not be followed by another
+                self._log().error(f"{message.request_id}: {''.join(traceback.format_exception(error))}")
+
+    # Events.
+
+    def tell_error(self, request_id: str, source: str, error: BaseException) -> None:
+        """An error on ~/status and in the log."""
+        message, kind, code = sentence_of(error), type(error).__name__, code_of(error)
+        self.outlets.tell("error", request_id, source, kind=kind, code=code, message=message)
+        expected = isinstance(error, GraspdError | OSError)
+        detail = "" if expected else "\n" + "".join(traceback.format_exception(error))
+        self._log().error(f"{request_id or source}: {message}{detail}")
+
+    def _tell_superseded(self, request_id: str) -> None:
+        """How many clouds gave way to newer ones since this was last told; at most one a second and one a request."""
+        count, self._superseded = self._superseded, 0
+        if count:
+            self._superseded_told = time.monotonic()
+            self.outlets.tell("superseded", request_id, "cloud", count=count)
+
+    def _now(self) -> Time:
+        return self._node.get_clock().now().to_msg()
+
+    def _log(self):
+        return self._node.get_logger()

@@ -1,0 +1,233 @@
+"""The command line: what comes out, the exit status, and one line on stderr for whatever is wrong with the input."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspd_core.cli import main
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
+from graspd_core.config import preset_names
+from graspd_core.formats.grasps_json import load_document
+from graspd_core.mesh.mesh_files import save_mesh, surface_samples
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.planning import plan_grasps as pipeline
+from graspd_core.types import GraspResult, Outcome, Timing, TriangleMesh
+
+GRASPD = [sys.executable, "-m", "graspd_core.cli"]
+NO_FACES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+NAN_VERTEX = "v 0 0 0\nv nan 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+
+def save_large(path: Path) -> None:
+    box = make_shape("box")
+    save_mesh(TriangleMesh(box.vertices / np.ptp(box.vertices, axis=0).max() * 40.0, box.faces), path)
+
+
+# name of the file: how to make it, and what the message must say
+BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing.obj": (lambda path: None, "no such"),
+    "missing.npy": (lambda path: None, "no such"),
+    "folder.stl": (lambda path: path.mkdir(), "is a directory"),
+    "notes.txt": (lambda path: path.write_text("hello"), "unknown ending"),
+    "noise.stl": (lambda path: path.write_bytes(b"not a mesh at all"), "noise.stl"),
+    "empty.obj": (lambda path: path.write_text(""), "empty.obj"),
+    "points.obj": (lambda path: path.write_text(NO_FACES), "empty mesh"),
+    "nan.obj": (lambda path: path.write_text(NAN_VERTEX), "NaN"),
+    "large.ply": (save_large, "40 m across"),
+    "empty.npy": (lambda path: np.save(path, np.zeros((0, 3))), "empty"),
+    "nan.npy": (lambda path: np.save(path, np.full((100, 3), np.nan)), "NaN"),
+    "flat.npy": (lambda path: np.save(path, np.zeros(7)), "points × 3"),
+    "words.npz": (lambda path: path.write_bytes(b"PK nothing"), "words.npz"),
+}
+BAD_OPTIONS: list[tuple[list[str], str]] = [
+    (["--hand", "claw"], "unknown hand 'claw'; known: allegro_left, allegro_right"),
+    (["--hand", "missing.yaml"], "missing.yaml: no such file"),
+    (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
+    (["-n", "0"], "count: 0 grasps; valid: 1 to 1024"),
+    (["-n", "many"], "invalid int value: 'many'"),
+    (["--seed", "-1"], "seed: -1; valid: 0 to"),
+    (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
+    (["--mass", "nan"], "mass nan kg"),
+    (["--friction", "-1"], "friction -1.0 must be a positive number"),
+    (["--scale", "0"], "scale 0.0 must be a positive number"),
+    (["--scale", "1e6"], "m across"),
+    (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),
+    (["--scale", "2", "--units", "mm"], "not allowed with argument"),
+    (["--deadline", "0"], "deadline: 0.0 s; it must be positive"),
+    (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
+    (["--method", "magic"], "invalid choice: 'magic' (choose from"),
+    (["--device", "abacus"], "device: 'abacus'; valid on this machine: cpu"),
+    (["--threads", "0"], "threads: 0; at least 1"),
+    (["--frobnicate"], "unrecognized arguments: --frobnicate"),
+]
+
+
+def the_line(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line of stderr; nothing on stdout."""
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("graspd: ")
+    assert err.count("\n") == 1, err
+    return err
+
+
+@pytest.mark.parametrize("name", BAD_OBJECTS)
+def test_a_bad_object_is_named_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str):
+    make, culprit = BAD_OBJECTS[name]
+    make(tmp_path / name)
+    assert main(["synthesize", str(tmp_path / name)]) == EXIT_BAD_INPUT
+    line = the_line(capsys)
+    assert culprit in line
+    assert name in line or name.endswith("npy"), "clouds are cleaned after they were read, under the name of cloud"
+
+
+def test_an_unknown_shape_lists_the_known(capsys: pytest.CaptureFixture[str]):
+    assert main(["synthesize", "shape:teapot"]) == EXIT_BAD_INPUT
+    line = the_line(capsys)
+    assert "teapot" in line
+    assert "cylinder" in line
+
+
+@pytest.mark.parametrize(("options", "culprit"), BAD_OPTIONS, ids=lambda value: str(value)[:40])
+def test_a_bad_option_is_named_in_one_line(capsys: pytest.CaptureFixture[str], options: list[str], culprit: str):
+    assert main(["synthesize", "shape:box", *options]) == EXIT_BAD_INPUT
+    assert culprit in the_line(capsys)
+
+
+@pytest.mark.parametrize("option", ["--hand", "--preset"])
+def test_malformed_yaml_is_named_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str):
+    (tmp_path / "broken.yaml").write_text("a: [1\nb: {")
+    assert main(["synthesize", "shape:box", option, str(tmp_path / "broken.yaml")]) == EXIT_BAD_INPUT
+    assert "broken.yaml" in the_line(capsys)
+
+
+@pytest.mark.parametrize("option", ["--out", "--html"])
+def test_an_unwritable_result_is_refused_before_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: pytest.fail("the run was started"))
+    (tmp_path / "file").write_text("here")
+    for path, culprit in ((tmp_path, "is a directory"), (tmp_path / "file" / "out", "cannot be written")):
+        assert main(["synthesize", "shape:box", option, str(path)]) == EXIT_BAD_INPUT
+        line = the_line(capsys)
+        assert str(path) in line
+        assert culprit in line
+
+
+def test_no_command_is_bad_input_and_help_is_not(capsys: pytest.CaptureFixture[str]):
+    assert main([]) == EXIT_BAD_INPUT
+    assert "COMMAND" in the_line(capsys)
+    with pytest.raises(SystemExit) as left:
+        main(["synthesize", "--help"])
+    assert left.value.code == 0
+    assert "--friction" in capsys.readouterr().out
+
+
+def test_hands_lists_the_boxed_hands(capsys: pytest.CaptureFixture[str]):
+    assert main(["hands"]) == EXIT_OK
+    assert "allegro_right: 16 joints" in capsys.readouterr().out
+
+
+def test_a_cloud_is_reconstructed_to_a_mesh_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    np.save(tmp_path / "ball.npy", surface_samples(make_shape("sphere"), 2000, 0)[0])
+    assert main(["reconstruct", str(tmp_path / "ball.npy"), "--out", str(tmp_path / "ball.ply")]) == EXIT_OK
+    assert "ball.ply" in capsys.readouterr().out
+    assert (tmp_path / "ball.ply").stat().st_size > 1000
+    assert main(["reconstruct", str(tmp_path / "ball.npy"), "--out", str(tmp_path / "ball.doc")]) == EXIT_BAD_INPUT
+    assert "valid endings" in the_line(capsys)
+    assert main(["reconstruct", str(tmp_path / "none.npy"), "--out", str(tmp_path / "x.ply")]) == EXIT_BAD_INPUT
+    assert "none.npy" in the_line(capsys)
+
+
+def test_a_run_that_ends_with_too_few_says_so(capsys: pytest.CaptureFixture[str]):
+    assert main(["synthesize", "shape:box", "-n", "2", "--preset", "fast", "--deadline", "0.01"]) == EXIT_TOO_FEW
+    assert "0 of 2 grasps (verified, 0 tried): the deadline passed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("outcome", "status"),
+    [
+        (Outcome.SUCCEEDED, EXIT_OK),
+        (Outcome.TOO_FEW, EXIT_TOO_FEW),
+        (Outcome.NO_CANDIDATES, EXIT_TOO_FEW),
+        (Outcome.DEADLINE, EXIT_TOO_FEW),
+        (Outcome.CANCELLED, EXIT_INTERRUPTED),
+    ],
+)
+def test_every_outcome_has_its_status(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], outcome: Outcome, status: int
+):
+    ended = GraspResult(outcome, (), Timing(), 0, "closed_form")
+    monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: ended)
+    assert main(["synthesize", "shape:box"]) == status
+    assert outcome.value in capsys.readouterr().out
+
+
+def test_the_first_interrupt_ends_the_run_and_the_second_the_process():
+    before = signal.getsignal(signal.SIGINT)
+    with Interrupt() as interrupt:
+        assert not interrupt.came()
+        signal.raise_signal(signal.SIGINT)
+        assert interrupt.came()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
+    """A mesh in millimetres on disk in; grasps.json and a page out."""
+    box = make_shape("box")
+    save_mesh(TriangleMesh(box.vertices * 1000, box.faces), tmp_path / "box.stl")
+    options = [
+        "-n",
+        "1",
+        "--units",
+        "mm",
+        "--preset",
+        "fast",
+        "--seed",
+        "1",
+        "--out",
+        "grasps.json",
+        "--html",
+        "view.html",
+    ]
+    done = subprocess.run(
+        [*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode in (EXIT_OK, EXIT_TOO_FEW), done.stderr
+    document = load_document(tmp_path / "grasps.json")
+    verified = [grasp["verdict"] == "verified" for grasp in document["grasps"]]
+    assert (sum(verified) == 1) == (done.returncode == EXIT_OK)
+    assert document["object"]["scale"] == 0.001
+    assert document["seed"] == 1
+    assert len(document["grasps"][0]["joint_positions"]) == len(document["hand"]["joint_names"]) == 16
+    assert (tmp_path / "view.html").stat().st_size > 100_000
+    assert "graspd: optimise" in done.stderr
+    assert "total" in done.stdout
+
+
+def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path):
+    out = tmp_path / "grasps.json"
+    command = [*GRASPD, "synthesize", "shape:box", "-n", "32", "--preset", "accurate", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert "optimise" in process.stderr.readline()
+    begun = time.monotonic()
+    os.kill(process.pid, signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == EXIT_INTERRUPTED, errors
+    assert "Traceback" not in errors
+    assert "cancelled" in output
+    assert load_document(out)["outcome"]["name"] == "CANCELLED"
+    # One optimiser step, the collision parts of a box, and the end of the process; an uncancelled run takes a minute.
+    assert time.monotonic() - begun < 15

@@ -1,0 +1,282 @@
+"""The file format: what is written comes back, JSON is strict, and other files are refused by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graspd_core.config import PlanConfig
+from graspd_core.errors import ConfigError, FormatError
+from graspd_core.formats.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import Mount
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.types import (
+    Contact,
+    Grasp,
+    GraspMetrics,
+    GraspResult,
+    HoldResult,
+    LiftResult,
+    Outcome,
+    Plane,
+    Posture,
+    Timing,
+    Verdict,
+)
+
+# The keys of docs/format.md, one set per object.
+TOP = {
+    "format",
+    "version",
+    "units",
+    "outcome",
+    "hand",
+    "object",
+    "config",
+    "seed",
+    "method",
+    "versions",
+    "timing",
+    "grasps",
+}
+HAND = {"name", "urdf", "base_link", "joint_names", "mimic", "mount"}
+OBJECT = {"source", "sha256", "center_of_mass", "mass", "friction", "scale", "support"}
+TIMING = {"load", "sdf", "compile", "optimise", "verify", "first_verified", "total"}
+GRASP = {
+    "rank", "verdict", "reason", "score", "position", "quaternion_wxyz", "joint_positions", "pregrasp_joint_positions",
+    "squeeze_joint_positions", "pregrasp_position", "pregrasp_quaternion_wxyz", "contacts", "metrics",
+}  # fmt: skip
+METRICS = {
+    "contact_area_cm2", "intersection_volume_cm3", "penetration_mm", "self_penetration_mm", "epsilon", "volume",
+    "sd_cm", "robustness", "hold", "lift",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("allegro_right")
+
+
+@pytest.fixture(scope="module")
+def target():
+    return load_scene("shape:box", mass=0.25, friction=0.8, resolution=16).object
+
+
+def posture(seed: int) -> Posture:
+    rng = np.random.default_rng(seed)
+    quaternion = rng.normal(size=4)
+    return Posture(rng.normal(size=3), quaternion / np.linalg.norm(quaternion), rng.normal(size=16))
+
+
+@pytest.fixture
+def result() -> GraspResult:
+    grip = posture(1)
+    held = Grasp(
+        pregrasp=posture(0),
+        grasp=grip,
+        squeeze=replace(posture(2), position=grip.position, quaternion_wxyz=grip.quaternion_wxyz),
+        contacts=(Contact("link_3.0_tip", (0.1, 0.2, 0.3), (0.0, 0.6, 0.8)),),
+        score=-1.5,
+        metrics=GraspMetrics(2e-4, 3, 1e-6, 0.0015, 0.0, 0.25, 1.5),
+        hold=HoldResult(True, 0.01, 0.1),
+        verdict=Verdict.VERIFIED,
+    )
+    lost = replace(
+        held,
+        metrics=None,
+        hold=HoldResult(False, float("inf"), float("inf"), "the simulation diverged"),
+        verdict=Verdict.FAILED,
+        reason="the simulation diverged",
+    )
+    timing = Timing(load=0.5, first_verified=2.5, total=3.0)
+    return GraspResult(Outcome.TOO_FEW, (held, lost), timing, 7, "closed_form", warnings=("open mesh",))
+
+
+@pytest.fixture
+def document(result, target, hand) -> dict[str, Any]:
+    return result_document(result, target, hand, PlanConfig())
+
+
+def test_keys_are_those_of_the_format(document):
+    assert set(document) == TOP
+    assert set(document["hand"]) == HAND
+    assert set(document["object"]) == OBJECT
+    assert set(document["timing"]) == TIMING
+    for grasp in document["grasps"]:
+        assert set(grasp) == GRASP
+        assert set(grasp["metrics"]) == METRICS
+        assert set(grasp["metrics"]["hold"]) == {"max_displacement_cm", "max_rotation_deg"}
+        assert set(grasp["contacts"][0]) == {"link", "position", "normal"}
+    assert {"graspd", "torch", "mujoco"} <= set(document["versions"])
+
+
+def test_units_are_converted_where_a_key_names_one(document):
+    metrics = document["grasps"][0]["metrics"]
+    assert metrics["contact_area_cm2"] == pytest.approx(2.0)
+    assert metrics["intersection_volume_cm3"] == pytest.approx(1.0)
+    assert metrics["penetration_mm"] == pytest.approx(1.5)
+    assert metrics["hold"]["max_displacement_cm"] == pytest.approx(1.0)
+    assert metrics["hold"]["max_rotation_deg"] == pytest.approx(np.rad2deg(0.1))
+
+
+def test_a_saved_result_is_read_back_bit_by_bit(tmp_path: Path, result, target, hand, document):
+    path = tmp_path / "deep" / "down" / "grasps.json"
+    save_result(path, result, target, hand, PlanConfig())
+    read = load_document(path)
+    assert read == document
+    assert [p.name for p in path.parent.iterdir()] == ["grasps.json"]
+    for before, after in zip(result.grasps, grasps_of(read), strict=True):
+        for name in ("pregrasp", "grasp", "squeeze"):
+            for field in ("position", "quaternion_wxyz", "joint_positions"):
+                assert np.array_equal(getattr(getattr(before, name), field), getattr(getattr(after, name), field))
+        assert after.contacts == before.contacts
+        assert (after.score, after.verdict, after.reason) == (before.score, before.verdict, before.reason)
+        assert after.hold is not None
+        assert before.hold is not None
+        assert after.hold.passed == before.hold.passed
+        assert after.hold.max_displacement == pytest.approx(before.hold.max_displacement)
+        assert after.hold.max_rotation == pytest.approx(before.hold.max_rotation)
+
+
+def test_what_is_not_finite_is_written_as_null(document):
+    text = json.dumps(document, allow_nan=False)
+    hold = json.loads(text)["grasps"][1]["metrics"]["hold"]
+    assert hold == {"max_displacement_cm": None, "max_rotation_deg": None}
+    assert json.loads(text)["grasps"][1]["metrics"]["epsilon"] is None
+
+
+def test_a_grasp_that_was_never_tried_has_no_hold(result, target, hand):
+    untried = replace(result, grasps=(replace(result.grasps[0], hold=None, verdict=Verdict.UNVERIFIED),))
+    written = result_document(untried, target, hand, PlanConfig())
+    assert written["grasps"][0]["metrics"]["hold"] is None
+    assert grasps_of(written)[0].hold is None
+
+
+def test_lift_and_support_are_written_and_read_back(result, target, hand):
+    held = result.grasps[0]
+    lifted = replace(held, lift=LiftResult(True, 0.02, 0.2, 0.0004))
+    dropped = replace(
+        held, lift=LiftResult(False, 0.06, 0.1, 0.0, "dropped"), verdict=Verdict.FAILED, reason="dropped"
+    )  # fmt: skip
+    table = Plane(np.array([0.0, 0.0, 1.0]), -0.05)
+    written = result_document(replace(result, grasps=(lifted, dropped), support=table), target, hand, PlanConfig())
+    assert json.loads(json.dumps(written, allow_nan=False)) == written
+    assert written["object"]["support"] == {"normal": [0.0, 0.0, 1.0], "offset": -0.05}
+    assert written["grasps"][0]["metrics"]["lift"] == {
+        "max_displacement_cm": pytest.approx(2.0),
+        "max_rotation_deg": pytest.approx(np.rad2deg(0.2)),
+        "reach_through_mm": pytest.approx(0.4),
+    }
+    for before, after in zip((lifted, dropped), grasps_of(written), strict=True):
+        assert after.hold is not None
+        assert after.hold.passed
+        assert after.hold.reason == ""
+        assert before.lift is not None
+        assert after.lift is not None
+        assert (after.lift.passed, after.lift.reason) == (before.lift.passed, before.lift.reason)
+        assert after.lift.reach_through == pytest.approx(before.lift.reach_through)
+
+
+def test_without_a_lift_there_is_none_and_files_from_before_there_was_one_are_read(document):
+    assert document["object"]["support"] is None
+    assert document["grasps"][0]["metrics"]["lift"] is None
+    assert grasps_of(document)[0].lift is None
+    del document["grasps"][0]["metrics"]["lift"]
+    assert grasps_of(document)[0].lift is None
+
+
+@pytest.mark.parametrize(
+    ("text", "culprit"),
+    [
+        ('{"format": "graspd/grasps", "version": 2}', "version 2 is unknown; this reader knows 1"),
+        ('{"format": "graspd/grasps"}', "version None"),
+        ('{"format": "other", "version": 1}', "not a graspd/grasps file"),
+        ("[]", "not a graspd/grasps file"),
+        ('{"format": ', "not JSON"),
+        ('{"format": "graspd/grasps", "version": 1, "seed": NaN}', "NaN is not a JSON number"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str, culprit: str):
+    path = tmp_path / "odd.json"
+    path.write_text(text)
+    with pytest.raises(FormatError) as caught:
+        load_document(path)
+    assert culprit in str(caught.value)
+    assert "odd.json" in str(caught.value)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path):
+    with pytest.raises(FormatError, match=r"nowhere\.json"):
+        load_document(tmp_path / "nowhere.json")
+
+
+@pytest.mark.parametrize("key", ["position", "verdict", "squeeze_joint_positions"])
+def test_a_grasp_without_a_key_is_refused(document, key: str):
+    del document["grasps"][0][key]
+    with pytest.raises(FormatError, match=key):
+        grasps_of(document)
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, result, target, hand):
+    spoilt = replace(result, grasps=(replace(result.grasps[0], score=float("nan")),))
+    with pytest.raises(ValueError, match="JSON"):
+        save_result(tmp_path / "grasps.json", spoilt, target, hand, PlanConfig())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_paths_are_refused_and_writable_ones_left_alone(tmp_path: Path):
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(ConfigError, match="is a directory"):
+        check_writable(tmp_path)
+    with pytest.raises(ConfigError, match="cannot be written"):
+        check_writable(tmp_path / "file" / "grasps.json")
+    check_writable(tmp_path / "new" / "grasps.json")
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_coupled_joints_are_written_with_their_own_values_and_read_back_as_they_were(result, target):
+    hand = replace(load_hand("barrett_like", candidates=8), mount=Mount("tool0", (0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)))
+    rng = np.random.default_rng(0)
+
+    def at(posture: Posture) -> Posture:
+        return replace(posture, joint_positions=rng.uniform(hand.lower, hand.upper))
+
+    grasp = result.grasps[0]
+    grasp = replace(grasp, pregrasp=at(grasp.pregrasp), grasp=at(grasp.grasp), squeeze=at(grasp.squeeze))
+    document = json.loads(json.dumps(result_document(replace(result, grasps=(grasp,)), target, hand, PlanConfig())))
+    names, values = document["hand"]["joint_names"], document["grasps"][0]["joint_positions"]
+    assert len(names) == len(values) == 8
+    value = dict(zip(names, values, strict=True))
+    for mimic in document["hand"]["mimic"]:
+        assert value[mimic["joint"]] == pytest.approx(mimic["multiplier"] * value[mimic["of"]] + mimic["offset"])
+    assert document["hand"]["mount"] == {
+        "parent": "tool0", "position": [0.0, 0.0, 0.1], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]
+    }  # fmt: skip
+    (after,) = grasps_of(document)
+    for name in ("pregrasp", "grasp", "squeeze"):
+        assert np.array_equal(getattr(after, name).joint_positions, getattr(grasp, name).joint_positions)
+
+
+def test_a_file_from_before_joints_could_be_coupled_is_read(document, result):
+    del document["hand"]["mimic"]
+    del document["hand"]["mount"]
+    assert np.array_equal(grasps_of(document)[0].grasp.joint_positions, result.grasps[0].grasp.joint_positions)
+
+
+def test_too_few_joint_values_are_refused(document):
+    document["grasps"][0]["squeeze_joint_positions"].pop()
+    with pytest.raises(FormatError, match="squeeze_joint_positions has 15 values for 16 joints"):
+        grasps_of(document)
+
+
+@pytest.mark.parametrize("wrong", [[], None, "allegro", {"joint_names": 3}, {"joint_names": [], "mimic": [7]}])
+def test_a_hand_of_the_wrong_kind_is_refused(document, wrong: object):
+    document["hand"] = wrong
+    with pytest.raises(FormatError, match="grasps: "):
+        grasps_of(document)

@@ -1,0 +1,115 @@
+"""All solids at once give the distances that each primitive gives on its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from graspd_core.hands.collision_tensors import Solids, make_solids, pair_distance, solid_distance
+from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.link_distance import hand_sdf, primitive_sdf
+from graspd_core.hands.model import HandModel, Primitive
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return load_hand("allegro_right", candidates=40)
+
+
+@pytest.fixture(scope="module")
+def solids(hand: HandModel) -> Solids:
+    return make_solids(hand, "cpu", torch.float64)
+
+
+@pytest.fixture(scope="module")
+def kinematics(hand: HandModel) -> Kinematics:
+    return make_kinematics(hand, dtype=torch.float64)
+
+
+def drawn(hand: HandModel, seed: int, postures: int = 2, points: int = 12) -> tuple[Tensor, Tensor]:
+    """Joint values within limits, and points in the space that the hand takes up."""
+    generator = torch.Generator().manual_seed(seed)
+    lower, upper = torch.as_tensor(hand.lower), torch.as_tensor(hand.upper)
+    q = lower + (upper - lower) * torch.rand(postures, len(lower), generator=generator, dtype=torch.float64)
+    low, high = torch.tensor([-0.05, -0.1, -0.1]), torch.tensor([0.1, 0.1, 0.2])
+    return q, low + (high - low) * torch.rand(postures, points, 3, generator=generator, dtype=torch.float64)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=8)
+def test_distances_are_those_of_the_primitives(hand, solids, kinematics, seed):
+    q, points = drawn(hand, seed)
+    rotations, translations = forward(kinematics, q)
+    together = solid_distance(solids, rotations, translations, points)
+    assert together.shape == (2, 12, len(hand.primitives))
+    for link in range(hand.num_links):
+        local = (points - translations[:, None, link]) @ rotations[:, link]
+        # The same formulas in another order: rounding of 0.1 m.
+        for number, primitive in enumerate(hand.primitives):
+            if primitive.link == link:
+                alone = primitive_sdf(primitive, local)
+                assert together[..., number].numpy() == pytest.approx(alone.numpy(), abs=1e-12)
+        own = solids.link == link
+        if own.any():
+            union = hand_sdf(hand, link, local)
+            assert together[..., own].amin(-1).numpy() == pytest.approx(union.numpy(), abs=1e-12)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=8)
+def test_pairs_are_entries_of_the_whole(hand, solids, kinematics, seed):
+    q, points = drawn(hand, seed)
+    frames = forward(kinematics, q)
+    which = torch.randint(len(solids.link), points.shape[:2], generator=torch.Generator().manual_seed(seed))
+    pairs = pair_distance(solids, *frames, points, which)
+    whole = solid_distance(solids, *frames, points).gather(-1, which[..., None]).squeeze(-1)
+    assert pairs.numpy() == pytest.approx(whole.numpy(), abs=1e-12)
+
+
+def test_capsules_are_swept_segments_and_hulls_are_left_out(hand):
+    corners = np.array([[0.0, 0, 0], [0.03, 0, 0], [0, 0.02, 0], [0, 0, 0.04]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    capsule = Primitive(1, "capsule", np.eye(3)[:, [1, 2, 0]], np.array([0.02, 0.0, 0.01]), (0.01, 0.03))
+    hull = Primitive(1, "hull", np.eye(3), np.zeros(3), (), corners, faces)
+    found = make_solids(replace(hand, primitives=(hull, capsule)), "cpu", torch.float64)
+    assert found.link.tolist() == [1]
+    q, points = drawn(hand, 0)
+    rotations, translations = forward(make_kinematics(hand, dtype=torch.float64), q)
+    local = (points - translations[:, None, 1]) @ rotations[:, 1]
+    together = solid_distance(found, rotations, translations, points)[..., 0]
+    assert together.numpy() == pytest.approx(primitive_sdf(capsule, local).numpy(), abs=1e-12)
+
+
+def test_gradients_against_finite_differences(hand, solids, kinematics):
+    q, points = drawn(hand, 5, points=3)
+    which = torch.tensor([[0, 7, 13], [4, 19, 26]])
+
+    def every(q: Tensor, points: Tensor) -> Tensor:
+        return solid_distance(solids, *forward(kinematics, q), points)
+
+    def pairs(q: Tensor, points: Tensor) -> Tensor:
+        return pair_distance(solids, *forward(kinematics, q), points, which)
+
+    # Points are drawn anywhere, so none is within the step of 1e-6 of a kink (an edge's or a middle plane's extension).
+    inputs = (q.requires_grad_(True), points.requires_grad_(True))
+    assert gradcheck(every, inputs)
+    assert gradcheck(pairs, inputs)
+
+
+def test_gradients_are_finite_on_an_axis(solids):
+    at = solids.translation[None].clone().requires_grad_(True)
+    links = int(solids.link.max()) + 1
+    rotations = torch.eye(3, dtype=torch.float64).expand(1, links, 3, 3)
+    distance = solid_distance(solids, rotations, torch.zeros(1, links, 3, dtype=torch.float64), at)
+    # Each point is the middle of its own solid, and of no other necessarily.
+    assert (distance[0].diagonal() < 0).all()
+    (gradient,) = torch.autograd.grad(distance.sum(), at)
+    assert gradient.isfinite().all()

@@ -1,0 +1,236 @@
+"""Reading, refusing, cleaning and measuring meshes."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graspd_core.errors import MeshError
+from graspd_core.mesh.mesh_files import (
+    check_mesh,
+    content_hash,
+    load_mesh,
+    mass_properties,
+    save_mesh,
+    simplify,
+    surface_samples,
+)
+from graspd_core.mesh.shapes import BOX_HALF, make_shape, shape_volume
+from graspd_core.mesh.topology import is_closed
+from graspd_core.mesh.units import unit_advice
+from graspd_core.types import TriangleMesh
+
+
+def scaled(mesh, factor):
+    return dataclasses.replace(mesh, vertices=mesh.vertices * factor)
+
+
+@pytest.mark.parametrize("ending", ["obj", "stl", "ply", "glb", "off"])
+def test_files_come_back_whole(tmp_path, ending):
+    box = make_shape("box")
+    save_mesh(box, tmp_path / f"box.{ending}")
+    mesh, warnings = check_mesh(load_mesh(tmp_path / f"box.{ending}", scale=2.0), "box")
+    assert warnings == ()
+    assert len(mesh.faces) == len(box.faces)
+    # Binary formats hold float32.
+    assert mass_properties(mesh)[0] == pytest.approx(8 * shape_volume("box"), rel=1e-5)
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda d: d / "none.obj", "no such mesh file"),
+        (lambda d: d, "is a directory"),
+        (lambda d: write(d / "a.xyz", "0 0 0"), "unknown mesh ending '.xyz'; valid endings: dae, glb, obj"),
+        (lambda d: write(d / "a.stl", "no mesh at all"), "a.stl"),
+        (lambda d: write(d / "a.glb", "no mesh at all"), "not a readable glb"),
+        (lambda d: write(d / "a.obj", ""), "a.obj"),
+        (lambda d: write(d / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n"), "a.obj"),
+        (lambda d: write(d / "a.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "1 of 3 vertices are NaN"),
+        (lambda d: write(d / "a.obj", "v inf 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "1 of 3 vertices are NaN"),
+    ],
+)
+def test_bad_files_are_named(tmp_path, make, complaint):
+    with pytest.raises(MeshError) as error:
+        load_mesh(make(tmp_path))
+    assert complaint in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("factor", "complaint"),
+    [
+        (1000.0, "90 m across.*--units mm makes it 90 mm$"),
+        (100.0, "9 m across.*--units cm makes it 90 mm, --units inch makes it 229 mm"),
+        (1 / 0.0254, "3.543 m across.*--units inch makes it 90 mm.*--units cm makes it 35.4 mm"),
+        (1e-3, "9e-05 m across.*--scale 1000 makes it 90 mm"),
+        (1e6, r"9e\+04 m across.*--scale 1e-06 makes it 90 mm$"),
+        (0.0, "0 m across.*all lie in one point"),
+    ],
+)
+def test_wrong_units_are_guessed_and_not_applied(factor, complaint):
+    with pytest.raises(MeshError, match=complaint):
+        check_mesh(scaled(make_shape("box"), factor), "box.obj")
+
+
+@pytest.mark.parametrize(
+    ("size", "doubt"),
+    [
+        (0.005, "small for a hand; if the file is not in metres, --scale 10 makes it 50 mm"),
+        (
+            0.9,
+            "large for a hand; if the file is not in metres, --scale 0.1 makes it 90 mm, --units inch makes it 22.9 mm",
+        ),
+        (0.09, None),
+        (0.45, None),
+        (0.01, None),
+    ],
+)
+def test_small_and_large_things_are_allowed_and_doubted(size, doubt):
+    mesh, warnings = check_mesh(scaled(make_shape("box"), size / 0.09), "box")
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(size)
+    assert [w.partition("across, ")[2] for w in warnings] == ([doubt] if doubt else [])
+
+
+@pytest.mark.parametrize(
+    ("scale", "size", "advice"),
+    [
+        (0.01, 0.9, "in another unit, --units mm makes it 90 mm"),
+        (
+            1e-3,
+            0.005,
+            "in another unit, --units inch makes it 127 mm, --units cm makes it 50 mm, --scale 0.1 makes it 500 mm",
+        ),
+        (10.0, 0.9, "in another unit, --scale 1 makes it 90 mm"),
+    ],
+)
+def test_advice_is_on_what_to_pass_in_place_of_what_was_passed(scale, size, advice):
+    _, (doubt,) = check_mesh(scaled(make_shape("box"), size / 0.09), "box", scale=scale)
+    assert doubt.partition("if the file is ")[2] == advice
+
+
+@pytest.mark.parametrize(("size", "scale"), [(float("inf"), 1.0), (1e300, 1e-300), (5e-324, 1e10), (1e-9, 1e300)])
+def test_advice_on_absurd_numbers_is_a_number_still(size, scale):
+    assert re.fullmatch(r"--scale 1e[+-]\d+ makes it [\d.]+ mm", unit_advice(size, scale))
+
+
+def test_a_face_without_its_vertex_is_named(tmp_path):
+    with pytest.raises(MeshError, match="a face names a vertex that the file does not hold: index 8 is out of bounds"):
+        load_mesh(write(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"))
+
+
+def test_a_mesh_of_many_faces_is_made_smaller_first():
+    mesh, warnings = check_mesh(make_shape("sphere"), "ball", 1000)
+    assert len(mesh.faces) <= 1020
+    assert warnings == ("ball: simplified from 5120 to 1000 faces",)
+    assert is_closed(mesh)
+
+
+def test_faces_without_area_alone_are_refused():
+    line = TriangleMesh(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, 0, 0]]), np.array([[0, 1, 2]]))
+    with pytest.raises(MeshError, match="no face has an area"):
+        check_mesh(line, "line")
+
+
+def test_faces_beyond_the_vertices_are_refused():
+    with pytest.raises(MeshError, match="outside 0 to 2"):
+        check_mesh(TriangleMesh(np.eye(3), np.array([[0, 1, 3]])), "mesh")
+
+
+def test_doubled_and_degenerate_faces_go():
+    box = make_shape("box")
+    extra = np.vstack([box.faces, box.faces[:, ::-1], [[0, 0, 1]]])
+    mesh, warnings = check_mesh(TriangleMesh(box.vertices, extra), "box")
+    assert len(mesh.faces) == len(box.faces)
+    assert any("without area" in w for w in warnings)
+    assert any(f"{len(box.faces)} repeated" in w for w in warnings)
+
+
+def test_soup_is_joined():
+    box = make_shape("box")
+    soup = TriangleMesh(box.vertices[box.faces].reshape(-1, 3), np.arange(3 * len(box.faces)).reshape(-1, 3))
+    mesh, warnings = check_mesh(soup, "soup")
+    assert len(mesh.vertices) == len(box.vertices)
+    assert warnings == ()
+
+
+@given(seed=st.integers(0, 1000))
+def test_mixed_winding_is_made_consistent(seed):
+    bowl = make_shape("bowl")
+    flip = np.random.default_rng(seed).random(len(bowl.faces)) < 0.5
+    mixed = np.where(flip[:, None], bowl.faces[:, ::-1], bowl.faces)
+    mesh, warnings = check_mesh(TriangleMesh(bowl.vertices, mixed), "bowl")
+    assert any("winding" in w for w in warnings)
+    assert mass_properties(mesh)[0] == pytest.approx(mass_properties(bowl)[0], rel=1e-9)
+
+
+def test_mass_properties_of_a_box_are_the_closed_form():
+    volume, center, inertia = mass_properties(make_shape("box"))
+    squares = (2 * np.array(BOX_HALF)) ** 2
+    assert volume == pytest.approx(shape_volume("box"))
+    assert center == pytest.approx(np.zeros(3), abs=1e-12)
+    # Box: I_x = m (b² + c²) / 12, and so on.
+    assert inertia == pytest.approx(np.diag(volume * (squares.sum() - squares) / 12), abs=1e-12)
+
+
+@pytest.mark.parametrize("change", ["invert", "open"])
+def test_mass_properties_of_broken_boxes(change):
+    box = make_shape("box")
+    # A face of the 1024 missing: the winding number hardly notices.
+    faces = box.faces[:, ::-1] if change == "invert" else box.faces[1:]
+    volume, center, inertia = mass_properties(TriangleMesh(box.vertices, faces))
+    exact = mass_properties(box)
+    assert volume == pytest.approx(exact[0], rel=0.02)
+    assert center == pytest.approx(exact[1], abs=1e-3)
+    assert inertia == pytest.approx(exact[2], abs=0.05 * exact[2].max())
+
+
+def test_a_flat_sheet_has_the_mass_properties_of_a_thin_box():
+    corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+    sheet = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    volume, center, inertia = mass_properties(sheet)
+    assert volume == pytest.approx(0.1 * 0.1 * 1e-3)
+    assert center == pytest.approx([0.05, 0.05, 0.0], abs=1e-5)
+    assert (np.linalg.eigvalsh(inertia) > 0).all()
+
+
+def test_hash_tells_content_apart():
+    box = make_shape("box")
+    assert content_hash(box) == content_hash(make_shape("box"))
+    assert content_hash(box) != content_hash(scaled(box, 1.0001))
+    assert content_hash(box) != content_hash(TriangleMesh(box.vertices, box.faces[:, ::-1]))
+
+
+def test_simplified_sphere_keeps_its_volume():
+    coarse = simplify(make_shape("sphere"), 600)
+    assert len(coarse.faces) <= 620
+    assert mass_properties(coarse)[0] == pytest.approx(shape_volume("sphere"), rel=0.03)
+
+
+@given(seed=st.integers(0, 2**31))
+def test_samples_lie_on_the_surface_and_are_spread_by_area(seed):
+    points, normals = surface_samples(make_shape("box"), 2000, seed)
+    past = np.abs(points) / np.array(BOX_HALF)
+    assert past.max(1) == pytest.approx(np.ones(2000), abs=1e-9)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(2000))
+    # The two square ends are 2·60·60 of 2·60·60 + 4·60·90 mm²: a quarter.
+    assert (past.argmax(1) == 2).mean() == pytest.approx(0.25, abs=0.01)
+
+
+def test_a_tear_made_by_simplifying_is_not_blamed_on_the_mesh():
+    # Boxes that touch along whole sides share edges of four faces: closed, and torn by the simplifier.
+    box = make_shape("box")
+    halves = box.vertices / np.abs(box.vertices).max(0) * 0.02
+    row = np.concatenate([halves + np.array([0.04 * i, 0.0, 0.0]) for i in range(4)])
+    joined = TriangleMesh(row, np.concatenate([box.faces + i * len(halves) for i in range(4)]))
+    mesh, warnings = check_mesh(joined, "row", 600)
+    assert not is_closed(mesh)
+    assert warnings == ("row: simplified from 4096 to 600 faces",)

@@ -1,0 +1,233 @@
+"""The grid against exact distances, its derivative against differences, and surfaces with odd insides."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graspd_core.hands.primitive_sdf import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+from graspd_core.mesh.mesh_files import check_mesh
+from graspd_core.mesh.sdf import PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf
+from graspd_core.mesh.shapes import (
+    BOX_HALF,
+    CAPSULE_HALF,
+    CAPSULE_RADIUS,
+    CYLINDER_HALF,
+    CYLINDER_RADIUS,
+    MUG_RADIUS,
+    MUG_WALL,
+    PLATE_HALF,
+    SPHERE_RADIUS,
+    make_shape,
+)
+from graspd_core.se3 import random_rotations
+from graspd_core.types import TriangleMesh
+
+EXACT = {
+    "sphere": lambda p: sphere_sdf(p, SPHERE_RADIUS),
+    "box": lambda p: box_sdf(p, torch.tensor(BOX_HALF, dtype=p.dtype)),
+    "plate": lambda p: box_sdf(p, torch.tensor(PLATE_HALF, dtype=p.dtype)),
+    "cylinder": lambda p: cylinder_sdf(p, CYLINDER_RADIUS, CYLINDER_HALF),
+    "capsule": lambda p: capsule_sdf(p, CAPSULE_RADIUS, CAPSULE_HALF),
+}
+
+
+def phi(sdf: GridSDF, points) -> np.ndarray:
+    return sample_sdf(sdf, torch.as_tensor(points, dtype=sdf.field.dtype))[0].numpy()
+
+
+@pytest.fixture(scope="module")
+def box() -> GridSDF:
+    return build_sdf(make_shape("box"), resolution=32, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", EXACT)
+@settings(max_examples=6)
+@given(seed=st.integers(0, 10_000))
+def test_grid_is_the_exact_distance_to_a_fraction_of_a_cell(name, seed):
+    generator = torch.Generator().manual_seed(seed)
+    rotation = random_rotations(1, generator, torch.float64)[0]
+    shift = torch.randn(3, generator=generator, dtype=torch.float64)
+    mesh = make_shape(name)
+    posed = TriangleMesh(mesh.vertices @ rotation.numpy().T + shift.numpy(), mesh.faces)
+    sdf = build_sdf(posed, resolution=32, dtype=torch.float64)
+    points = 0.2 * (torch.rand(2000, 3, generator=generator, dtype=torch.float64) - 0.5)
+    inner = points[((points @ rotation.T + shift - sdf.origin - sdf.half).abs() < sdf.half).all(-1)]
+    found, normal = sample_sdf(sdf, inner @ rotation.T + shift)
+    exact = EXACT[name](inner)
+    # At a kink of the distance (crease, axis) all nodes may err by their way to it: half a cell's diagonal.
+    assert (found - exact).abs().max() < 0.87 * sdf.spacing
+    assert (found - exact).abs().mean() < 0.06 * sdf.spacing
+    assert torch.allclose(normal.norm(dim=-1), torch.ones_like(exact), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_normals_near_the_surface_point_outwards(name):
+    sdf = build_sdf(make_shape(name), dtype=torch.float64)
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).sub(0.5).mul(0.16)
+    points = points[EXACT[name](points).abs() < 0.01].requires_grad_()
+    (exact,) = torch.autograd.grad(EXACT[name](points).sum(), points)
+    _, normal = sample_sdf(sdf, points)
+    # Median within 3 degrees: at creases the direction jumps, and there only the side counts.
+    cosine = (normal * exact).sum(-1)
+    assert cosine.median() > 0.9985
+    assert (cosine > 0).double().mean() > 0.98
+
+
+@given(seed=st.integers(0, 10_000), reach=st.sampled_from([0.05, 0.4]))
+def test_derivative_is_the_finite_difference(box, seed, reach):
+    generator = torch.Generator().manual_seed(seed)
+    points = (2 * torch.rand(16, 3, generator=generator, dtype=torch.float64) - 1) * reach
+    # Keep 1 % of a cell clear of cell walls, where the interpolant's slope jumps.
+    cell = (points - box.origin) / box.spacing
+    points = box.origin + box.spacing * (cell.floor() + (cell - cell.floor()).clamp(0.01, 0.99))
+    weights = torch.randn(16, 4, generator=generator, dtype=torch.float64)
+
+    def value(p):
+        distance, normal = sample_sdf(box, p)
+        return (weights[:, 0] * distance + (weights[:, 1:] * normal).sum(-1) * 0.01).reshape(-1)
+
+    points.requires_grad_()
+    (gradient,) = torch.autograd.grad(value(points).sum(), points)
+    step = 1e-7
+    shifts = step * torch.eye(3, dtype=torch.float64)
+    numeric = torch.stack([(value(points.detach() + d) - value(points.detach() - d)) / (2 * step) for d in shifts], -1)
+    # Where the interpolated directions cancel, on the box's middle planes, the normal turns within a rounding error.
+    assert torch.isfinite(gradient).all()
+    close = torch.isclose(gradient, numeric, rtol=1e-4, atol=1e-4).all(-1)
+    assert close.double().mean() > 0.9
+
+
+@given(seed=st.integers(0, 10_000))
+def test_continuous_across_the_border(box, seed):
+    generator = torch.Generator().manual_seed(seed)
+    size = 2 * box.half
+    points = box.origin + size * torch.rand(64, 3, generator=generator, dtype=torch.float64)
+    face = torch.randint(3, (64,), generator=generator)
+    points[torch.arange(64), face] = (box.origin + size)[face]
+    outwards = torch.nn.functional.one_hot(face, 3).double() * 1e-9
+    inside, outside = sample_sdf(box, points - outwards), sample_sdf(box, points + outwards)
+    assert torch.allclose(inside[0], outside[0], atol=1e-7)
+    assert torch.allclose(inside[1], outside[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_far_outside_the_error_is_a_few_percent(name):
+    sdf = build_sdf(make_shape(name), dtype=torch.float64)
+    points = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = points / points.norm(dim=-1, keepdim=True) * 0.3
+    found, _ = sample_sdf(sdf, points)
+    error = (found - EXACT[name](points)).abs() / EXACT[name](points)
+    # One surface point stands for the closest one; worst is a ball seen along the grid's diagonal.
+    assert error.max() < 0.04
+
+
+def test_precisions_agree(box):
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).sub(0.5).mul(0.3)
+    single = sample_sdf(box.to("cpu", torch.float32), points.float())
+    double = sample_sdf(box, points)
+    assert torch.allclose(single[0].double(), double[0], atol=1e-6)
+
+
+def test_no_nan_at_nodes_centre_and_border(box):
+    nodes = torch.stack([box.origin, box.origin + 2 * box.half, torch.zeros(3).double()]).requires_grad_()
+    distance, normal = sample_sdf(box, nodes)
+    (distance.sum() + normal.sum()).backward()
+    assert nodes.grad is not None
+    assert torch.isfinite(nodes.grad).all()
+
+
+def test_the_mug_is_hollow_and_its_handle_is_joined():
+    sdf = build_sdf(make_shape("mug"), resolution=64)
+    axis, wall, root, hole = (0, 0, 0.01), (0, MUG_RADIUS - MUG_WALL / 2, 0), (0.042, 0, 0.028), (0.05, 0, 0)
+    found = phi(sdf, [axis, wall, root, hole])
+    assert found[0] == pytest.approx(MUG_RADIUS - MUG_WALL, abs=0.002)
+    assert found[1] < 0
+    assert found[2] < 0
+    assert found[3] > 0.005
+
+
+def test_mug_without_its_bottom_cap_stays_hollow():
+    mug = make_shape("mug")
+    bottom = mug.vertices[mug.faces][:, :, 2].max(1) < mug.vertices[:, 2].min() + 1e-6
+    sdf = build_sdf(TriangleMesh(mug.vertices, mug.faces[~bottom]), resolution=64)
+    found = phi(sdf, [(0, 0, 0.02), (0, MUG_RADIUS - MUG_WALL / 2, 0)])
+    assert found[0] > 0.02
+    assert found[1] < 0
+
+
+@pytest.mark.parametrize("change", ["invert", "double", "mix"])
+def test_damaged_surfaces_have_the_same_inside(change):
+    sphere = make_shape("sphere")
+    flipped = sphere.faces[:, ::-1]
+    odd = (np.arange(len(sphere.faces)) % 3 == 0)[:, None]
+    faces = {
+        "invert": flipped,
+        "double": np.vstack([sphere.faces, sphere.faces]),
+        "mix": np.where(odd, flipped, sphere.faces),
+    }[change]
+    damaged = TriangleMesh(sphere.vertices, np.ascontiguousarray(faces))
+    if change == "mix":
+        damaged, _ = check_mesh(damaged, "sphere")
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)).sub(0.5).mul(0.12)
+    good = sample_sdf(build_sdf(sphere, resolution=24), points)
+    bad = sample_sdf(build_sdf(damaged, resolution=24), points)
+    assert torch.allclose(good[0], bad[0], atol=1e-5)
+    # One direction in 13824 may lie on the surface, and an inverted face's normal must not leak through it.
+    assert torch.allclose(good[1], bad[1], atol=1e-3)
+
+
+def test_a_sheet_has_no_inside():
+    corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+    sheet = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    sdf = build_sdf(sheet, resolution=16)
+    assert not is_solid(sdf)
+    assert phi(sdf, [(0.05, 0.05, 0.02)])[0] == pytest.approx(0.02, abs=0.002)
+    assert is_solid(build_sdf(make_shape("sphere"), resolution=16))
+
+
+@pytest.mark.parametrize("size", [0.005, 1.2])
+def test_small_and_large_objects_fill_their_grid(size):
+    sphere = make_shape("sphere")
+    mesh = dataclasses.replace(sphere, vertices=sphere.vertices * size / (2 * SPHERE_RADIUS))
+    sdf = build_sdf(mesh)
+    # The centre lies between eight nodes, each half a cell's diagonal nearer to the surface.
+    assert phi(sdf, [(0, 0, 0)])[0] == pytest.approx(-size / 2, abs=float(sdf.spacing))
+    assert float(sdf.spacing) < size / 23
+
+
+@given(sides=st.tuples(*[st.floats(0.001, 2.0)] * 3), resolution=st.integers(8, 96))
+def test_cells_are_the_finest_that_cover_any_box(sides, resolution):
+    corners = np.array([(0, 0, 0), sides]) + 5.0
+    mesh = TriangleMesh(np.vstack([corners, corners[:1]]), np.array([[0, 1, 2]]))
+    layout = grid_layout(mesh, resolution)
+    padding = min(PADDING, max(sides) / 2)
+    reach = (np.array(layout.counts) - 1) * layout.spacing
+    assert np.prod(layout.counts) <= resolution**3
+    assert (layout.origin <= corners[0] - padding + 1e-6).all()
+    assert (layout.origin + reach >= corners[1] + padding - 1e-6).all()
+    assert layout.origin + reach / 2 == pytest.approx(corners.mean(0))
+    finer = np.ceil((np.array(sides) + 2 * padding) / (layout.spacing * (1 - 1e-6))) + 1
+    assert finer.prod() > resolution**3
+
+
+def test_a_cube_keeps_as_many_nodes_along_each_axis():
+    sphere = make_shape("sphere")
+    layout = grid_layout(sphere, 48)
+    assert layout.counts == (48, 48, 48)
+    assert layout.spacing == pytest.approx((2 * (SPHERE_RADIUS + PADDING)) / 47)
+
+
+def test_a_rod_is_seen_by_a_grid_of_as_many_nodes():
+    box = make_shape("box")
+    rod = TriangleMesh(box.vertices / np.abs(box.vertices).max(0) * (0.012, 0.012, 0.6), box.faces)
+    sdf = build_sdf(rod)
+    # Cells of a cube about it would be 26 mm wide.
+    assert float(sdf.spacing) < 0.005
+    assert is_solid(sdf)
+    # Halfway along, at its end, and beside it as far as the grid does not reach.
+    assert phi(sdf, [(0.012, 0, 0.1), (0, 0, 0.6)]) == pytest.approx(0.0, abs=0.002)
+    assert phi(sdf, [(0.1, 0.0, 0.3)]) == pytest.approx(0.088, abs=0.001)

@@ -1,0 +1,74 @@
+"""One small hand and small problems for the whole room, and the one finite-difference checker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.methods.problem import Problem, build_problem
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Scene
+
+
+@pytest.fixture(scope="session")
+def hand() -> HandModel:
+    return load_hand("allegro_right", candidates=120)
+
+
+@pytest.fixture(scope="session")
+def scenes() -> dict[str, Scene]:
+    return {name: load_scene(f"shape:{name}", resolution=48) for name in ("sphere", "box", "cylinder")}
+
+
+@pytest.fixture(scope="session")
+def problem_of(hand: HandModel, scenes: dict[str, Scene]) -> Callable[[str, torch.dtype], Problem]:
+    """The problem of an object by name and precision, with 60 coarse candidates; built once."""
+    built: dict[tuple[str, torch.dtype], Problem] = {}
+
+    def problem_of(name: str, dtype: torch.dtype = torch.float64) -> Problem:
+        if (name, dtype) not in built:
+            built[name, dtype] = build_problem(
+                scenes[name], hand, candidates=60, features=24, directions=12, friction=0.5, seed=0,
+                device="cpu", dtype=dtype,
+            )  # fmt: skip
+        return built[name, dtype]
+
+    return problem_of
+
+
+@pytest.fixture(scope="session")
+def slope_errors() -> Callable[..., Tensor]:
+    """Autograd against central differences along seeded random directions.
+
+    The error is relative to the length of the gradient, so that directions across the gradient count for little.
+    """
+
+    def slope_errors(
+        function: Callable[[Tensor], Tensor],
+        x: Tensor,
+        *,
+        step: float,
+        directions: int = 4,
+        variables: slice = slice(None),
+    ) -> Tensor:
+        """Errors of the slopes of `function`, (batch, n) to (batch,), as (directions, batch)."""
+        x = x.detach().requires_grad_(True)
+        (gradient,) = torch.autograd.grad(function(x).sum(), x)
+        length = gradient[:, variables].norm(dim=-1)
+        generator = torch.Generator().manual_seed(0)
+        errors = []
+        for _ in range(directions):
+            along = torch.zeros_like(x)
+            along[:, variables] = torch.randn(x[:, variables].shape, generator=generator, dtype=x.dtype)
+            along = along / along.norm(dim=-1, keepdim=True)
+            with torch.no_grad():
+                slope = (function(x + step * along) - function(x - step * along)) / (2 * step)
+            errors.append((slope - (gradient * along).sum(-1)).abs() / length.clamp_min(1e-9))
+        return torch.stack(errors)
+
+    return slope_errors

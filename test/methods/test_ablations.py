@@ -1,0 +1,78 @@
+"""The ablation presets change what they name and nothing else, and the hard contact has no gradient off its width."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from graspd_core.config import METHODS, ClosedFormConfig, LossWeights, load_preset
+from graspd_core.methods.candidates import SEARCHES
+from graspd_core.methods.closed_form.closed_form import ClosedForm, pack
+from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.methods.loop import Hooks, minimise
+from graspd_core.methods.losses import hard_contact, soft_contact
+
+DEFAULT = ClosedFormConfig()
+DOUBLE = torch.float64
+
+
+@pytest.mark.parametrize(
+    ("preset", "expected"),
+    [
+        ("closed_form_no_coarse_to_fine", replace(DEFAULT, radius_start=0.0, delta_start=DEFAULT.delta_end)),
+        ("closed_form_hard_contact", replace(DEFAULT, activation="hard")),
+        (
+            "closed_form_no_self_collision",
+            replace(
+                DEFAULT,
+                weights=replace(DEFAULT.weights, self_collision=0.0),
+                polish_weights=replace(DEFAULT.polish_weights, self_collision=0.0),
+            ),
+        ),
+    ],
+)
+def test_an_ablation_changes_only_what_it_names(preset: str, expected: ClosedFormConfig):
+    assert load_preset(preset) == replace(load_preset("balanced"), closed_form=expected)
+
+
+@pytest.mark.parametrize("method", ["annealing", "random_closure"])
+def test_rivals_have_a_preset_and_a_search(method: str):
+    assert load_preset(method) == replace(load_preset("balanced"), method=method)
+    assert method in METHODS
+    assert callable(SEARCHES[method])
+
+
+def test_a_hard_contact_is_one_within_its_width_and_zero_beyond_without_gradient():
+    distance = torch.tensor([[-0.005, -0.004, 0.0, 0.003, 0.0041]], dtype=DOUBLE, requires_grad=True)
+    radius = torch.zeros(1, dtype=DOUBLE)
+    assert hard_contact(distance, radius, 0.004).tolist() == [[0.0, 1.0, 1.0, 1.0, 0.0]]
+    assert not hard_contact(distance, radius, 0.004).requires_grad
+    assert soft_contact(distance, radius, 0.004).requires_grad
+    assert hard_contact(distance, radius + 0.004, 0.001).tolist() == [[0.0, 0.0, 0.0, 1.0, 1.0]]
+
+
+def test_the_hard_solver_looks_no_farther_than_the_end_width(hand, scenes, problem_of):
+    problem = problem_of("box", DOUBLE)
+    starts = draw_starts(scenes["box"], hand, 2, 0, "cpu", DOUBLE)
+    # From the start, centimetres off and without padding, no candidate is within 4 mm: the task has no slope at all.
+    only_task = LossWeights(task=1.0, distance=0.0, penetration=0.0, self_collision=0.0, posture=0.0)
+    config = replace(DEFAULT, activation="hard", weights=only_task)
+    x = pack(replace(starts, translation=starts.translation + 0.2))
+    radius = x.new_zeros(len(x))
+    hard = ClosedForm(config, 2).value_and_gradient(problem, x, radius, config.delta_end, polish=False)[1]
+    soft = ClosedForm(replace(config, activation="soft"), 2)
+    assert hard.abs().max() == 0
+    assert soft.value_and_gradient(problem, x, radius, config.delta_start, polish=False)[1].abs().max() > 0
+
+
+@pytest.mark.parametrize("preset", ["closed_form_hard_contact", "closed_form_no_coarse_to_fine"])
+def test_an_ablation_runs_and_ends_elsewhere(hand, scenes, problem_of, preset: str):
+    problem = problem_of("box", DOUBLE)
+    starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
+    short = {"explore_steps": 6, "refine_steps": 2, "polish_steps": 4}
+    ablated = minimise(ClosedForm(replace(load_preset(preset).closed_form, **short), 3), problem, starts, Hooks())
+    full = minimise(ClosedForm(replace(DEFAULT, **short), 3), problem, starts, Hooks())
+    assert torch.isfinite(ablated.loss).all()
+    assert not torch.allclose(pack(ablated.poses), pack(full.poses), atol=1e-4)

@@ -1,0 +1,106 @@
+"""What a hand cannot hold anywhere is told at once; what it might hold is never refused."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.mesh.shapes import SHAPES, make_shape
+from graspd_core.methods.feasibility import out_of_reach, reach_of
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Scene
+from graspd_core.types import Outcome, TriangleMesh
+
+
+def scene_of(*meshes: TriangleMesh, friction: float = 0.6) -> Scene:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+    whole = TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+    return load_scene(whole, resolution=8, friction=friction)
+
+
+def box(half: tuple[float, float, float], at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriangleMesh:
+    unit = make_shape("box")
+    return TriangleMesh(unit.vertices / np.abs(unit.vertices).max(0) * half + np.array(at), unit.faces)
+
+
+def crate(wall: float) -> tuple[TriangleMesh, ...]:
+    """A cube of 1.2 m, open above."""
+    half = 0.6
+    sides = [((wall, half, half), (x, 0.0, 0.0)) for x in (-half, half)]
+    sides += [((half, wall, half), (0.0, y, 0.0)) for y in (-half, half)]
+    return tuple(box(*side) for side in (*sides, ((half, half, wall), (0.0, 0.0, -half))))
+
+
+HOLDABLE = {
+    "rod": (box((0.6, 0.012, 0.012)),),
+    "board": (box((0.6, 0.6, 0.008)),),
+    "open crate": crate(0.005),
+    "cube with a handle": (box((0.5, 0.5, 0.5)), box((0.01, 0.06, 0.03), (0.53, 0.0, 0.0))),
+}
+
+
+@pytest.fixture(scope="module")
+def holdable() -> dict[str, Scene]:
+    shapes = {shape: load_scene(f"shape:{shape}", resolution=8) for shape in SHAPES}
+    return {**shapes, **{about: scene_of(*meshes) for about, meshes in HOLDABLE.items()}}
+
+
+@pytest.mark.parametrize("name", hand_names())
+def test_no_hand_refuses_what_it_might_hold(name: str, holdable):
+    hand = load_hand(name, candidates=120)
+    for about, scene in holdable.items():
+        assert out_of_reach(scene, hand) == "", about
+
+
+def test_no_scan_sized_object_is_refused(hand):
+    for scale in (0.1, 0.5, 2.0, 3.0):
+        assert out_of_reach(load_scene("shape:sphere", scale=scale, resolution=8), hand) == "", scale
+
+
+def test_a_small_knob_on_a_cabinet_of_many_faces_is_found(holdable):
+    """Ten of 16394 faces, and a four thousandth of the surface; the knob is open where it sits."""
+    whole, knob = box((0.99, 0.99, 0.99)), trimesh.creation.box((0.02, 0.02, 0.02))
+    fine = trimesh.Trimesh(whole.vertices, whole.faces, process=False).subdivide().subdivide()
+    outer = knob.faces[(knob.vertices[knob.faces, 0] > -0.009).any(1)] + len(fine.vertices)
+    corners = np.add(knob.vertices, (1.0, 0.3, 0.2))
+    mesh = TriangleMesh(np.vstack([fine.vertices, corners]), np.vstack([fine.faces, outer]))
+    scene = replace(holdable["rod"], object=replace(holdable["rod"].object, mesh=mesh))
+    assert len(outer) == 10
+    assert out_of_reach(scene, load_hand("parallel_gripper", candidates=120)) == ""
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.6, 1.5])
+def test_a_crate_beyond_the_hand_is_refused_with_both_sizes(hand, friction: float):
+    said = out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=friction), hand)
+    assert "120 cm across" in said
+    assert "fingertips of allegro_right open to" in said
+
+
+def test_the_corner_of_a_crate_is_refused_up_to_the_friction_that_would_hold_it(hand, monkeypatch: pytest.MonkeyPatch):
+    """The normals of a corner lie arccos(1/√3) = 54.7° about its diagonal: friction of tan(35.3°) = 0.707 closes it."""
+    monkeypatch.setattr("graspd_core.methods.feasibility._MOST_FRICTION", 10.0)
+    assert out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=0.65), hand)
+    assert not out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=0.75), hand)
+
+
+def test_a_jaw_opens_as_wide_as_its_description_says():
+    span, opening = reach_of(load_hand("parallel_gripper", candidates=120))
+    # Two jaws of 70 mm stroke; their pads stand 5 mm into the gap.
+    assert opening == pytest.approx(0.13, abs=0.002)
+    assert opening < span < 0.25
+
+
+def test_a_ball_of_70_cm_ends_the_run_within_a_second(hand):
+    scene = load_scene("shape:sphere", scale=10.0, resolution=16)
+    began = time.process_time()
+    result = plan_grasps(scene, hand, count=2)
+    assert time.process_time() - began < 1.0
+    assert (result.outcome, result.grasps) == (Outcome.NO_CANDIDATES, ())
+    assert "70 cm across" in result.message

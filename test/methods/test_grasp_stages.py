@@ -1,0 +1,201 @@
+"""Touches, balanced forces and the open posture, on cases that can be worked out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from graspd_core.config import PostureConfig
+from graspd_core.hands.kinematics import link_poses, point_jacobian
+from graspd_core.mesh.shapes import SPHERE_RADIUS
+from graspd_core.methods.grasp_stages import (
+    balanced_forces,
+    find_touches,
+    hand_distance,
+    joint_torques,
+    open_clear,
+    self_overlap,
+    squeeze,
+)
+from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.methods.loop import Poses
+from graspd_core.se3 import rotation_from_quaternion
+
+FRICTION, LENGTH = 0.5, 0.035
+
+
+def forces_at(directions: list[list[float]], active: list[bool] | None = None) -> tuple[np.ndarray, float]:
+    """Balanced forces of contacts on a sphere of 35 mm in these directions from its middle."""
+    normals = np.array([directions], dtype=float)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    on = np.array([active if active is not None else [True] * len(directions)])
+    forces, imbalance = balanced_forces(LENGTH * normals, normals, on, LENGTH, FRICTION)
+    return forces[0], float(imbalance[0])
+
+
+def test_antipodal_contacts_balance():
+    forces, imbalance = forces_at([[1, 0, 0], [-1, 0, 0]])
+    # The ridge favours even loads, which balance here too: what is left is rounding.
+    assert imbalance < 1e-9
+    assert forces == pytest.approx(np.array([[-0.5, 0, 0], [0.5, 0, 0]]), abs=1e-9)
+
+
+def test_three_contacts_around_a_sphere_share_the_load():
+    turn = 2 * np.pi * np.arange(3) / 3
+    directions = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(3)])
+    forces, imbalance = forces_at(directions.tolist())
+    # The eight cone edges are no multiple of three, so that the ridge pulls a little off the symmetric answer.
+    assert imbalance < 0.02
+    assert forces == pytest.approx(-directions / 3, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_forces_lie_in_their_cones_and_imbalance_is_their_net_wrench(seed: int):
+    normals = np.random.default_rng(seed).normal(size=(5, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    forces, imbalance = forces_at(normals.tolist())
+    pressing = -(forces * normals).sum(1)
+    sliding = np.linalg.norm(forces + pressing[:, None] * normals, axis=1)
+    assert (sliding <= FRICTION * pressing + 1e-12).all()
+    assert pressing.sum() == pytest.approx(1.0, abs=1e-9)
+    net = np.concatenate([forces.sum(0), np.cross(normals, forces).sum(0)])
+    assert imbalance == pytest.approx(np.linalg.norm(net), abs=1e-9)
+
+
+def test_one_contact_or_one_side_does_not_balance():
+    alone, imbalance = forces_at([[1, 0, 0], [-1, 0, 0]], [True, False])
+    assert imbalance == 1.0
+    assert not alone.any()
+    # 20° apart: the forces of cones of 27° can never cancel their normal parts, which add up to cos 10°.
+    _, same_side = forces_at([[1, 0.18, 0], [1, -0.18, 0]])
+    assert same_side > 0.7
+
+
+def closed_on(problem, hand, scene, count: int) -> Poses:
+    """Starts with the fingers closed until something touches."""
+    starts = draw_starts(scene, hand, count, 0, "cpu", torch.float64)
+    closed = torch.as_tensor(hand.closed_posture)
+    rotation = rotation_from_quaternion(starts.quaternion)
+    share = torch.zeros(count, 1, dtype=torch.float64)
+    moving = torch.ones(count, dtype=torch.bool)
+    for step in torch.linspace(0, 1, 41)[1:].tolist():
+        joints = starts.joints + step * (closed - starts.joints)
+        moving &= hand_distance(problem, rotation, starts.translation, joints).amin(-1) > 0
+        share[moving] = step
+    return replace(starts, joints=starts.joints + share * (closed - starts.joints))
+
+
+def test_open_clear_opens_around_a_cylinder(problem_of, hand, scenes):
+    problem, config = problem_of("cylinder"), PostureConfig()
+    grasps = closed_on(problem, hand, scenes["cylinder"], 6)
+    rotation = rotation_from_quaternion(grasps.quaternion)
+    before = hand_distance(problem, rotation, grasps.translation, grasps.joints).amin(-1)
+    touching = before < 0.004
+    assert touching.sum() >= 3
+    opened, clearance = open_clear(problem, grasps, config)
+    after = hand_distance(problem, rotation, opened.translation, opened.joints).amin(-1)
+    assert (clearance > 0.5).all()
+    # The share is that of the worst place of the way, so the open end has at least this much.
+    assert (after >= clearance * config.clearance - 1e-9).all()
+    assert (after > before)[touching].all()
+    assert torch.equal(opened.quaternion, grasps.quaternion)
+    assert ((opened.joints >= problem.lower) & (opened.joints <= problem.upper)).all()
+
+
+def fingertip_on_sphere(problem, hand) -> tuple[Poses, int, torch.Tensor, torch.Tensor]:
+    """The open hand, unturned, with one candidate of a fingertip on the sphere: its link, the point and the normal."""
+    link = hand.link_index["link_3.0_tip"]
+    rotations, translations = link_poses(hand, hand.open_posture)
+    of_tip = np.flatnonzero(hand.candidate_link == link)
+    normals = hand.candidate_normals[of_tip] @ rotations[link].T
+    # The palm looks along x, and so does the inside of the fingertip.
+    best = normals[:, 0].argmax()
+    point = rotations[link] @ hand.candidate_points[of_tip[best]] + translations[link]
+    contact = torch.as_tensor(-SPHERE_RADIUS * normals[best])
+    poses = Poses(
+        (contact - torch.as_tensor(point))[None],
+        torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
+        torch.as_tensor(hand.open_posture)[None],
+    )
+    return poses, link, contact, torch.as_tensor(-normals[best])
+
+
+def test_a_known_contact_is_found(problem_of, hand):
+    poses, link, contact, normal = fingertip_on_sphere(problem_of("sphere"), hand)
+    touches = find_touches(problem_of("sphere"), poses, reach=0.002)
+    found = torch.nonzero(touches.active[0] & (touches.link == link)).flatten()
+    assert len(found)
+    away = (touches.position[0, found] - contact).norm(dim=-1)
+    slot = found[away.argmin()]
+    # Facets and grid cells of 2 mm flatten a sphere of 35 mm by less than 0.1 mm, and turn its normal by less than 3°.
+    assert away.min() < 1e-4
+    assert abs(float(touches.distance[0, slot])) < 1e-4
+    assert touches.normal[0, slot] @ normal > np.cos(0.05)
+    assert (touches.distance[touches.active].abs() <= 0.002).all()
+
+
+def test_nothing_touches_from_afar(problem_of, hand):
+    poses, *_ = fingertip_on_sphere(problem_of("box"), hand)
+    away = replace(poses, translation=poses.translation + 1.0)
+    for name in ("sphere", "box"):
+        assert not find_touches(problem_of(name), away, reach=0.002).active.any()
+
+
+def test_torques_are_the_transposed_jacobian_times_forces(problem_of, hand, scenes):
+    problem = problem_of("box")
+    poses = closed_on(problem, hand, scenes["box"], 2)
+    touches = find_touches(problem, poses, reach=0.02)
+    generator = torch.Generator().manual_seed(0)
+    forces = torch.randn(touches.position.shape, generator=generator, dtype=torch.float64)
+    torques = joint_torques(problem, poses, touches, forces)
+    links = touches.link.numpy()
+    for row in range(2):
+        rotation = rotation_from_quaternion(poses.quaternion[row]).numpy()
+        in_base = (touches.position[row] - poses.translation[row]).numpy() @ rotation
+        joints = poses.joints[row].numpy()
+        rotations, translations = link_poses(hand, joints)
+        in_link = np.einsum("pij,pi->pj", rotations[links], in_base - translations[links])
+        jacobian = point_jacobian(hand, joints, in_link, links)
+        expected = np.einsum("pij,pi->j", jacobian, forces[row].numpy() @ rotation)
+        # Two ways to the same sum: rounding only.
+        assert torques[row].numpy() == pytest.approx(expected, abs=1e-10)
+
+
+def test_the_squeeze_presses_within_effort_and_limits(problem_of, hand, scenes):
+    problem, config = problem_of("cylinder"), PostureConfig()
+    poses = closed_on(problem, hand, scenes["cylinder"], 4)
+    touches = find_touches(problem, poses, reach=0.02)
+    effort = torch.as_tensor(hand.effort)
+    pressed = squeeze(problem, poses, touches, effort, config)
+    assert ((pressed.joints >= problem.lower) & (pressed.joints <= problem.upper)).all()
+    assert not pressed.forces[~touches.active].any()
+    pressing = -(pressed.forces * touches.normal).sum((-1, -2))
+    assert (pressing > 0).any()
+    assert (pressing <= config.grip_force * (1 + 1e-9)).all()
+    torque = joint_torques(problem, poses, touches, pressed.forces)
+    assert (torque.abs() <= effort * config.effort_share * (1 + 1e-9)).all()
+    weak = squeeze(problem, poses, touches, effort / 10, config)
+    assert (weak.forces.norm(dim=-1) <= pressed.forces.norm(dim=-1) + 1e-12).all()
+
+
+def test_an_open_hand_is_clear_of_itself_and_crossed_fingers_are_not(problem_of, hand):
+    problem = problem_of("sphere")
+    joint = {name: i for i, name in enumerate(hand.joint_names)}
+    upright = torch.as_tensor(hand.open_posture)
+    crossed = []
+    for sign in (1, -1):
+        q = upright.clone()
+        # First and second finger lean towards each other, or away from each other.
+        q[joint["joint_0.0"]], q[joint["joint_4.0"]] = 0.47 * sign, -0.47 * sign
+        crossed.append(q)
+    overlap = self_overlap(problem, torch.stack([upright, *crossed]), torch.as_tensor(hand.adjacent))
+    assert overlap[0] == 0.0
+    # Fingers are 45 mm apart and 27 mm wide; leaning 27° each way they meet within 45 mm of their roots.
+    assert overlap[1:].max() > 0.004
+    # Leaning apart, the second finger just brushes the third.
+    assert overlap[1:].min() < 0.001
+    everything = torch.ones_like(torch.as_tensor(hand.adjacent))
+    assert not self_overlap(problem, torch.stack(crossed), everything).any()

@@ -1,0 +1,301 @@
+"""Grasp'D as published: multipliers with known answers, desired forces, starts, and short runs of it all."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from graspd_core.config import Graspd2022Config, PlanConfig, load_preset, preset_names
+from graspd_core.contact.free_body import make_body
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods.candidates import SEARCHES
+from graspd_core.methods.closed_form.closed_form import pack
+from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
+from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, search_graspd2022
+from graspd_core.methods.graspd2022.initial_poses_published import published_starts
+from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
+from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.planner import Task
+from graspd_core.methods.problem import place
+from graspd_core.se3 import rotation_from_quaternion
+
+SHORT = Graspd2022Config(steps=12, coarse_steps=6)
+VARIANTS = {
+    "force": SHORT,
+    "wrench": replace(SHORT, desired="wrench"),
+    "cone": replace(SHORT, desired="cone", scaling="object", stiffness=1e3),
+    "direct": replace(SHORT, relaxation=False),
+}
+
+
+def draw(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def solver_of(scenes):
+    def solver_of(config: Graspd2022Config, name: str = "box", dtype: torch.dtype = torch.float64) -> Graspd2022:
+        thing = scenes[name].object
+        body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, "cpu", dtype)
+        return Graspd2022(config, body)
+
+    return solver_of
+
+
+@pytest.fixture(scope="module")
+def problem(problem_of):
+    return problem_of("box", torch.float64)
+
+
+@pytest.fixture(scope="module")
+def starts(problem, scenes, hand) -> Poses:
+    return published_starts(problem, scenes["box"], hand, 3, 0, 0.1)
+
+
+def test_adamax_by_hand():
+    state = adamax(torch.zeros(1, 2, dtype=torch.float64))
+    state = adamax_step(state, torch.tensor([[4.0, -0.5]], dtype=torch.float64), 0.1, 1)
+    # The first step has the size of the rate, whatever the gradient's.
+    assert state.value[0].tolist() == pytest.approx([-0.1, 0.1])
+    state = adamax_step(state, torch.tensor([[2.0, 1.0]], dtype=torch.float64), 0.1, 2)
+    # Means 0.9 · 0.4 + 0.2 and 0.9 · (−0.05) + 0.1, over 1 − 0.9²; maxima 0.999 · 4 and 1.
+    assert state.value[0].tolist() == pytest.approx([-0.1 - 0.056 / 0.19 / 3.996, 0.1 - 0.0055 / 0.19], rel=1e-6)
+    forgetful = adamax_step(state, torch.zeros(1, 2, dtype=torch.float64), 0.1, 3, memory=0.5)
+    assert forgetful.top[0].tolist() == pytest.approx([1.998, 0.5])
+
+
+@pytest.mark.parametrize("bound", [1.0, 10.0])
+def test_multipliers_find_the_constrained_minimum(bound: float):
+    # min (x − 2)² + (y − 1)² subject to x + y < C: at C = 1 on the border, (1, 0) with λ = 2; at C = 10 free, (2, 1).
+    x, multiplier = adamax(torch.zeros(1, 2, dtype=torch.float64)), adamax(torch.zeros(1, 1, dtype=torch.float64))
+    for count in range(1, 501):
+        at = x.value.detach().requires_grad_(True)
+        broken = excess(at.sum(-1, keepdim=True), bound)
+        cost = ((at - at.new_tensor([2.0, 1.0])) ** 2).sum()
+        (gradient,) = torch.autograd.grad(cost + damped(broken, multiplier.value, 1.0).sum(), at)
+        fade = 1 - count / 501
+        x = adamax_step(x, gradient, 0.03 * fade, count)
+        multiplier = adamax_step(multiplier, broken.detach(), -0.1 * fade, count)
+    # Adamax's steps do not shrink with the gradient; faded ones leave a few thousandths.
+    assert x.value[0].tolist() == pytest.approx([1.0, 0.0] if bound == 1.0 else [2.0, 1.0], abs=0.02)
+    # A multiplier of a broken inequality only climbs; from its known value on, the minimum is where it should be.
+    assert multiplier.value.item() >= 1.95 if bound == 1.0 else multiplier.value.item() == 0.0
+
+
+@given(seed=st.integers(0, 2**31), friction=st.floats(0.05, 2.0))
+def test_the_cone_projection_is_nearest_and_stays(seed: int, friction: float):
+    normals = draw(seed, 2, 5, 3)
+    normals = normals / normals.norm(dim=-1, keepdim=True)
+    forces = draw(seed + 1, 2, 5, 3, 3)
+    inside = into_cone(forces, normals, friction)
+    along = -(inside * normals[:, :, None]).sum(-1)
+    side = (inside + along[..., None] * normals[:, :, None]).norm(dim=-1)
+    assert (along >= -1e-12).all()
+    assert (side <= friction * along + 1e-9).all()
+    assert into_cone(inside, normals, friction).numpy() == pytest.approx(inside.numpy(), abs=1e-9)
+    # Nearest in a convex cone: what was taken off is at right angles to what is left, and against all of the cone.
+    off = forces - inside
+    assert (off * inside).sum(-1).abs().max() < 1e-9
+    assert ((off * -normals[:, :, None]).sum(-1) <= 1e-9).all()
+
+
+def test_desired_forces_that_balance_the_momentum_leave_no_motion(solver_of):
+    solver = solver_of(SHORT)
+    body, velocities = solver.body, solver.velocities
+    arms = 0.03 * draw(0, 1, 4, 3)
+    arms = arms - arms.mean(1, keepdim=True)
+    stopping = -body.mass * velocities / solver.time_step / 4
+    forces = stopping.expand(1, 4, 3, 3)
+    assert motion_left(body, 0 * forces, arms, velocities, solver.time_step)[0].tolist() == pytest.approx([0, 1.5, 1.5])
+    assert motion_left(body, forces, arms, velocities, solver.time_step).abs().max() < 1e-20
+    # As wrenches, with the torques that go with them: the same.
+    wrenches = actual(forces, arms, body.length, 6)
+    assert motion_left(body, wrenches, arms, velocities, solver.time_step).abs().max() < 1e-20
+    assert physics(wrenches, 0 * wrenches).item() > physics(forces, 0 * forces).item() > 0
+
+
+def test_the_scaling_by_object_needs_the_same_forces_for_every_mass(solver_of):
+    config = replace(SHORT, scaling="object", stopping_force=5.0)
+    for mass in (0.01, 0.1, 2.0):
+        solver = solver_of(config)
+        solver = replace(solver, body=replace(solver.body, mass=mass))
+        forces = solver.velocities / solver.velocities.norm(dim=-1).amax() * -5.0
+        left = motion_left(
+            solver.body, forces[None, None], torch.zeros(1, 1, 3, dtype=torch.float64), solver.velocities,
+            solver.time_step,
+        )  # fmt: skip
+        assert left.abs().max() < 1e-20
+
+
+def test_gradients_of_motion_and_physics(solver_of):
+    solver = solver_of(replace(SHORT, scaling="object"))
+
+    def cost(forces: Tensor, arms: Tensor) -> Tensor:
+        left = motion_left(solver.body, forces, arms, solver.velocities, solver.time_step)
+        return left.mean(-1) + physics(actual(forces, arms, 0.05, 6), torch.ones_like(actual(forces, arms, 0.05, 6)))
+
+    assert gradcheck(cost, (draw(0, 1, 2, 3, 3).requires_grad_(True), (0.03 * draw(1, 1, 2, 3)).requires_grad_(True)))
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_gradients_of_the_whole_evaluation(name, problem, starts, solver_of, slope_errors):
+    # Without a leak, and with the hand partly below the level set; the leak's own gradient is tested in test_forces.py.
+    solver = solver_of(replace(VARIANTS[name], leak=0.0, scaling="object", stiffness=1e3))
+    x = pack(starts)
+    components = 6 if name == "wrench" else 3
+    desired = 0.1 * draw(0, len(x), len(problem.coarse.links), 3, components)
+    radius = x.new_full((len(x),), 0.12)
+
+    def lagrangian(y: Tensor) -> Tensor:
+        found = solver.evaluate(problem, y, desired, radius)
+        return solver.cost(found) + damped(excess(found.limit, 0.0), found.limit + 1.0, 1.0)
+
+    assert (lagrangian(x) > 0).all()
+    # As in test_gradients.py: the grid's cells have kinks that a step may cross, and values up to 1e4 round to 1e-12.
+    assert (slope_errors(lagrangian, x, step=1e-8, directions=6) > 1e-4).sum() <= 1
+
+
+def test_the_task_is_a_matter_of_the_forces_not_of_the_pose(problem, starts, solver_of):
+    solver = solver_of(VARIANTS["cone"])
+    x = pack(starts).requires_grad_(True)
+    desired = (0.1 * draw(0, len(x), len(problem.coarse.links), 3, 3)).requires_grad_(True)
+    task = solver.evaluate(problem, x, desired, x.detach().new_zeros(len(x))).task
+    by_pose, by_force = torch.autograd.grad(task.sum(), (x, desired), allow_unused=True)
+    assert by_pose is None
+    assert (by_force.abs().amax((1, 2, 3)) > 0).all()
+
+
+def test_published_starts_face_the_surface_from_ten_centimetres(problem, scenes, hand):
+    starts = published_starts(problem, scenes["box"], hand, 6, 3, 0.1)
+    rotation = rotation_from_quaternion(starts.quaternion)
+    palm = starts.translation + rotation @ torch.as_tensor(hand.palm_center)
+    distance, normal = sample_sdf(problem.sdf, palm)
+    facing = rotation @ torch.as_tensor(hand.palm_normal)
+    # The grid is 3 cm wider than the box; farther out its distance errs by little, its direction by a little more.
+    assert distance.numpy() == pytest.approx(np.full(6, 0.1), abs=5e-3)
+    assert ((facing * normal).sum(-1) < -0.95).all()
+    assert torch.equal(starts.joints, torch.as_tensor(hand.open_posture).expand(6, -1))
+    placed = place(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
+    assert (sample_sdf(problem.sdf, placed.points)[0] > 0).all()
+
+
+def test_published_starts_come_from_all_sides(problem_of, scenes, hand):
+    starts = published_starts(problem_of("sphere", torch.float64), scenes["sphere"], hand, 64, 0, 0.3)
+    facing = rotation_from_quaternion(starts.quaternion) @ torch.as_tensor(hand.palm_normal)
+    # The mean of 64 uniform directions is about an eighth long; that of a quarter of the sphere is three quarters.
+    assert facing.mean(0).norm() < 0.35
+
+
+def run(config, problem, starts, solver_of, **hooks) -> tuple[Tensor, Tensor]:
+    solution = minimise(solver_of(config), problem, starts, Hooks(**hooks))
+    return pack(solution.poses), solution.loss
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_the_same_seed_gives_the_same_bits_and_nothing_is_not_a_number(name, problem, starts, solver_of):
+    once, loss = run(VARIANTS[name], problem, starts, solver_of)
+    again, _ = run(VARIANTS[name], problem, starts, solver_of)
+    assert torch.equal(once, again)
+    assert torch.isfinite(once).all()
+    assert torch.isfinite(loss).all()
+    assert not torch.equal(once, pack(starts))
+    assert once[:, 3:7].norm(dim=-1).tolist() == pytest.approx([1.0] * len(once))
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_it_brings_its_own_cost_down(name, problem, starts, solver_of):
+    # On a fixed level set that the hands already touch.
+    config = replace(
+        VARIANTS[name], steps=60, coarse_steps=0, scaling="object", stiffness=1e3, force_rate=0.05, starts="hull"
+    )
+    near = replace(starts, translation=0.6 * starts.translation)
+    first = run(replace(config, steps=1), problem, near, solver_of)[1]
+    last = run(config, problem, near, solver_of)[1]
+    assert (last < first).all(), (first, last)
+
+
+def test_desired_forces_of_the_cone_stay_in_it(problem, starts, solver_of):
+    solver = solver_of(replace(VARIANTS["cone"], force_rate=0.05))
+    state = solver.init(problem, starts)
+    for index in range(5):
+        before = state
+        state = solver.step(problem, state, index)
+    p = before.pose.value
+    normals = sample_sdf(problem.sdf, place(problem, problem.coarse, p[:, :3], p[:, 3:7], p[:, 7:]).points)[1]
+    assert state.forces.value.abs().max() > 0
+    kept = into_cone(state.forces.value, normals, 0.8)
+    assert kept.numpy() == pytest.approx(state.forces.value.numpy(), abs=1e-9)
+
+
+def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, starts, solver_of):
+    solver = solver_of(SHORT)
+    state = solver.init(problem, starts)
+    assert state.radius.tolist() == [0.1] * 3
+    for index in range(SHORT.coarse_steps):
+        state = solver.step(problem, state, index)
+        assert not torch.isfinite(state.best_loss).any()
+    state = solver.step(problem, state, SHORT.coarse_steps)
+    assert torch.isfinite(state.best_loss).all()
+    by_code = solver_of(replace(SHORT, radius="code")).init(problem, starts).radius
+    placed = place(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
+    nearest = sample_sdf(problem.sdf, placed.points)[0].amin(-1)
+    assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
+
+
+def test_the_best_iterate_is_kept_or_the_last(problem, starts, solver_of):
+    wild = replace(VARIANTS["cone"], steps=20, coarse_steps=0, pose_rate=0.05)
+    _, best = run(wild, problem, starts, solver_of)
+    _, last = run(replace(wild, keep="last"), problem, starts, solver_of)
+    assert (best <= last).all()
+    assert (best < last).any()
+
+
+def test_a_start_that_is_not_a_number_never_wins_and_harms_none(problem, starts, solver_of):
+    broken = starts.translation.clone()
+    broken[1] = torch.nan
+    x, loss = run(SHORT, problem, replace(starts, translation=broken), solver_of)
+    clean, _ = run(SHORT, problem, starts, solver_of)
+    assert loss.isfinite().tolist() == [True, False, True]
+    assert torch.equal(x[[0, 2]], clean[[0, 2]])
+
+
+def test_the_search_obeys_limits_and_stop(hand, scenes):
+    config = replace(PlanConfig(), graspd2022=SHORT)
+    task = Task(scenes["sphere"], hand, 2, 1, config, Hooks())
+    found = search_graspd2022(task)
+    assert len(found.poses.translation) == 2
+    assert (found.poses.joints >= found.problem.lower).all()
+    assert (found.poses.joints <= found.problem.upper).all()
+    polls = iter([False, True])
+    stopped = search_graspd2022(replace(task, hooks=Hooks(stop=polls.__next__)))
+    assert stopped.interrupted == "cancelled"
+    assert SEARCHES["graspd2022"] is search_graspd2022
+
+
+def test_presets_name_this_method_and_change_what_they_say():
+    mine = {name: load_preset(name) for name in preset_names() if name.startswith("graspd2022")}
+    assert {p.method for p in mine.values()} == {"graspd2022"}
+    assert mine["graspd2022"].graspd2022 == Graspd2022Config()
+    assert mine["graspd2022_no_coarse_to_fine"].graspd2022.coarse_steps == 0
+    assert not mine["graspd2022_no_relaxation"].graspd2022.relaxation
+    assert mine["graspd2022_no_leak"].graspd2022.leak == 0.0
+
+
+def test_every_setting_is_explained():
+    for setting in fields(Graspd2022Config):
+        assert f"        {setting.name}: " in (Graspd2022Config.__doc__ or ""), setting.name
+
+
+def test_state_is_never_changed_in_place(problem, starts, solver_of):
+    solver = solver_of(SHORT)
+    state = solver.init(problem, starts)
+    kept = Adamax(*(x.clone() for x in vars(state.pose).values()))
+    solver.step(problem, state, 0)
+    assert all(torch.equal(a, b) for a, b in zip(vars(kept).values(), vars(state.pose).values(), strict=True))

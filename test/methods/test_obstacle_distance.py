@@ -1,0 +1,170 @@
+"""Support and neighbours in the optimiser: exact on half-spaces, nothing reaches through, free scenes pay nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graspd_core.config import ClosedFormConfig, PlanConfig
+from graspd_core.hands.hand_mesh import hand_mesh
+from graspd_core.hands.kinematics import forward
+from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.closed_form.closed_form import pack
+from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.methods.loop import Hooks
+from graspd_core.methods.obstacle_distance import RETREAT, hand_reach, intrusion, make_obstacles, obstacle_gaps
+from graspd_core.methods.problem import Problem, build_problem, evaluate
+from graspd_core.scene.obstacles import make_neighbours
+from graspd_core.scene.scene import Scene
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Plane, Posture
+
+UP = np.array([0.0, 0.0, 1.0])
+DOUBLE = torch.float64
+
+
+def on_table(scene: Scene) -> Scene:
+    """The scene with a table under the object."""
+    return replace(scene, support=Plane(UP, float(scene.object.mesh.vertices[:, 2].min())))
+
+
+def beside(scene: Scene, x: float) -> Scene:
+    """The scene with a wall 100 mm wide and high at x [m]."""
+    y, z = np.meshgrid(np.linspace(-0.05, 0.05, 15), np.linspace(-0.045, 0.055, 15))
+    wall = np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()])
+    return replace(scene, neighbours=make_neighbours([wall], scene.support, scene.object.mesh, 10.0))
+
+
+def problem(scene: Scene, hand, **more) -> Problem:
+    return build_problem(
+        scene, hand, candidates=60, features=24, directions=12, friction=0.5, seed=0, device="cpu", dtype=DOUBLE, **more
+    )
+
+
+def lowest(hand, posture: Posture, plane: Plane) -> float:
+    """Height of the hand's lowest point over a plane, off the meshes of its solids [m]."""
+    rotation = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz)).numpy()
+    vertices = hand_mesh(hand, posture.joint_positions).vertices @ rotation.T + posture.position
+    return float((vertices @ plane.normal).min() - plane.offset)
+
+
+@settings(max_examples=12)
+@given(seed=st.integers(0, 2**31))
+def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: int):
+    rng = np.random.default_rng(seed)
+    normal, quaternion = rng.normal(size=3), rng.normal(size=4)
+    plane = Plane(normal / np.linalg.norm(normal), float(rng.normal() * 0.1))
+    quaternion /= np.linalg.norm(quaternion)
+    joints = hand.lower + (hand.upper - hand.lower) * rng.random(hand.num_joints)
+    posture = Posture(rng.normal(size=3) * 0.1, quaternion, joints)
+    obstacles = make_obstacles(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
+    assert obstacles is not None
+    rotation = rotation_from_quaternion(torch.as_tensor(quaternion))[None]
+    frames = forward(problem(scenes["box"], hand).kinematics, torch.as_tensor(joints)[None])
+    gaps = obstacle_gaps(obstacles, rotation, torch.as_tensor(posture.position)[None], *frames)
+    # Meshes of round solids are inscribed: facets cut off up to half a millimetre of a fingertip.
+    assert float(gaps.min()) == pytest.approx(lowest(hand, posture, plane), abs=5e-4)
+
+
+def test_a_free_object_pays_nothing(hand, scenes):
+    free = problem(scenes["box"], hand)
+    assert (free.obstacles, free.trust) == (None, None)
+    starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
+    terms = evaluate(free, starts.translation, starts.quaternion, starts.joints, torch.zeros(3, dtype=DOUBLE), 0.004)
+    assert terms.obstacle is None
+    # A wall that no hand on the object could touch is no obstacle either.
+    far = hand_reach(hand) + RETREAT + 0.05
+    assert problem(beside(scenes["box"], far + 0.03), hand).obstacles is None
+    assert problem(beside(scenes["box"], far - 0.1), hand).obstacles is not None
+
+
+def test_obstacles_leave_the_other_terms_alone(hand, scenes):
+    starts = draw_starts(scenes["box"], hand, 4, 0, "cpu", DOUBLE)
+    arguments = (starts.translation, starts.quaternion, starts.joints, torch.zeros(4, dtype=DOUBLE), 0.004)
+    free = evaluate(problem(scenes["box"], hand), *arguments)
+    among = evaluate(problem(beside(on_table(scenes["box"]), 0.1), hand), *arguments)
+    for name in free._fields[:-1]:
+        assert torch.equal(getattr(free, name), getattr(among, name))
+
+
+@pytest.mark.parametrize("fine", [False, True])
+@pytest.mark.parametrize("kind", ["table", "wall"])
+def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, fine: bool):
+    scene = on_table(scenes["box"]) if kind == "table" else beside(scenes["box"], 0.06)
+    built = problem(scene, hand)
+    x = pack(draw_starts(scenes["box"], hand, 6, 3, "cpu", DOUBLE))
+
+    def term(y: torch.Tensor) -> torch.Tensor:
+        obstacle = evaluate(built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01, fine=fine).obstacle
+        assert obstacle is not None
+        return obstacle
+
+    reaching = term(x) > 0
+    assert reaching.sum() >= 2
+    errors = slope_errors(term, x[reaching], step=1e-8, directions=6)
+    # As for the whole evaluation: rounding over a step of 1e-8, and a rare crossing of a kink between cells.
+    assert (errors > 1e-4).sum() <= 1, errors
+
+
+def test_trust_scales_what_a_contact_counts(hand, scenes):
+    x = draw_starts(scenes["box"], hand, 4, 0, "cpu", DOUBLE)
+    arguments = (x.translation, x.quaternion, x.joints, torch.zeros(4, dtype=DOUBLE), 0.02)
+    ones = torch.ones_like(scenes["box"].sdf.field[0])
+    known = evaluate(problem(scenes["box"], hand), *arguments)
+    seen = evaluate(problem(replace(scenes["box"], trust=ones), hand, trust_floor=0.4), *arguments)
+    guessed = evaluate(problem(replace(scenes["box"], trust=0 * ones), hand, trust_floor=0.4), *arguments)
+    # Interpolating ones leaves rounding.
+    assert seen.task.tolist() == pytest.approx(known.task.tolist(), rel=1e-12)
+    # The support falls to 0.4 of itself, and its logarithm by −log 0.4, but for the floor that keeps it finite.
+    assert (guessed.task > known.task).all()
+    assert (guessed.task - known.task <= -np.log(0.4) + 1e-9).all()
+    for name in known._fields[1:-1]:
+        assert torch.equal(getattr(known, name), getattr(guessed, name))
+
+
+@pytest.mark.parametrize("name", ["sphere", "box", "cylinder"])
+def test_starts_lie_above_the_table_and_could_have_come_there(hand, scenes, name: str):
+    scene = on_table(scenes[name])
+    assert scene.support is not None
+    starts = draw_starts(scene, hand, 24, 0, "cpu", DOUBLE)
+    back = rotation_from_quaternion(starts.quaternion) @ torch.as_tensor(-RETREAT * hand.approach)
+    depths = []
+    for i in range(24):
+        here = Posture(starts.translation[i].numpy(), starts.quaternion[i].numpy(), starts.joints[i].numpy())
+        behind = replace(here, position=here.position + back[i].numpy())
+        depths.append(-min(lowest(hand, here, scene.support), lowest(hand, behind, scene.support)))
+    # A place is e times rarer for every 5 mm, and many are clear.
+    assert max(depths) < 0.02
+    assert np.mean(np.array(depths) < 0.003) > 0.6
+    free = draw_starts(scenes[name], hand, 24, 0, "cpu", DOUBLE)
+    under = [
+        lowest(hand, Posture(p.numpy(), q.numpy(), j.numpy()), scene.support) < -0.02
+        for p, q, j in zip(free.translation, free.quaternion, free.joints, strict=True)
+    ]
+    assert sum(under) > 4
+
+
+def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
+    scene = beside(on_table(scenes["box"]), 0.09)
+    assert scene.support is not None
+    short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15, candidates=60, fine_candidates=120)
+    config = PlanConfig(closed_form=short)
+    found = synthesise(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE)
+    assert found.grasps
+    obstacles = make_obstacles(scene, hand, "cpu", DOUBLE)
+    assert obstacles is not None
+    kinematics = problem(scene, hand).kinematics
+    for grasp in found.grasps:
+        for posture in (grasp.pregrasp, grasp.grasp):
+            assert lowest(hand, posture, scene.support) > -0.0016
+        ends = [
+            (torch.as_tensor(p.position)[None], torch.as_tensor(p.joint_positions)[None])
+            for p in (grasp.pregrasp, grasp.grasp)
+        ]
+        quaternion = torch.as_tensor(grasp.grasp.quaternion_wxyz)[None]
+        assert float(intrusion(obstacles, kinematics, quaternion, ends[0], ends[1])) < 0.0016

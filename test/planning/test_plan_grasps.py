@@ -1,0 +1,233 @@
+"""The front door, end to end on a cylinder: verdicts, limits, reproducibility, and every way for a run to end early."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graspd_core.config import load_preset
+from graspd_core.errors import ConfigError
+from graspd_core.hands.library import load_hand
+from graspd_core.planning import verification as trials
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime import disk_cache as cache
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.types import Grasp, GraspResult, LiftResult, Outcome, Plane, Progress, Stage, Verdict
+
+# How late a run may end: one optimiser step on a busy machine, not the seconds that a run takes.
+LATE = 0.5
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("allegro_right", candidates=load_preset("fast").closed_form.fine_candidates)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene("shape:cylinder")
+
+
+@pytest.fixture(scope="module")
+def told() -> list[Progress]:
+    """What the run of `result` reported."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(scene, hand, told) -> GraspResult:
+    return plan_grasps(scene, hand, count=2, seed=3, preset="fast", progress=told.append)
+
+
+def arrays(grasp: Grasp) -> list[np.ndarray]:
+    postures = (grasp.pregrasp, grasp.grasp, grasp.squeeze)
+    return [a for p in postures for a in (p.position, p.quaternion_wxyz, p.joint_positions)]
+
+
+def test_grasps_called_verified_have_passed_and_come_first(result):
+    assert result.outcome is Outcome.SUCCEEDED
+    verdicts = [grasp.verdict for grasp in result.grasps]
+    assert verdicts == sorted(verdicts, key=[Verdict.VERIFIED, Verdict.FAILED].index)
+    assert verdicts.count(Verdict.VERIFIED) == 2
+    for grasp in result.grasps:
+        assert grasp.hold is not None
+        assert grasp.hold.passed == (grasp.verdict is Verdict.VERIFIED) == (grasp.reason == "")
+        assert grasp.metrics is not None
+        assert grasp.contacts
+
+
+def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result):
+    table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()))
+    on_table = plan_grasps(replace(scene, support=table), hand, count=1, seed=3, preset="fast")
+    assert on_table.outcome is Outcome.SUCCEEDED
+    assert on_table.support is table
+    best = on_table.grasps[0]
+    assert best.verdict is Verdict.VERIFIED
+    assert best.hold is not None
+    assert best.lift is not None
+    assert best.hold.passed
+    assert best.lift.passed
+    assert result.support is None
+    assert all(grasp.lift is None for grasp in result.grasps)
+
+
+def test_a_grasp_that_holds_but_cannot_be_lifted_is_not_verified(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
+    lost = LiftResult(False, 0.06, 0.0, 0.0, "the object moved 6.0 cm while lifting")
+    monkeypatch.setattr(trials, "lift_trial", lambda *_, **__: lost)
+    table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()))
+    tried: list[Progress] = []
+    short = plan_grasps(
+        replace(scene, support=table), hand, count=1, seed=3, preset="fast",
+        progress=lambda p: tried.append(p) if p.stage is Stage.VERIFY else None, stop=lambda: len(tried) == 4,
+    )  # fmt: skip
+    assert short.outcome is Outcome.CANCELLED
+    held = [grasp for grasp in short.grasps if grasp.hold and grasp.hold.passed]
+    assert held
+    assert all((g.verdict, g.reason, g.lift) == (Verdict.FAILED, lost.reason, lost) for g in held)
+    assert not any(grasp.lift for grasp in short.grasps if grasp.hold and not grasp.hold.passed)
+
+
+def test_joint_limits_hold_exactly_and_quaternions_are_unit(result, hand):
+    for grasp in result.grasps:
+        for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze):
+            assert (posture.joint_positions >= hand.lower).all()
+            assert (posture.joint_positions <= hand.upper).all()
+            # float32 arithmetic
+            assert np.linalg.norm(posture.quaternion_wxyz) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_stages_are_reported_in_order(told, result):
+    order = [Stage.OPTIMISE, Stage.VERIFY, Stage.DONE]
+    stages = [progress.stage for progress in told]
+    assert stages == sorted(stages, key=order.index)
+    assert set(stages) == set(order)
+    assert [p.elapsed for p in told] == sorted(p.elapsed for p in told)
+    assert [p.verified for p in told] == sorted(p.verified for p in told)
+    assert told[-1].verified == 2
+    assert all(0 < p.step <= p.of for p in told)
+
+
+def test_times_add_up(result):
+    timing = result.timing
+    parts = timing.load + timing.sdf + timing.optimise + timing.verify
+    assert timing.total == pytest.approx(parts, abs=0.01)
+    assert timing.first_verified is not None
+    assert timing.load + timing.sdf + timing.optimise < timing.first_verified <= timing.total
+
+
+def test_the_same_seed_gives_the_same_grasps_and_another_others(scene, hand, result):
+    again = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
+    assert len(again.grasps) == len(result.grasps)
+    for one, other in zip(again.grasps, result.grasps, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(arrays(one), arrays(other), strict=True))
+        assert (one.score, one.metrics, one.hold) == (other.score, other.metrics, other.hold)
+    different = plan_grasps(scene, hand, count=2, seed=4, preset="fast", verify="none")
+    assert not np.array_equal(different.grasps[0].grasp.position, result.grasps[0].grasp.position)
+    assert len(different.grasps) == 2
+    assert all(g.verdict is Verdict.UNVERIFIED and g.hold is None and g.metrics for g in different.grasps)
+
+
+def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
+    stop = threading.Event()
+    steps: list[int] = []
+    times: list[float] = []
+
+    def progress(report: Progress) -> None:
+        if report.stage is Stage.OPTIMISE:
+            steps.append(report.step)
+            times.append(time.perf_counter())
+            stop.set()
+
+    cancelled = plan_grasps(scene, hand, count=8, preset="accurate", progress=progress, stop=stop.is_set)
+    assert time.perf_counter() - times[0] < LATE
+    assert cancelled.outcome is Outcome.CANCELLED
+    assert cancelled.grasps == ()
+    assert steps == [1]
+
+
+def test_cancelling_while_verifying_keeps_what_is_verified(scene, hand):
+    verified: list[int] = []
+
+    def progress(report: Progress) -> None:
+        verified.append(report.verified)
+
+    result = plan_grasps(
+        scene, hand, count=3, seed=3, preset="fast", progress=progress, stop=lambda: bool(verified and verified[-1])
+    )
+    assert result.outcome is Outcome.CANCELLED
+    assert sum(g.verdict is Verdict.VERIFIED for g in result.grasps) == 1
+
+
+@pytest.mark.parametrize("verify", ["standard", "none"])
+def test_a_deadline_is_kept(scene, hand, result, verify: str):
+    begun = time.perf_counter()
+    late = plan_grasps(scene, hand, count=2, preset="accurate", deadline=0.2, verify=verify)
+    assert time.perf_counter() - begun < 0.2 + LATE
+    assert late.outcome is Outcome.DEADLINE
+    assert late.grasps == ()
+
+
+def test_a_run_that_is_over_before_it_begins_begins_nothing(scene, hand):
+    told: list[Stage] = []
+    cancelled = plan_grasps(scene, hand, count=1, progress=lambda p: told.append(p.stage), stop=lambda: True)
+    late = plan_grasps(scene, hand, count=1, progress=lambda p: told.append(p.stage), deadline=1e-9)
+    assert (cancelled.outcome, late.outcome) == (Outcome.CANCELLED, Outcome.DEADLINE)
+    assert cancelled.grasps == late.grasps == ()
+    assert told == [Stage.DONE, Stage.DONE]
+
+
+def test_collision_parts_of_cancelled_runs_do_not_pile_up(scene, hand, result):
+    fresh = replace(scene, object=replace(scene.object, sha256="of nobody else"))
+    stop = threading.Event()
+    before = set(threading.enumerate())
+    with trials._CUTTING:
+        cancelled = plan_grasps(fresh, hand, count=1, progress=lambda _: stop.set(), stop=stop.is_set)
+    assert cancelled.outcome is Outcome.CANCELLED
+    # The thread that waited for its turn ends at once, and nothing was cut.
+    for thread in set(threading.enumerate()) - before:
+        thread.join(5)
+        assert not thread.is_alive()
+    assert "parts-of nobody else" not in cache._memory
+
+
+def test_what_held_in_an_earlier_round_stays_told(scene, hand):
+    config = load_preset("fast")
+    # The least that a round keeps is eight, so that nine take two.
+    short = replace(config.closed_form, explore_steps=3, refine_steps=3, polish_steps=3, keep_per_grasp=0.5)
+    told: list[Progress] = []
+    plan_grasps(scene, hand, count=9, preset=replace(config, closed_form=short), verify="none", progress=told.append)
+    assert [p.verified for p in told] == sorted(p.verified for p in told)
+    assert 0 < told[-2].verified <= told[-1].verified
+
+
+def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
+    release = threading.Event()
+    monkeypatch.setattr(trials, "object_parts", lambda _: release.wait(30))
+    begun = time.perf_counter()
+    late = plan_grasps(scene, hand, count=1, preset="fast", deadline=3.0)
+    assert time.perf_counter() - begun < 3.0 + LATE
+    assert late.outcome is Outcome.DEADLINE
+    release.set()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "culprit"),
+    [
+        ({"count": 0}, "count: 0"),
+        ({"count": 2000}, "1 to 1024"),
+        ({"seed": -1}, "seed: -1"),
+        ({"verify": "maybe"}, "'maybe'; valid: standard, hard, none"),
+        ({"deadline": -1.0}, "deadline: -1.0"),
+        ({"deadline": float("nan")}, "deadline: nan"),
+        ({"device": "abacus"}, "'abacus'; valid on this machine: cpu"),
+        ({"preset": "best"}, "unknown preset 'best'"),
+    ],
+)
+def test_a_wrong_request_is_refused(scene, hand, wrong: dict, culprit: str):
+    with pytest.raises(ConfigError) as caught:
+        plan_grasps(scene, hand, **wrong)
+    assert culprit in str(caught.value)

@@ -1,0 +1,41 @@
+"""Whether an object reaches the border of a picture."""
+
+import numpy as np
+import pytest
+
+from graspd_core.pointcloud.image_border import reaches_border
+
+EYE = np.array([0.0, 0.0, 1.0])
+
+
+def picture(rows: int = 120) -> np.ndarray:
+    """A plane seen by a camera above, half a metre wide."""
+    row, column = np.mgrid[-0.25 : 0.25 : rows * 1j, -0.25 : 0.25 : rows * 1j]
+    return np.column_stack([row.ravel(), column.ravel(), np.zeros(row.size)])
+
+
+@pytest.mark.parametrize(("middle", "reaches"), [((0.0, 0.0), False), ((0.24, 0.0), True), ((0.1, -0.24), True)])
+def test_what_lies_on_the_border_reaches_it(middle: tuple[float, float], reaches: bool):
+    points = picture()
+    mine = np.hypot(points[:, 0] - middle[0], points[:, 1] - middle[1]) < 0.05
+    assert reaches_border(points, EYE, mine) is reaches
+
+
+def test_what_makes_the_outline_alone_does_not():
+    points = picture()
+    out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
+    both = np.concatenate([points, out])
+    assert not reaches_border(both, EYE, np.arange(len(both)) >= len(points))
+
+
+def test_what_stands_out_over_the_end_of_the_table_does_not():
+    """The sides of the outline go from its top to the corners of the table, and there is nothing along them."""
+    points = picture(rows=300)
+    out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
+    both = np.concatenate([points, out])
+    assert not reaches_border(both, EYE, np.arange(len(both)) >= len(points))
+
+
+def test_nothing_reaches_nothing():
+    assert not reaches_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool))
+    assert not reaches_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool))

@@ -1,0 +1,266 @@
+"""Frames: matrices of messages, results in another frame, and /tf over DDS with the real message type."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from scipy.spatial.transform import Rotation
+
+from graspd_core.errors import TransformError
+from graspd_core.transforms import TransformBuffer
+from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Plane, Posture, Timing
+from graspd_ros.inputs import frames
+
+ROOT = Path(__file__).parents[2]
+DOMAIN = 1 + os.getpid() % 100
+SECOND = 1_000_000_000
+
+# A robot: base_link under world, static; the camera turns about z and rises by 1 m/s.
+PUBLISHER = """
+import contextlib, math, time, rclpy
+from geometry_msgs.msg import TransformStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from tf2_msgs.msg import TFMessage
+
+def transform(parent, child, stamp, z, turn):
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+    message.transform.translation.z = z
+    message.transform.rotation.w, message.transform.rotation.z = math.cos(turn / 2), math.sin(turn / 2)
+    return message
+
+rclpy.init()
+node = rclpy.create_node("robot")
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+fixed = node.create_publisher(TFMessage, "/tf_static", latched)
+moving = node.create_publisher(TFMessage, "/tf", 100)
+fixed.publish(TFMessage(transforms=[transform("world", "base_link", 0, 0.5, math.pi / 2)]))
+bad = transform("world", "broken", 0, 0.0, 0.0)
+bad.transform.rotation.w = 3.0
+print("ready", flush=True)
+for step in range(2000):
+    stamp = 100 * 10**9 + step * 10**7
+    message = TFMessage(transforms=[bad, transform("base_link", "camera", stamp, step * 0.01, step * 0.001)])
+    with contextlib.suppress(Exception):  # told to end in between
+        moving.publish(message)
+    if not rclpy.ok():
+        break
+    time.sleep(0.01)
+"""
+
+
+def pose(xyz: tuple[float, float, float], rotation: Rotation) -> Pose:
+    x, y, z, w = rotation.as_quat()
+    return Pose(position=Point(x=xyz[0], y=xyz[1], z=xyz[2]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def matrix(xyz: tuple[float, float, float], rotation: Rotation) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), xyz
+    return T
+
+
+PLACES = st.tuples(*[st.floats(-5.0, 5.0)] * 3)
+TURNS = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=np.random.default_rng(seed)))
+
+
+@given(PLACES, TURNS)
+def test_poses_and_matrices_are_inverse_to_each_other(xyz, rotation):
+    T = frames.matrix_of_pose(pose(xyz, rotation))
+    np.testing.assert_allclose(T, matrix(xyz, rotation), atol=1e-12)
+    np.testing.assert_allclose(frames.matrix_of_pose(frames.pose_of_matrix(T)), T, atol=1e-12)
+    q = pose(xyz, rotation).orientation
+    transform = Transform(translation=Vector3(x=xyz[0], y=xyz[1], z=xyz[2]), rotation=q)
+    np.testing.assert_array_equal(frames.matrix_of_transform(transform), T)
+
+
+def test_the_order_of_the_quaternion_is_that_of_ros():
+    quarter_about_z = Pose(orientation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5)))
+    np.testing.assert_allclose(frames.matrix_of_pose(quarter_about_z)[:3, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_a_rounded_quaternion_is_made_unit_and_a_wrong_one_refused():
+    rounded = frames.matrix_of_pose(Pose(orientation=Quaternion(z=0.7, w=0.7)))
+    np.testing.assert_allclose(rounded[:3, :3] @ rounded[:3, :3].T, np.eye(3), atol=1e-12)
+    for wrong in (Quaternion(w=0.0), Quaternion(w=2.0), Quaternion(w=math.nan), Quaternion(w=math.inf)):
+        with pytest.raises(TransformError, match="length"):
+            frames.matrix_of_pose(Pose(orientation=wrong))
+    with pytest.raises(TransformError, match="position"):
+        frames.matrix_of_pose(Pose(position=Point(x=math.nan)))
+
+
+@given(PLACES, TURNS, PLACES, TURNS)
+def test_a_moved_result_is_the_same_grasp_seen_from_elsewhere(where, how, base, turn):
+    T = matrix(where, how)
+    wxyz = np.roll(turn.as_quat(), 1)
+    posture = Posture(np.array(base), wxyz, np.array([0.1, 0.2]))
+    normal = np.array([0.0, 0.0, 1.0])
+    grasp = Grasp(posture, posture, posture, (Contact("tip", base, (1.0, 0.0, 0.0)),), score=2.0)
+    result = GraspResult(Outcome.SUCCEEDED, (grasp,), Timing(), 0, "closed_form", support=Plane(normal, 0.3))
+    moved = frames.moved_result(result, T)
+    found = moved.grasps[0]
+    for new in (found.pregrasp, found.grasp, found.squeeze):
+        seen = matrix(tuple(new.position), Rotation.from_quat(np.roll(new.quaternion_wxyz, -1)))
+        np.testing.assert_allclose(seen, T @ matrix(base, turn), atol=1e-9)
+        np.testing.assert_array_equal(new.joint_positions, posture.joint_positions)
+    contact = found.contacts[0]
+    np.testing.assert_allclose(contact.position, T[:3, :3] @ base + T[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(contact.normal, T[:3, 0], atol=1e-9)
+    # A point that was on the support still is.
+    assert moved.support is not None
+    on_it = T[:3, :3] @ np.array([1.0, -2.0, 0.3]) + T[:3, 3]
+    assert moved.support.normal @ on_it == pytest.approx(moved.support.offset, abs=1e-9)
+    assert (found.score, moved.outcome) == (2.0, Outcome.SUCCEEDED)
+
+
+def test_a_transform_that_comes_late_is_waited_for():
+    buffer = TransformBuffer()
+    asked: list[int] = []
+
+    def stop() -> bool:
+        asked.append(1)
+        if len(asked) == 3:  # as the executor's thread would, between two looks
+            buffer.add("world", "camera", matrix((1.0, 0.0, 0.0), Rotation.identity()), 5, static=True)
+        return False
+
+    found = frames.wait_for_transform(buffer, "world", "camera", 5, timeout=5.0, stop=stop)
+    assert found[0, 3] == 1.0
+    assert len(asked) == 3
+
+
+def test_waiting_ends_with_what_is_missing_at_the_timeout_or_when_stopped():
+    buffer = TransformBuffer()
+    buffer.add("world", "base", np.eye(4), 5, static=True)
+    begun = time.monotonic()
+    with pytest.raises(TransformError, match=r"'camera'.*base, world"):
+        frames.wait_for_transform(buffer, "world", "camera", None, timeout=0.1)
+    assert 0.1 <= time.monotonic() - begun < 2.0
+    begun = time.monotonic()
+    with pytest.raises(TransformError, match="camera"):
+        frames.wait_for_transform(buffer, "world", "camera", None, timeout=60.0, stop=lambda: True)
+    assert time.monotonic() - begun < 2.0
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = rclpy.create_node("listener", context=context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_without_tf2_msgs_the_node_says_so_once_and_goes_on(
+    node: Node, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
+    before = len(list(node.subscriptions))
+    listener = frames.TransformListener(node, TransformBuffer())
+    assert not listener.available
+    assert len(list(node.subscriptions)) == before
+    assert "".join(capfd.readouterr()).count("tf2_msgs is not installed") == 1
+
+
+@pytest.fixture
+def robot() -> Iterator[subprocess.Popen]:
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    process = subprocess.Popen([sys.executable, "-c", PUBLISHER], env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    yield process
+    process.terminate()  # killed, it would leave its shared memory behind
+    process.wait(10)
+    process.stdout.close()
+
+
+def spin_until(node: Node, condition: Callable[[], bool], timeout: float = 20.0) -> None:
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end
+        executor.spin_once(timeout_sec=0.05)
+    executor.shutdown()
+
+
+def test_tf_of_another_process_is_heard_and_told_right(node: Node, robot: subprocess.Popen):
+    assert robot.stdout is not None
+    assert robot.stdout.readline() == "ready\n"  # published before anyone listened: /tf_static comes late all the same
+    buffer = TransformBuffer()
+    listener = frames.TransformListener(node, buffer)
+    assert listener.available
+
+    def knows(stamp: int) -> bool:
+        try:
+            buffer.lookup("world", "camera", stamp)
+        except TransformError:
+            return False
+        return True
+
+    spin_until(node, lambda: {"world", "base_link", "camera"} <= set(buffer.frames()))
+    first = next(stamp for step in range(2000) if knows(stamp := 100 * SECOND + step * SECOND // 100))
+    stamp = first + SECOND // 5 + SECOND // 200  # between two samples
+    spin_until(node, lambda: knows(stamp))
+    seconds = stamp / SECOND - 100
+    expected = matrix((0.0, 0.0, 0.5), Rotation.from_rotvec([0, 0, math.pi / 2])) @ matrix(
+        (0.0, 0.0, seconds), Rotation.from_rotvec([0, 0, 0.1 * seconds])
+    )
+    np.testing.assert_allclose(buffer.lookup("world", "camera", stamp), expected, atol=1e-6)
+    assert "broken" not in buffer.frames()
+    with pytest.raises(TransformError, match="known from"):
+        buffer.lookup("world", "camera", stamp + 3600 * SECOND)
+
+
+def test_a_message_is_learnt_with_its_stamp_and_a_wrong_one_refused():
+    buffer = TransformBuffer()
+    message = TransformStamped(child_frame_id="camera")
+    message.header.frame_id = "world"
+    message.header.stamp.sec, message.header.stamp.nanosec = 3, 7
+    frames.learn(buffer, message, static=False)
+    np.testing.assert_array_equal(buffer.lookup("world", "camera", 3 * SECOND + 7), np.eye(4))
+    message.child_frame_id = ""
+    with pytest.raises(TransformError, match="without a name"):
+        frames.learn(buffer, message, static=False)
+
+
+def test_when_time_jumps_back_everything_is_forgotten(node: Node):
+    from rosgraph_msgs.msg import Clock
+
+    node.set_parameters([Parameter("use_sim_time", value=True)])
+    buffer = TransformBuffer()
+    listener = frames.TransformListener(node, buffer)
+    clock = node.create_publisher(Clock, "/clock", 10)
+    spin_until(node, lambda: clock.get_subscription_count() > 0)
+
+    def set_time(second: int) -> None:
+        message = Clock()
+        message.clock.sec = second
+        clock.publish(message)
+        spin_until(node, lambda: node.get_clock().now().nanoseconds == second * SECOND)
+
+    set_time(100)
+    set_time(101)
+    buffer.add("world", "camera", np.eye(4), 101 * SECOND)
+    set_time(102)
+    assert buffer.frames() == ("camera", "world")
+    set_time(50)
+    assert listener.available
+    assert buffer.frames() == ()

@@ -1,0 +1,172 @@
+"""A grasp as a trajectory: in limits, in step, never too fast, and good enough to hold an object when played."""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
+from trajectory_msgs.msg import JointTrajectory
+
+from graspd_core.errors import ConfigError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import object_parts
+from graspd_core.trials.world import PROTOCOLS, build_world
+from graspd_core.types import Grasp, Posture
+from graspd_ros.outputs.trajectory import Pace, base_poses, stage_times, trajectory_of
+
+HAND = load_hand("allegro_right")
+SHARES = st.lists(st.floats(0.0, 1.0), min_size=HAND.num_joints, max_size=HAND.num_joints)
+
+
+def posture(share: list[float], position: tuple[float, ...] = (0.0, 0.0, 0.0), turn: float = 0.0) -> Posture:
+    """Joints at a share of their range, the base turned about z."""
+    joints = HAND.lower + np.array(share) * (HAND.upper - HAND.lower)
+    return Posture(np.array(position), np.array([math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]), joints)
+
+
+def grasp(*postures: Posture) -> Grasp:
+    return Grasp(*postures, contacts=(), score=0.0)
+
+
+def seconds(trajectory: JointTrajectory) -> list[float]:
+    return [p.time_from_start.sec + p.time_from_start.nanosec * 1e-9 for p in trajectory.points]
+
+
+def positions(trajectory: JointTrajectory) -> np.ndarray:
+    return np.array([p.positions for p in trajectory.points])
+
+
+def spline(trajectory: JointTrajectory) -> CubicHermiteSpline:
+    """What ros2_control makes of points with positions and velocities."""
+    return CubicHermiteSpline(seconds(trajectory), positions(trajectory), [p.velocities for p in trajectory.points])
+
+
+@given(SHARES, SHARES, SHARES, st.floats(0.0, 0.3), st.floats(0.0, math.pi), st.floats(0.2, 20.0), st.floats(0.01, 5.0))
+def test_no_speed_is_exceeded_whatever_the_postures(first, second, third, travel, turn, joint_speed, shortest):
+    pace = Pace(joint_speed=joint_speed, shortest=shortest)
+    found = grasp(posture(first), posture(second, (travel, 0.0, 0.0), turn), posture(third, (travel, 0.0, 0.0), turn))
+    trajectory = trajectory_of(found, HAND, pace)
+    times = seconds(trajectory)
+    assert times[0] >= shortest
+    assert np.diff(times).min() >= shortest - 2e-9
+    path = spline(trajectory)
+    moments = np.linspace(times[0], times[-1], 400)
+    assert (np.abs(path(moments, 1)) <= np.minimum(joint_speed, HAND.velocity) * (1 + 1e-6)).all()
+    # The base goes the same way in the same rhythm.
+    assert 1.5 * travel / (times[1] - times[0]) <= pace.base_speed * (1 + 1e-6)
+    assert 1.5 * turn / (times[1] - times[0]) <= pace.base_turn * (1 + 1e-6)
+
+
+@given(SHARES, SHARES, SHARES)
+def test_joints_stay_within_their_limits_and_in_step(first, second, third):
+    trajectory = trajectory_of(grasp(posture(first), posture(second), posture(third)), HAND, Pace())
+    times, path = seconds(trajectory), spline(trajectory)
+    for start, end, a, b in zip(times, times[1:], positions(trajectory), positions(trajectory)[1:], strict=False):
+        way = path(np.linspace(start, end, 50))
+        assert (way >= HAND.lower - 1e-9).all()
+        assert (way <= HAND.upper + 1e-9).all()
+        # In step: every joint has done the same share of its way at the same time.
+        share = np.linspace(0, 1, 50) ** 2 * (3 - 2 * np.linspace(0, 1, 50))
+        np.testing.assert_allclose(way, a + share[:, None] * (b - a), atol=1e-6)
+
+
+def test_the_first_point_leaves_time_to_come_from_anywhere():
+    still = posture([0.5] * HAND.num_joints)
+    first = stage_times(grasp(still, still, still), HAND, Pace(joint_speed=0.5))[0]
+    assert first == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / 0.5)
+
+
+def test_a_negated_quaternion_is_no_turn():
+    here = posture([0.5] * HAND.num_joints)
+    negated = dataclasses.replace(here, quaternion_wxyz=-here.quaternion_wxyz)
+    times = stage_times(grasp(here, negated, here), HAND, Pace())
+    np.testing.assert_allclose(np.diff(times), Pace().shortest)
+
+
+def test_a_sliding_joint_keeps_the_speed_of_the_base():
+    sliding = dataclasses.replace(
+        HAND, joint_kind=tuple("prismatic" if kind == "revolute" else kind for kind in HAND.joint_kind)
+    )
+    here, there = posture([0.0] * HAND.num_joints), posture([1.0] * HAND.num_joints)
+    slow = np.diff(stage_times(grasp(here, there, there), sliding, Pace()))[0]
+    assert slow == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / Pace().base_speed)
+
+
+def test_rounding_beyond_a_limit_is_cut_off():
+    above = dataclasses.replace(posture([1.0] * HAND.num_joints), joint_positions=HAND.upper + 1e-12)
+    assert (positions(trajectory_of(grasp(above, above, above), HAND, Pace())) <= HAND.upper).all()
+
+
+def test_the_message_names_joints_and_starts_on_receipt():
+    here = posture([0.5] * HAND.num_joints, (0.1, 0.2, 0.3), 1.0)
+    trajectory = trajectory_of(grasp(here, here, here), HAND, Pace())
+    assert tuple(trajectory.joint_names) == HAND.joint_names
+    assert trajectory.header.frame_id == HAND.base_link
+    assert (trajectory.header.stamp.sec, trajectory.header.stamp.nanosec) == (0, 0)
+    assert all(list(p.velocities) == [0.0] * HAND.num_joints for p in trajectory.points)
+    poses = base_poses(grasp(here, here, here), "camera", Time(sec=7))
+    assert len(poses) == len(trajectory.points) == 3
+    assert {(p.header.frame_id, p.header.stamp.sec) for p in poses} == {("camera", 7)}
+    assert poses[1].pose.position.z == 0.3
+    assert poses[1].pose.orientation.z == pytest.approx(math.sin(0.5))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
+def test_a_pace_that_is_none_is_refused(value: float):
+    with pytest.raises(ConfigError, match="base_turn"):
+        Pace(base_turn=value)
+
+
+def play(found: Grasp, hand: HandModel, scene) -> float:
+    """Execute the messages in MuJoCo as a controller would, then hang the object on the hand; its travel in 2 s [m]."""
+    protocol = PROTOCOLS["standard"]
+    world = build_world(hand, scene.object, object_parts(scene.object), protocol)
+    data = mujoco.MjData(world.model)
+    trajectory, poses = trajectory_of(found, hand, Pace()), base_poses(found, "object", Time())
+    times, path = seconds(trajectory), spline(trajectory)
+    places = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in poses])
+    turns = Rotation.from_quat([[getattr(p.pose.orientation, axis) for axis in "xyzw"] for p in poses])
+    slerp = Slerp(range(3), turns)
+    # The base keeps the rhythm of the joints: 0 at the first point, 1 at the second, 2 at the third.
+    phase = CubicHermiteSpline(times, range(3), np.zeros(3))
+
+    def command(at: float) -> None:
+        done = min(float(phase(at)), 2.0)
+        data.ctrl[:] = path(at)
+        data.mocap_pos[0] = [np.interp(done, range(3), column) for column in places.T]
+        data.mocap_quat[0] = np.roll(slerp(done).as_quat(), 1)
+
+    command(times[0])
+    data.qpos[world.joint_addresses] = path(times[0])
+    for at in np.linspace(times[0], times[-1], round((times[-1] - times[0]) / protocol.timestep)):
+        command(at)
+        mujoco.mj_step(world.model, data)
+    weight = 9.81 * world.model.body_mass[world.object_body]
+    data.xfrc_applied[world.object_body, :3] = [0.0, 0.0, -weight]
+    mujoco.mj_step(world.model, data, round(2.0 / protocol.timestep))
+    return float(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))
+
+
+def test_the_messages_alone_make_a_hand_hold_an_object():
+    scene = load_scene("shape:cylinder")
+    result = plan_grasps(scene, HAND, count=1, preset="fast", seed=0)
+    assert result.grasps[0].verdict == "verified"
+    travel = play(result.grasps[0], HAND, scene)
+    assert travel < PROTOCOLS["standard"].max_displacement
+    # And the test can fail: a hand that stays open holds nothing.
+    opened = dataclasses.replace(result.grasps[0], grasp=result.grasps[0].pregrasp, squeeze=result.grasps[0].pregrasp)
+    assert play(opened, HAND, scene) > 1.0

@@ -1,0 +1,123 @@
+"""Work on one request: what it gives, and that nobody waits for it once the request is over."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+
+from graspd_core.errors import MeshError, TransformError
+from graspd_core.hands.library import load_hand
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.types import Outcome, Progress, Stage, Verdict
+from graspd_ros.inputs.requests import Request
+from graspd_ros.parameters import Settings
+from graspd_ros.request_planner import Planner, limited
+
+SETTINGS = Settings(num_grasps=1, preset="fast", deadline=60.0)
+AT_ONCE = 1.5  # seconds: PATIENCE and a crowded machine; the object is read for as long as the test likes
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("allegro_right", candidates=600)
+
+
+def request(load, settings: Settings = SETTINGS, pose: np.ndarray | None = None) -> Request:
+    return Request("r", "mesh", "object", Time(), settings, load, T_frame_object=pose)
+
+
+def planner(hand) -> Planner:
+    def lookup(target: str, source: str, stamp: Time, stop) -> np.ndarray:
+        raise TransformError(f"{source} -> {target}: not connected")
+
+    return Planner(hand, lookup)
+
+
+def never() -> bool:
+    return False
+
+
+def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):
+    stages: list[Progress] = []
+    pose = np.eye(4)
+    pose[:3, 3] = [10.0, 0.0, 0.0]
+    asked = request(lambda resolution: load_scene("shape:sphere", resolution=resolution), pose=pose)
+    planned = planner(hand).plan(asked, never, stages.append)
+    assert planned.result.outcome is Outcome.SUCCEEDED
+    best = planned.result.grasps[0]
+    assert best.verdict is Verdict.VERIFIED
+    assert np.linalg.norm(best.grasp.position - [10.0, 0.0, 0.0]) < 0.25
+    assert {report.stage for report in stages} == set(Stage)
+
+
+def test_trouble_on_the_way_comes_out_as_it_is(hand):
+    def broken(resolution: int):
+        raise MeshError("no such thing")
+
+    with pytest.raises(MeshError, match="no such thing"):
+        planner(hand).plan(request(broken), never, lambda _: None)
+    read: list[int] = []
+    elsewhere = replace(SETTINGS, output_frame="base")
+    with pytest.raises(TransformError, match="object -> base"):
+        planner(hand).plan(request(read.append, elsewhere), never, lambda _: None)
+    assert not read, "the object was read before it was known that the result cannot be told"
+
+
+@pytest.mark.parametrize(("timeless", "asked_for"), [(True, Time()), (False, Time(sec=7))])
+def test_what_came_without_a_time_is_told_by_the_newest_transforms(hand, timeless, asked_for):
+    asked: list[Time] = []
+
+    def lookup(target: str, source: str, stamp: Time, stop) -> np.ndarray:
+        asked.append(stamp)
+        return np.eye(4)
+
+    settings = replace(SETTINGS, output_frame="base", verify="none")
+    load = lambda resolution: load_scene("shape:sphere", resolution=resolution)  # noqa: E731
+    given = Request("r", "mesh", "object", Time(sec=7), settings, load, timeless=timeless)
+    Planner(hand, lookup).plan(given, never, lambda _: None)
+    assert asked == [asked_for]
+
+
+@pytest.mark.parametrize("ends_by", [Outcome.CANCELLED, Outcome.DEADLINE])
+def test_a_request_that_is_over_is_answered_while_its_object_is_still_being_read(hand, ends_by):
+    reading, release, told = threading.Event(), threading.Event(), []
+
+    def slow(resolution: int):
+        reading.set()
+        assert release.wait(10.0)
+        return load_scene("shape:sphere", resolution=resolution)
+
+    plans = planner(hand)
+    cancelled = threading.Event()
+    settings = replace(SETTINGS, deadline=60.0 if ends_by is Outcome.CANCELLED else 0.1)
+    if ends_by is Outcome.CANCELLED:
+        threading.Thread(target=lambda: reading.wait(10.0) and cancelled.set()).start()
+    begun = time.monotonic()
+    planned = plans.plan(request(slow, settings), cancelled.is_set, told.append)
+    assert time.monotonic() - begun < AT_ONCE + (0.1 if ends_by is Outcome.DEADLINE else 0.0)
+    assert planned.result.outcome is ends_by
+    before = len(told)
+    # The next one waits until the first has ended, and then runs as ever.
+    assert not plans.rest(0.05)
+    threading.Timer(0.2, release.set).start()
+    fine = plans.plan(request(lambda resolution: load_scene("shape:box", resolution=resolution)), never, lambda _: None)
+    assert fine.result.outcome is Outcome.SUCCEEDED
+    assert len(told) == before, "the request that was over went on telling"
+    assert plans.rest(0.0)
+
+
+def test_reports_are_limited_by_their_rate():
+    passed: list[Progress] = []
+    hook = limited(passed.append, rate=20.0)
+    end, given = time.monotonic() + 0.5, 0
+    while time.monotonic() < end:
+        hook(Progress(Stage.OPTIMISE, given, 1000, 0.0, 0, 0.0))
+        given += 1
+        time.sleep(0.001)
+    assert 2 <= len(passed) <= 11
+    assert given > len(passed)

@@ -1,0 +1,132 @@
+"""A function in a process of its own."""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from graspd_core.runtime.worker_process import OwnProcess, elsewhere
+
+
+@pytest.fixture
+def child() -> Iterator[OwnProcess]:
+    process = OwnProcess()
+    yield process
+    process.close()
+
+
+def test_the_work_is_done_elsewhere(child: OwnProcess):
+    assert child(os.getpid) == child(os.getpid) != os.getpid()
+
+
+def test_values_and_errors_come_back_and_the_child_lives_on(child: OwnProcess):
+    assert child(math.sqrt, 2.25) == 1.5
+    with pytest.raises(ValueError, match="math domain"):
+        child(math.sqrt, -1.0)
+    assert child(math.sqrt, 4.0) == 2.0
+
+
+def test_arrays_tensors_and_named_arguments_travel(child: OwnProcess):
+    points = np.arange(6.0).reshape(2, 3)
+    assert child(np.sum, points, axis=0).tolist() == [3.0, 5.0, 7.0]
+    field = torch.arange(5.0)
+    assert torch.equal(child(torch.mul, field, 2.0), 2.0 * field)
+
+
+def test_an_error_says_where_it_came_from_and_one_that_cannot_travel_what_it_was(child: OwnProcess):
+    with pytest.raises(ValueError, match="math domain") as caught:
+        child(math.sqrt, -1.0)
+    assert "own_process.py" in caught.value.__notes__[0]
+    with pytest.raises(RuntimeError, match="Homebound: no luggage"):
+        child(exec, "class Homebound(Exception): pass\nraise Homebound('no luggage')")
+    assert child(math.sqrt, 4.0) == 2.0
+
+
+def test_what_cannot_be_pickled_is_an_error_and_the_next_is_served(child: OwnProcess):
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        child(lambda: 1)
+    assert child(math.sqrt, 4.0) == 2.0
+
+
+def test_only_a_process_that_asked_for_it_has_its_work_done_elsewhere():
+    assert elsewhere(os.getpid) == os.getpid()
+    program = (
+        "import os\n"
+        "from graspd_core.runtime.worker_process import elsewhere, work_elsewhere\n"
+        "if __name__ == '__main__':\n"
+        "    work_elsewhere()\n"
+        "    work_elsewhere()\n"
+        "    print(elsewhere(os.getpid) == elsewhere(os.getpid) != os.getpid())\n"
+        "    print(elsewhere(elsewhere, os.getpid) == elsewhere(os.getpid))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["True", "True"]
+
+
+def test_when_the_child_is_killed_nothing_is_lost(child: OwnProcess):
+    first = child(os.getpid)
+    os.kill(first, signal.SIGKILL)
+    assert child(os.getpid) not in (first, os.getpid())
+
+
+def test_work_that_kills_its_process_does_not_kill_this_one(child: OwnProcess):
+    with pytest.raises(MemoryError, match="_exit: the process that it is done in died twice"):
+        child(os._exit, 1)
+    assert child(math.sqrt, 4.0) == 2.0
+
+
+def test_ctrl_c_in_the_terminal_leaves_the_child_alone(child: OwnProcess):
+    first = child(os.getpid)
+    os.kill(first, signal.SIGINT)
+    assert child(os.getpid) == first
+
+
+def test_an_answer_that_was_not_waited_for_is_not_the_next_ones(child: OwnProcess):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    assert child(subprocess.getoutput, "echo ready") == "ready"
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            child(subprocess.getoutput, "sleep 0.5; echo late")
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert child(subprocess.getoutput, "echo next") == "next"
+
+
+def test_the_child_ends_with_its_parent():
+    program = (
+        "import os, signal, math\n"
+        "from graspd_core.runtime.worker_process import OwnProcess\n"
+        "if __name__ == '__main__':\n"
+        "    aside = OwnProcess()\n"
+        "    assert aside(math.sqrt, 4.0) == 2.0\n"
+        "    print(aside._process.pid, flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    child = int(done.stdout)
+    end = time.monotonic() + 10
+    while _alive(child) and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not _alive(child)
+
+
+def _alive(process: int) -> bool:
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            return file.read().split()[2] != "Z"
+    except FileNotFoundError:
+        return False

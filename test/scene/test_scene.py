@@ -1,0 +1,131 @@
+"""Scenes from every kind of source, and the cache behind them."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from graspd_core.errors import MeshError
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.mesh.shapes import SPHERE_RADIUS, shape_volume
+from graspd_core.runtime import disk_cache as cache
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import build_scene, object_parts
+from graspd_core.types import TriangleMesh
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("GRASPD_CACHE", raising=False)
+    cache.forget()
+    yield tmp_path / "cache" / "graspd"
+    cache.forget()
+
+
+def test_a_sphere_scene_holds_the_closed_forms():
+    scene = load_scene("shape:sphere", mass=0.2, friction=0.8, resolution=24)
+    thing = scene.object
+    assert thing.source == "shape:sphere"
+    assert (thing.mass, thing.friction, thing.scale) == (0.2, 0.8, 1.0)
+    assert thing.volume == pytest.approx(shape_volume("sphere"), rel=0.01)
+    assert thing.center_of_mass == pytest.approx(np.zeros(3), abs=1e-6)
+    assert thing.radius == pytest.approx(SPHERE_RADIUS, rel=1e-6)
+    # Solid ball: I = 2/5 m r².
+    assert thing.inertia == pytest.approx(np.eye(3) * 0.4 * 0.2 * SPHERE_RADIUS**2, rel=0.02, abs=1e-9)
+    assert thing.warnings == ()
+    assert min(scene.timing) >= 0
+
+
+def test_mass_follows_volume_when_not_given():
+    thing = load_scene("shape:box", mass=None, resolution=16).object
+    assert thing.mass == pytest.approx(300 * shape_volume("box"))
+
+
+@pytest.mark.parametrize("setting", [{"mass": 0.0}, {"mass": float("nan")}, {"friction": -1.0}, {"resolution": 2}])
+def test_numbers_out_of_range_are_named(setting):
+    with pytest.raises(MeshError, match=next(iter(setting))):
+        load_scene("shape:box", **setting)
+
+
+def test_a_sheet_is_warned_about():
+    corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+    scene = build_scene(TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), source="sheet", resolution=16)
+    assert any("not closed" in w for w in scene.object.warnings)
+    assert any("encloses nothing" in w for w in scene.object.warnings)
+    assert (np.linalg.eigvalsh(scene.object.inertia) > 0).all()
+
+
+def fields_of(own_cache):
+    return sorted(own_cache.glob("sdf-*.npz"))
+
+
+def test_the_second_scene_comes_from_the_disk(own_cache):
+    first = load_scene("shape:torus", resolution=16)
+    (file,) = fields_of(own_cache)
+    place = file.stat().st_ino
+    cache.forget()
+    second = load_scene("shape:torus", resolution=16)
+    assert torch.equal(first.sdf.field, second.sdf.field)
+    assert torch.equal(first.sdf.origin, second.sdf.origin)
+    assert file.stat().st_ino == place
+    assert not list(own_cache.glob("*.part"))
+
+
+DAMAGE = [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b[:900] + b"\xff" * 99 + b[999:]]
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=["half", "empty", "scratched"])
+def test_a_damaged_file_is_built_again(own_cache, damage):
+    first = load_scene("shape:torus", resolution=16)
+    (file,) = fields_of(own_cache)
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    cache.forget()
+    again = load_scene("shape:torus", resolution=16)
+    assert torch.equal(first.sdf.field, again.sdf.field)
+    assert len(file.read_bytes()) == len(whole)
+
+
+def test_an_alien_file_is_built_again(own_cache):
+    first = load_scene("shape:torus", resolution=16)
+    (file,) = fields_of(own_cache)
+    with file.open("wb") as stream:
+        np.savez(stream, other=np.zeros(3))
+    cache.forget()
+    assert torch.equal(first.sdf.field, load_scene("shape:torus", resolution=16).sdf.field)
+
+
+def test_the_disk_does_not_fill_up(own_cache, monkeypatch):
+    monkeypatch.setattr(cache, "MOST_BYTES", 3000)
+    monkeypatch.setattr(cache, "LOOK_EVERY", 1)
+    for number in range(6):
+        cache.remember(f"thing-{number}", lambda: {"numbers": np.zeros(100)}, lambda _: True)
+        os.utime(own_cache / f"thing-{number}-v{cache.VERSION}.npz", (number, number))
+    cache.remember("last", lambda: {"numbers": np.zeros(100)}, lambda _: True)
+    left = {file.name.split("-v")[0] for file in own_cache.glob("*.npz")}
+    assert left == {"thing-5", "last"}
+
+
+def test_the_disk_can_be_left_alone(own_cache, monkeypatch):
+    monkeypatch.setenv("GRASPD_CACHE", "off")
+    load_scene("shape:torus", resolution=16)
+    assert not own_cache.exists()
+
+
+def test_an_unwritable_disk_is_done_without(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert sample_sdf(load_scene("shape:torus", resolution=16).sdf, torch.zeros(1, 3))[0] > 0
+
+
+def test_parts_are_remembered():
+    thing = load_scene("shape:l_block", resolution=16).object
+    parts = object_parts(thing)
+    cache.forget()
+    again = object_parts(thing)
+    assert len(parts) == len(again) >= 2
+    for one, other in zip(parts, again, strict=True):
+        assert np.array_equal(one.vertices, other.vertices)
+        assert np.array_equal(one.faces, other.faces)

@@ -1,0 +1,62 @@
+"""A two-finger gripper about boxes: grasps whose fate can be told beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import content_hash, mass_properties
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.scene.scene import ObjectModel
+from graspd_core.types import Grasp, Posture, TriangleMesh
+
+FINGER = """
+  <joint name="{name}_slide" type="prismatic"><parent link="palm"/><child link="{name}"/>
+    <origin xyz="0 {y} 0.04"/><axis xyz="0 {sign} 0"/><limit lower="0" upper="0.04" effort="20" velocity="1"/></joint>
+  <link name="{name}">
+    <inertial><mass value="0.05"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="0.03 0.01 0.06"/></geometry></collision></link>"""
+
+GRIPPER = f"""<robot name="gripper">
+  <link name="palm">
+    <collision><origin xyz="0 0 -0.01"/><geometry><box size="0.04 0.16 0.02"/></geometry></collision>
+  </link>
+  {FINGER.format(name="left", y=0.05, sign=-1)}{FINGER.format(name="right", y=-0.05, sign=1)}
+</robot>"""
+
+
+@pytest.fixture(scope="session")
+def gripper(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
+    """Two fingers that slide along y; at 25 mm their inner faces touch a cube of 40 mm in the middle."""
+    path: Path = tmp_path_factory.mktemp("gripper") / "gripper.urdf"
+    path.write_text(GRIPPER)
+    return load_hand(path, candidates=8)
+
+
+@pytest.fixture(scope="session")
+def cube() -> ObjectModel:
+    """A cube of 40 mm and 100 g."""
+    box = make_shape("box")
+    mesh = TriangleMesh(box.vertices / np.array([0.03, 0.03, 0.045]) * 0.02, box.faces)
+    volume, center, inertia = mass_properties(mesh)
+    radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
+    inertia = inertia * (0.1 / volume)
+    return ObjectModel("cube", content_hash(mesh), mesh, volume, 0.1, center, inertia, 0.6, 1.0, radius, ())
+
+
+@pytest.fixture(scope="session")
+def closing() -> Callable[..., Grasp]:
+    """The gripper about the origin: fingers at `pre`, at `touch`, and told to go to `squeeze` (left, right) [m]."""
+
+    def build(pre: float, touch: float, squeeze: tuple[float, float], height: float = -0.045) -> Grasp:
+        def posture(left: float, right: float) -> Posture:
+            return Posture(np.array([0.0, 0.0, height]), np.array([1.0, 0, 0, 0]), np.array([left, right]))
+
+        return Grasp(posture(pre, pre), posture(touch, touch), posture(*squeeze), (), 0.0)
+
+    return build

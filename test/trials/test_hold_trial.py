@@ -1,0 +1,125 @@
+"""The hold trial on grasps made by hand: good ones pass, bad ones fail for the right reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graspd_core.trials.hold_trial import hold_trial, judge
+from graspd_core.trials.noisy_trial import displaced, noisy_trial, pose_error
+from graspd_core.trials.world import PROTOCOLS, Protocol, World, build_world
+from graspd_core.types import Posture, Verdict
+
+# On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
+STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
+GOOD = (0.015, 0.025, (0.04, 0.04))
+
+
+@pytest.fixture(scope="module")
+def world(gripper, cube) -> World:
+    return build_world(gripper, cube, (cube.mesh,), STANDARD)
+
+
+def test_a_firm_squeeze_holds(world, closing):
+    grasp = closing(*GOOD)
+    hold = hold_trial(world, grasp, STANDARD)
+    assert hold.passed
+    assert hold.reason == ""
+    # 7.5 N on either side against 1 N: it gives by the springs' 1 N / 1000 N/m.
+    assert hold.max_displacement < 0.003
+    assert hold.max_rotation < np.deg2rad(1)
+    judged = judge(grasp, hold)
+    assert (judged.verdict, judged.hold) == (Verdict.VERIFIED, hold)
+
+
+def test_the_same_trial_gives_the_same_figures(world, gripper, cube, closing):
+    # A weak hold, whose slipping amplifies any difference.
+    grasp = closing(0.015, 0.025, (0.0262, 0.0262))
+    again = build_world(gripper, cube, (cube.mesh,), STANDARD)
+    first = hold_trial(world, grasp, STANDARD)
+    assert first.max_displacement > 0
+    assert first == hold_trial(world, grasp, STANDARD) == hold_trial(again, grasp, STANDARD)
+
+
+def test_a_hand_ten_centimetres_away_holds_nothing(world, closing):
+    hold = hold_trial(world, closing(*GOOD, height=-0.145), STANDARD)
+    assert not hold.passed
+    assert hold.reason.startswith("the object moved")
+    assert hold.reason.endswith("under a pull along +x")
+
+
+def test_a_push_from_one_side_fails_while_squeezing(world, closing):
+    hold = hold_trial(world, closing(0.015, 0.025, (0.04, 0.0)), STANDARD)
+    assert not hold.passed
+    assert "moved" in hold.reason or "turned" in hold.reason
+    judged = judge(closing(*GOOD), hold)
+    assert (judged.verdict, judged.reason) == (Verdict.FAILED, hold.reason)
+
+
+def test_a_start_fifteen_millimetres_deep_is_refused(world, closing):
+    hold = hold_trial(world, closing(0.04, 0.04, (0.04, 0.04)), STANDARD)
+    assert hold == replace(hold, passed=False, max_displacement=0.0, max_rotation=0.0)
+    assert hold.reason == "the pregrasp penetrates the object by 15.0 mm"
+    # Nine are allowed.
+    assert "penetrates" not in hold_trial(world, closing(0.034, 0.034, (0.04, 0.04)), STANDARD).reason
+
+
+def test_a_trial_can_be_stopped(world, closing):
+    hold = hold_trial(world, closing(*GOOD), STANDARD, stop=lambda: True)
+    assert not hold.passed
+    assert hold.reason == "stopped before the trial ended"
+
+
+def test_a_diverging_simulation_is_a_failure_not_an_exception(gripper, cube, closing, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wild = Protocol(pull=1e12)
+    hold = hold_trial(build_world(gripper, cube, (cube.mesh,), wild), closing(*GOOD), wild)
+    assert not hold.passed
+    assert hold.reason.startswith("the simulation diverged")
+    assert hold.max_displacement == np.inf
+    # MuJoCo's own log of such things stays unwritten.
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("share", "held"), [(1.3, True), (0.75, False)])
+@pytest.mark.parametrize("friction", [0.3, 0.6, 1.0])
+def test_friction_holds_above_coulombs_limit_and_slips_below(friction, share, held, gripper, cube, closing):
+    # A pull of F along x against two faces: 2 μ N ≥ F. MuJoCo's friction is regularised, so that it creeps near the
+    # limit, and the pulls across the faces unload one of them: a quarter to either side is left out.
+    protocol = replace(STANDARD, friction=(friction, 0.02, 1e-4))
+    force = protocol.pull * cube.mass
+    normal = share * force / (2 * friction)
+    squeeze = 0.025 + normal / protocol.slide_stiffness
+    world = build_world(gripper, cube, (cube.mesh,), protocol)
+    hold = hold_trial(world, closing(0.015, 0.0245, (squeeze, squeeze)), protocol)
+    assert hold.passed == held, hold
+    if not held:
+        assert hold.reason.endswith("pull along +x")
+
+
+def test_noise_is_survived_by_a_firm_squeeze_only(world, closing):
+    good = noisy_trial(world, closing(0.008, 0.025, (0.04, 0.04)), STANDARD, seed=1)
+    assert good >= 0.75
+    assert good == noisy_trial(world, closing(0.008, 0.025, (0.04, 0.04)), STANDARD, seed=1)
+    assert noisy_trial(world, closing(*GOOD, height=-0.145), STANDARD, seed=1) == 0.0
+
+
+def test_pose_errors_stay_within_their_bounds_and_move_all_postures_alike(closing):
+    rng = np.random.default_rng(0)
+    center = np.array([0.01, -0.02, 0.03])
+    grasp = closing(*GOOD)
+    for _ in range(50):
+        rotation, offset = pose_error(rng)
+        assert np.abs(offset).max() <= 0.005
+        assert np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)) <= np.deg2rad(5) + 1e-7
+        moved = displaced(grasp, rotation, offset, center)
+        for before, after in zip(postures(grasp), postures(moved), strict=True):
+            assert after.position == pytest.approx(rotation @ (before.position - center) + center + offset)
+            assert after.joint_positions is before.joint_positions
+            assert np.linalg.norm(after.quaternion_wxyz) == pytest.approx(1.0)
+
+
+def postures(grasp) -> tuple[Posture, Posture, Posture]:
+    return grasp.pregrasp, grasp.grasp, grasp.squeeze

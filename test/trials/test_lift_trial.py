@@ -1,0 +1,163 @@
+"""The lift trial on grasps made by hand: a cube on a table, a gripper that comes straight down on it."""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import build_sdf
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.scene.scene import Neighbour
+from graspd_core.trials.hold_trial import hold_trial, judge
+from graspd_core.trials.lift_trial import LiftSettings, lift_trial, retreat_posture
+from graspd_core.trials.world import PROTOCOLS, World, build_world
+from graspd_core.types import HoldResult, LiftResult, Plane, TriangleMesh, Verdict
+
+# On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
+STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
+# The fixtures' gripper reaches along +z; a table whose free side is −z makes that "down". The cube ends at z = 20 mm.
+TABLE = Plane(np.array([0.0, 0.0, -1.0]), -0.02)
+GOOD = (0.015, 0.025, (0.04, 0.04))
+# The fingers end 70 mm from the base: 2 mm above the table.
+CLEAR = -0.052
+
+
+def box(centre: tuple[float, float, float], half: float) -> Neighbour:
+    """A fixed cube [m]."""
+    unit = make_shape("box")
+    mesh = TriangleMesh(unit.vertices / np.array([0.03, 0.03, 0.045]) * half + np.array(centre), unit.faces)
+    return Neighbour(mesh, build_sdf(mesh, resolution=16))
+
+
+@pytest.fixture(scope="module")
+def hand(gripper) -> HandModel:
+    """The gripper, coming along its fingers."""
+    return replace(gripper, approach=np.array([0.0, 0.0, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def table(hand, cube) -> World:
+    return build_world(hand, cube, (cube.mesh,), STANDARD, TABLE)
+
+
+def test_the_retreat_lies_straight_back(hand, closing):
+    pregrasp = closing(*GOOD).pregrasp
+    assert retreat_posture(hand, pregrasp).position == pytest.approx([0, 0, -0.145])
+    assert retreat_posture(hand, pregrasp, 0.02).position == pytest.approx([0, 0, -0.065])
+
+
+def test_a_firm_squeeze_lifts(table, hand, closing):
+    lift = lift_trial(table, hand, closing(*GOOD, height=CLEAR), STANDARD)
+    assert lift.passed, lift
+    assert lift.reason == ""
+    assert lift.reach_through == 0.0
+    # 1 N of weight on the springs of 500 N/m, as in the hold trial; the cube rose with the hand.
+    assert lift.max_displacement < 0.003
+    assert lift.max_rotation < np.deg2rad(1)
+
+
+def test_the_same_lift_gives_the_same_figures(table, hand, closing):
+    grasp = closing(0.015, 0.025, (0.0262, 0.0262), height=CLEAR)
+    assert lift_trial(table, hand, grasp, STANDARD) == lift_trial(table, hand, grasp, STANDARD)
+
+
+def test_fingers_through_the_table_are_refused(table, hand, closing):
+    lift = lift_trial(table, hand, closing(*GOOD), STANDARD)
+    assert not lift.passed
+    # 5 mm below the table at the height of the other tests.
+    assert lift.reason == "the hand reaches 5.0 mm into the support while coming"
+    assert lift.reach_through == pytest.approx(0.005)
+
+
+def test_a_weak_squeeze_leaves_the_object_on_the_table(table, hand, closing):
+    # 0.5 N on either side hold 0.6 N by friction, of 1 N.
+    lift = lift_trial(table, hand, closing(0.015, 0.025, (0.026, 0.026), height=CLEAR), STANDARD)
+    assert not lift.passed
+    assert lift.reason.startswith("the object moved")
+    assert lift.reason.endswith("while lifting")
+    missed = lift_trial(table, hand, closing(0.0, 0.0, (0.0, 0.0), height=CLEAR), STANDARD)
+    assert missed.reason.endswith("while lifting")
+
+
+@pytest.mark.parametrize(("share", "lifted"), [(1.3, True), (0.75, False)])
+def test_friction_lifts_above_coulombs_limit_and_slips_below(table, hand, cube, closing, share: float, lifted: bool):
+    # 2 μ N ≥ m (g + a), a the greatest acceleration of the lift, 6 h / T².
+    weight = cube.mass * (9.81 + 6 * LiftSettings.lift_height / LiftSettings.lift_time**2)
+    normal = share * (weight if lifted else cube.mass * 9.81) / (2 * 0.6)
+    squeeze = 0.025 + normal / STANDARD.slide_stiffness
+    lift = lift_trial(table, hand, closing(0.015, 0.0245, (squeeze, squeeze), height=CLEAR), STANDARD)
+    assert lift.passed == lifted, lift
+
+
+def test_until_it_is_touched_an_object_rests_as_it_was_seen(hand, cube, closing):
+    # On a table of 25° a cube would slide or tip long before the fingers are there; firm fingers catch it.
+    normal = np.array([np.sin(0.44), 0.0, -np.cos(0.44)])
+    world = build_world(hand, cube, (cube.mesh,), replace(STANDARD, friction=(0.3, 0.02, 1e-4)), Plane(normal, -0.12))
+    late = LiftSettings(approach_time=1.0)
+    lift = lift_trial(world, hand, closing(0.02, 0.025, (0.04, 0.04), height=-0.06), STANDARD, settings=late)
+    assert lift.passed, lift
+
+
+def test_the_hand_keeps_out_of_neighbours_with_its_fingers_and_its_palm(hand, cube, closing):
+    # Fingers at 50 mm from the middle when open, 10 mm thick; the palm ends at y = 80 mm, 72 mm above the table.
+    beside_finger, under_palm = box((0.0, 0.06, 0.01), 0.01), box((0.0, 0.075, -0.055), 0.01)
+    for neighbour in (beside_finger, under_palm):
+        world = build_world(hand, cube, (cube.mesh,), STANDARD, TABLE, (box((0.5, 0, 0), 0.01), neighbour))
+        lift = lift_trial(world, hand, closing(0.0, 0.025, (0.04, 0.04), height=CLEAR), STANDARD)
+        assert not lift.passed
+        assert "into neighbour 2" in lift.reason
+    away = build_world(hand, cube, (cube.mesh,), STANDARD, TABLE, (box((0.0, 0.11, 0.01), 0.01),))
+    assert lift_trial(away, hand, closing(*GOOD, height=CLEAR), STANDARD).passed
+
+
+def test_without_a_support_the_object_is_drawn_back_the_way_the_hand_came(hand, cube, closing):
+    world = build_world(hand, cube, (cube.mesh,), STANDARD, None, (box((0.5, 0, 0), 0.01),))
+    assert world.up is None
+    assert not world.model.opt.gravity.any()
+    assert lift_trial(world, hand, closing(*GOOD), STANDARD).passed
+
+
+def test_a_neighbour_that_touches_the_object_does_not_throw_it(hand, cube, closing):
+    # 3 mm into the cube, from the side that no finger is on.
+    world = build_world(hand, cube, (cube.mesh,), STANDARD, TABLE, (box((0.037, 0, 0), 0.02),))
+    lift = lift_trial(world, hand, closing(0.015, 0.025, (0.04, 0.04), height=-0.08), STANDARD)
+    assert "while closing" not in lift.reason
+    assert "while squeezing" not in lift.reason
+
+
+def test_an_object_rests_on_its_own_lowest_point(hand, cube):
+    # A table seen 4 mm too low: hand and object each meet theirs.
+    world = build_world(hand, cube, (cube.mesh,), STANDARD, replace(TABLE, offset=-0.024))
+    data = mujoco.MjData(world.model)
+    data.mocap_pos[0] = [0, 0, -1]
+    mujoco.mj_step(world.model, data, 250)
+    moved = data.qpos[world.object_address : world.object_address + 3]
+    # Contacts give by a fraction of a millimetre.
+    assert moved == pytest.approx([0, 0, 0], abs=5e-4)
+
+
+def test_a_lift_can_be_stopped(table, hand, closing):
+    lift = lift_trial(table, hand, closing(*GOOD, height=CLEAR), STANDARD, stop=lambda: True)
+    assert lift == replace(lift, passed=False, reason="stopped before the trial ended")
+
+
+def test_a_verdict_needs_both_trials(table, hand, cube, closing):
+    held, lifted = HoldResult(True, 0.0, 0.0), LiftResult(True, 0.0, 0.0, 0.0)
+    grasp = closing(*GOOD)
+    assert judge(grasp, held).verdict is Verdict.VERIFIED
+    assert judge(grasp, held, lifted).verdict is Verdict.VERIFIED
+    # This one holds in free space and reaches through the table.
+    hold = hold_trial(build_world(hand, cube, (cube.mesh,), STANDARD), grasp, STANDARD)
+    lift = lift_trial(table, hand, grasp, STANDARD)
+    assert hold.passed
+    judged = judge(grasp, hold, lift)
+    assert (judged.verdict, judged.reason, judged.lift) == (Verdict.FAILED, lift.reason, lift)
+    lost = replace(held, passed=False, reason="the object moved")
+    assert judge(grasp, lost, lifted).reason == "the object moved"
