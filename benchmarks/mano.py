@@ -35,7 +35,7 @@ def case(model: Path, source: str, betas: list[float], preset: str, seed: int) -
     from graspd_core.config import load_preset
     from graspd_core.hands.mano.mano_hand import load_mano
     from graspd_core.mesh.mesh_distance import make_distance_query
-    from graspd_core.methods.candidates import synthesise
+    from graspd_core.methods.candidates import find_candidates
     from graspd_core.methods.loop import Hooks
     from graspd_core.metrics.skin_metrics import measure_skin
     from graspd_core.scene.load_scene import load_scene
@@ -48,7 +48,7 @@ def case(model: Path, source: str, betas: list[float], preset: str, seed: int) -
     mano = load_mano(model, betas, candidates=config.closed_form.fine_candidates)
     scene = load_scene(source, resolution=config.resolution)
     began = time.process_time()
-    found = synthesise(scene, mano.model, count=COUNT, seed=seed, config=config, hooks=Hooks())
+    found = find_candidates(scene, mano.model, count=COUNT, seed=seed, config=config, hooks=Hooks())
     seconds = (time.process_time() - began) / COUNT
     parts = object_parts(scene.object)
     world = build_world(mano.model, scene.object, parts, PROTOCOLS["standard"])

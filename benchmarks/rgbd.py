@@ -150,7 +150,7 @@ def main() -> None:
     results = run_missing(list(wanted(options)), options.out, options.processes)
     head = (
         f"{len(options.things)} {'scans' if meshes else 'shapes'} × {1 if options.quick else len(STARTS)} viewpoints "
-        f"on a table, noise `{options.noise}`{', two neighbours' if options.clutter else ''}, "
+        f"on a table, noise `{options.noise}`{', two obstacles' if options.clutter else ''}, "
         f"preset `{options.preset}`, {options.count} grasps asked for, {options.processes} at a time on "
         f"{os.cpu_count()} cores, Python {platform.python_version()}.\n\n"
     )

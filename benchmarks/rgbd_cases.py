@@ -100,7 +100,7 @@ def run_case(case: Case) -> dict:
 
     hand = warm_hand(case.preset)
     thing = load_mesh(case.shape) if Path(case.shape).suffix else case.shape
-    stage = tabletop(thing, yaw=YAW, neighbours=CLUTTER if case.clutter else ())
+    stage = tabletop(thing, yaw=YAW, obstacles=CLUTTER if case.clutter else ())
     if case.views:
         seed = 1000 * case.start
         clouds = views_of(stage, CAMERA, camera_poses(case), LEVELS[case.noise], seed)
@@ -113,7 +113,7 @@ def run_case(case: Case) -> dict:
             scene = front(clouds)
         else:
             scene = replace(
-                build_scene(stage.truth, source=case.shape), support=stage.support, neighbours=_neighbours(stage)
+                build_scene(stage.truth, source=case.shape), support=stage.support, obstacles=_obstacles(stage)
             )
     except GraspdError as error:
         return {**vars(case), "error": str(error), "scene_s": time.perf_counter() - began, "verified": 0}
@@ -136,7 +136,7 @@ def _grasps(case: Case, scene: Any, stage: Any, hand: Any) -> dict:
     truth = build_scene(stage.truth, source=case.shape).object
     parts = object_parts(truth)
     world = build_world(hand, truth, parts, protocol)
-    table = build_world(hand, truth, parts, protocol, stage.support, _neighbours(stage))
+    table = build_world(hand, truth, parts, protocol, stage.support, _obstacles(stage))
 
     def verified(result: Any) -> list:
         return [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
@@ -163,11 +163,11 @@ def _grasps(case: Case, scene: Any, stage: Any, hand: Any) -> dict:
     }
 
 
-def _neighbours(stage: Any) -> tuple:
+def _obstacles(stage: Any) -> tuple:
     from graspd_core.mesh.sdf import build_sdf
-    from graspd_core.scene.scene import Neighbour
+    from graspd_core.scene.scene import Obstacle
 
-    return tuple(Neighbour(mesh, build_sdf(mesh, resolution=32, padding=0.02)) for mesh in stage.neighbours)
+    return tuple(Obstacle(mesh, build_sdf(mesh, resolution=32, padding=0.02)) for mesh in stage.obstacles)
 
 
 def reconstruction_error(scene: Any, stage: Any) -> dict:

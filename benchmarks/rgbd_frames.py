@@ -91,7 +91,7 @@ def run_frame(folder: Path, pictures: Path, hand: Any, *, count: int, preset: st
         "asked": count,
         "tried": len(result.grasps),
         "outcome": result.outcome.name,
-        "neighbours": len(scene.neighbours),
+        "neighbours": len(scene.obstacles),
         "support": scene.support is not None,
         "warnings": list(result.warnings),
         "picture": str(picture),
@@ -114,7 +114,7 @@ def draw(scene: Any, hand: Any, posture: Any, points: np.ndarray, eye: np.ndarra
         for rows, colour in ((near, SEEN), (~near, GUESSED))
         if rows.any()
     ]
-    things += [(n.mesh, OTHER) for n in scene.neighbours]
+    things += [(n.mesh, OTHER) for n in scene.obstacles]
     centre = mesh.vertices.mean(0)
     up = np.array([0.0, -1.0, 0.0])
     if scene.support is not None:

@@ -24,7 +24,7 @@ def run_node(file: Path, arguments: list[str]) -> int:
     """graspd_node, with a timer that notes how late it comes and a note of each cloud's age on arrival."""
     from graspd_ros import grasp_node as service
     from graspd_ros import node
-    from graspd_ros.inputs.sensor_frames import Sighting, nanoseconds
+    from graspd_ros.inputs.sensor_frames import SensorFrame, nanoseconds
 
     class TimedNode(service.GraspNode):
         def __init__(self, *args, **kwargs) -> None:
@@ -42,7 +42,7 @@ def run_node(file: Path, arguments: list[str]) -> int:
             # From this tick on: one long stall is one late tick, as the timer skips those that it missed.
             self._due = now + TIMER_PERIOD
 
-        def _see(self, sighting: Sighting) -> None:
+        def _see(self, sighting: SensorFrame) -> None:
             self.ages.append((sighting.arrived - nanoseconds(sighting.stamp)) * 1e-9)
             super()._see(sighting)
 

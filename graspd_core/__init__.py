@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from graspd_core.pointcloud.camera import PinholeCamera
     from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_in_metres
     from graspd_core.pointcloud.point_cloud import PointCloud, transform_cloud
-    from graspd_core.runtime.heap import give_memory_back, share_arenas
-    from graspd_core.runtime.worker_process import elsewhere
+    from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
+    from graspd_core.runtime.worker_process import run_isolated
     from graspd_core.scene.load_scene import load_scene
     from graspd_core.scene.scene import Scene
     from graspd_core.scene.scene_from_views import scene_from_views
@@ -48,8 +48,8 @@ _MODULES = {
     "pointcloud.camera": ("PinholeCamera",),
     "pointcloud.depth_image": ("cloud_from_depth", "depth_in_metres"),
     "pointcloud.point_cloud": ("PointCloud", "transform_cloud"),
-    "runtime.heap": ("give_memory_back", "share_arenas"),
-    "runtime.worker_process": ("elsewhere",),
+    "runtime.heap": ("trim_heap", "limit_malloc_arenas"),
+    "runtime.worker_process": ("run_isolated",),
     "scene.load_scene": ("load_scene",),
     "scene.scene": ("Scene",),
     "scene.scene_from_views": ("scene_from_views",),

@@ -21,7 +21,7 @@ _NAMES = {
 }
 
 
-class Tally:
+class Counters:
     """Counts by name, and the last figures."""
 
     def __init__(self) -> None:

@@ -27,7 +27,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from graspd_core import all_joint_names, give_memory_back, hand_names, load_hand, warm_up
+from graspd_core import all_joint_names, hand_names, load_hand, trim_heap, warm_up
 from graspd_core.config import load_preset
 from graspd_core.errors import GraspdError
 from graspd_core.transforms import TransformBuffer
@@ -35,11 +35,11 @@ from graspd_ros.action_server import GoalServer
 from graspd_ros.diagnostics import health_message, resident_memory
 from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.frames import TransformListener, wait_for_transform
-from graspd_ros.inputs.request_builder import SOURCES, Intake
+from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
 from graspd_ros.inputs.requests import Listener, Request
-from graspd_ros.inputs.sensor_frames import Sighting, cloud_sighting, depth_sighting, nanoseconds
+from graspd_ros.inputs.sensor_frames import SensorFrame, cloud_frame, depth_sensor_frame, nanoseconds
 from graspd_ros.outputs.error_codes import RequestError, sentence_of
-from graspd_ros.outputs.responses import Answers
+from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings, declare_settings, read_settings
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
@@ -72,8 +72,8 @@ class GraspNode(Node):
         self._transforms = TransformBuffer()
         self._listener = TransformListener(self, self._transforms)
         self._pairs = ImagePairs()
-        self._intake = Intake(self._hand.name, self._now, self._transform)
-        self._answers = Answers(self, self._hand)
+        self._intake = RequestBuilder(self._hand.name, self._now, self._transform)
+        self._answers = Responses(self, self._hand)
         self._planner = Planner(self._hand, self._transform_in_time)
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._answers.finished, prepare=self._prepare, queue_size=settings.queue_size
@@ -131,17 +131,17 @@ class GraspNode(Node):
 
     def _on_points(self, message: PointCloud2) -> None:
         try:
-            self._see(cloud_sighting(message, nanoseconds(self._now())))
+            self._see(cloud_frame(message, nanoseconds(self._now())))
         except RequestError as error:  # too large to keep
             self._answers.cloud_not_taken(self._intake.new_id("cloud"), error)
 
     def _on_image(self, message: Image) -> None:
         if pair := self._pairs.add_image(message):
-            self._see(depth_sighting(*pair, nanoseconds(self._now())))
+            self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         if pair := self._pairs.add_info(message):
-            self._see(depth_sighting(*pair, nanoseconds(self._now())))
+            self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
 
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
@@ -213,7 +213,7 @@ class GraspNode(Node):
         else:
             self._submit(request)
 
-    def _see(self, sighting: Sighting) -> None:
+    def _see(self, sighting: SensorFrame) -> None:
         self._answers.tally.count("clouds_received")
         self._intake.newest, settings = sighting, read_settings(self)
         if settings.cloud_policy == "off":
@@ -267,4 +267,4 @@ class GraspNode(Node):
         try:
             return self._planner.plan(request, stop, self._answers.progress_hook(request))
         finally:
-            give_memory_back()
+            trim_heap()

@@ -33,11 +33,11 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown
 
-    from graspd_core import share_arenas
+    from graspd_core import limit_malloc_arenas
     from graspd_core.errors import GraspdError
     from graspd_ros.grasp_node import GraspNode
 
-    share_arenas()
+    limit_malloc_arenas()
     sys.setswitchinterval(SWITCH_INTERVAL)
     wake, failed = threading.Event(), threading.Event()
 

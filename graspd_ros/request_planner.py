@@ -89,9 +89,9 @@ class Planner:
         settings = request.settings
         config = load_preset(settings.preset)
         # Looked up before the work, which would be lost where there is no transform.
-        elsewhere = request.frame_out != request.frame
+        run_isolated = request.frame_out != request.frame
         stamp = Time() if request.timeless else request.stamp
-        T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if elsewhere else None
+        T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
         scene = request.load(config.resolution)
         result = plan_grasps(
             scene,

@@ -293,7 +293,7 @@ def test_constants_are_those_of_the_messages():
 
 def test_events_are_those_that_the_node_tells():
     told = set()
-    for path in (ROOT / "graspd_ros").glob("*.py"):
+    for path in (ROOT / "graspd_ros").rglob("*.py"):
         told |= set(re.findall(r"\.tell\(\s*\"(\w+)\"", path.read_text()))
     told |= {Ending.CANCELLED.value, Ending.SUPERSEDED.value}
     assert {quoted(row[0])[0] for row in tables("Requests and answers")[3]} == told
@@ -308,7 +308,7 @@ def test_keys_of_the_diagnostics_are_those_that_are_sent():
 
 
 def test_every_fault_names_a_test_that_exists():
-    tests = "".join(path.read_text() for path in (ROOT / "test" / "ros").glob("test_*.py"))
+    tests = "".join(path.read_text() for path in (ROOT / "test" / "ros").rglob("test_*.py"))
     named = [quoted(row[2])[0] for row in tables("Faults")[0]]
     assert named
     assert not [name for name in named if f"def {name}(" not in tests]

@@ -113,7 +113,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     presets = {name: load_preset(name) for name in request.presets or defaults}
     planned = {name: config for name, config in presets.items() if name in PLANNED}
     if "balanced" in planned:
-        planned[STEADY] = override(planned["balanced"], {"rounds.first_effort": 1.0, "rounds.growth": 1.0})
+        planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
     objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
     cells: list[Cell] = []
     for thing in objects:

@@ -73,7 +73,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
             yield frame, str(error)
 
 
-def fused_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
+def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
     """The chosen clouds as views of one scene, less those that cannot be used, which stderr counts.
 
     Raises:
@@ -106,4 +106,4 @@ def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...
     if not is_bag(path):
         return cloud_files.load_views(path)
     chosen = argparse.Namespace(**{**vars(options), "limit": options.limit or 1})
-    return fused_views(path, chosen)
+    return merged_views(path, chosen)

@@ -15,7 +15,7 @@ from graspd_core.cli.cloud_options import (
     add_object_options,
     bag_views,
     check_bag_options,
-    fused_views,
+    merged_views,
     target_of,
 )
 from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options
@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
     """One cloud after the other, or all of them together."""
     if options.fuse:
-        views = fused_views(options.bag, options)
+        views = merged_views(options.bag, options)
         yield _Job("fused", f"{len(views)} clouds fused", views)
         return
     for frame, seen in bag_views(options.bag, options):

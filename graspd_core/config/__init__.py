@@ -9,12 +9,12 @@ from typing import Literal
 
 from graspd_core.config.baselines import AnnealingConfig, RandomClosureConfig
 from graspd_core.config.closed_form import ClosedFormConfig, LossWeights
-from graspd_core.config.grasp_stages import PostureConfig
+from graspd_core.config.grasp_stages import GraspStagesConfig
 from graspd_core.config.graspd2022 import Graspd2022Config
 from graspd_core.config.mapping import from_mapping
 from graspd_core.config.robust import RobustConfig
 from graspd_core.config.rounds import RoundsConfig
-from graspd_core.config.segmentation import SegmentConfig
+from graspd_core.config.segmentation import SegmentationConfig
 from graspd_core.errors import ConfigError
 from graspd_core.paths import config_dir
 
@@ -23,14 +23,14 @@ __all__ = [
     "VERIFICATIONS",
     "AnnealingConfig",
     "ClosedFormConfig",
+    "GraspStagesConfig",
     "Graspd2022Config",
     "LossWeights",
     "PlanConfig",
-    "PostureConfig",
     "RandomClosureConfig",
     "RobustConfig",
     "RoundsConfig",
-    "SegmentConfig",
+    "SegmentationConfig",
     "from_mapping",
     "load_preset",
     "preset_names",
@@ -64,7 +64,7 @@ class PlanConfig:
     graspd2022: Graspd2022Config = field(default_factory=Graspd2022Config)
     annealing: AnnealingConfig = field(default_factory=AnnealingConfig)
     random_closure: RandomClosureConfig = field(default_factory=RandomClosureConfig)
-    postures: PostureConfig = field(default_factory=PostureConfig)
+    postures: GraspStagesConfig = field(default_factory=GraspStagesConfig)
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
     robust: RobustConfig = field(default_factory=RobustConfig)
 

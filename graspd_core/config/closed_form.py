@@ -53,7 +53,7 @@ class ClosedFormConfig:
         polish_weights: of the loss terms while polishing.
         obstacle_factor: times as many starts are tried and kept where there is a support or a neighbour, which rule
             out most ways to grasp a thing.
-        trust_floor: what a contact counts on surface that was only guessed; one where it was seen.
+        confidence_floor: what a contact counts on surface that was only guessed; one where it was seen.
     """
 
     starts_per_grasp: float = 4.0
@@ -74,7 +74,7 @@ class ClosedFormConfig:
     rotation_rate: float = 0.03
     joint_rate: float = 0.03
     obstacle_factor: float = 2.0
-    trust_floor: float = 0.4
+    confidence_floor: float = 0.4
     weights: LossWeights = field(default_factory=LossWeights)
     polish_weights: LossWeights = field(
         default_factory=lambda: LossWeights(

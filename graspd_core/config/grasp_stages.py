@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class PostureConfig:
+class GraspStagesConfig:
     """Pregrasp and squeeze.
 
     Attributes:

@@ -14,10 +14,10 @@ class RoundsConfig:
 
     Attributes:
         most: rounds at most.
-        first_effort: of the first round, on an object of known shape that stands alone; elsewhere it is one.
+        first_budget: of the first round, on an object of known shape that stands alone; elsewhere it is one.
         growth: times as much effort with every further round.
     """
 
     most: int = 3
-    first_effort: float = 0.5
+    first_budget: float = 0.5
     growth: float = 2.0

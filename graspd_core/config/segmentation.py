@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class SegmentConfig:
+class SegmentationConfig:
     """How an object is cut out of a scene that depth cameras saw.
 
     Attributes:
@@ -22,7 +22,7 @@ class SegmentConfig:
         largest_object: things larger than this are background: walls, floors, furniture [m].
         min_points: things seen by fewer points than this are noise.
         target_reach: a target point this near to a thing means that thing [m].
-        neighbour_reach: other things are reported as far as this from the object [m].
+        obstacle_range: other things are reported as far as this from the object [m].
     """
 
     roi_low: tuple[float, float, float] | None = None
@@ -37,4 +37,4 @@ class SegmentConfig:
     largest_object: float = 0.35
     min_points: int = 30
     target_reach: float = 0.05
-    neighbour_reach: float = 0.3
+    obstacle_range: float = 0.3

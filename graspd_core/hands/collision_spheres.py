@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from graspd_core.hands.model import HandModel, Primitive
 
 
-def proxy_spheres(
+def collision_spheres(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "spheres 3"], Float[np.ndarray, "spheres"], Int[np.ndarray, "spheres"]]:
     """Centres in link frames [m], radii [m] and links of spheres that fill every primitive."""

@@ -18,7 +18,7 @@ from graspd_core.se3 import safe_norm
 
 
 @dataclass(frozen=True, eq=False)
-class Solids:
+class CollisionTensors:
     """Primitives in one common form: a box of half extents `core`, swept by `radius`; cylinders are round boxes.
 
     Attributes:
@@ -37,7 +37,7 @@ class Solids:
     link: Int[Tensor, "solids"]
 
 
-def make_solids(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> Solids:
+def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
     """Lay the hand's boxes and round solids out as tensors."""
     solids = [p for p in hand.primitives if p.kind != "hull"]
     core, radius, is_round = [], [], []
@@ -55,7 +55,7 @@ def make_solids(hand: HandModel, device: torch.device | str, dtype: torch.dtype)
         return torch.as_tensor(np.asarray(values, dtype=float).reshape(shape), device=device, dtype=dtype)
 
     n = len(solids)
-    return Solids(
+    return CollisionTensors(
         rotation=tensor([p.rotation for p in solids], (n, 3, 3)),
         translation=tensor([p.translation for p in solids], (n, 3)),
         core=tensor(core, (n, 3)),
@@ -66,7 +66,7 @@ def make_solids(hand: HandModel, device: torch.device | str, dtype: torch.dtype)
 
 
 def solid_distance(
-    solids: Solids,
+    solids: CollisionTensors,
     rotations: Float[Tensor, "batch links 3 3"],
     translations: Float[Tensor, "batch links 3"],
     points: Float[Tensor, "batch points 3"],
@@ -77,7 +77,7 @@ def solid_distance(
 
 
 def solid_bound(
-    solids: Solids,
+    solids: CollisionTensors,
     rotations: Float[Tensor, "batch links 3 3"],
     translations: Float[Tensor, "batch links 3"],
     points: Float[Tensor, "batch points 3"],
@@ -88,7 +88,7 @@ def solid_bound(
 
 
 def _to_solids(
-    solids: Solids, rotations: Tensor, translations: Tensor, points: Float[Tensor, "batch points 3"]
+    solids: CollisionTensors, rotations: Tensor, translations: Tensor, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids 3"]:
     """Base-frame points in the frame of every solid."""
     rotation = rotations[:, solids.link] @ solids.rotation
@@ -98,7 +98,7 @@ def _to_solids(
 
 
 def pair_distance(
-    solids: Solids,
+    solids: CollisionTensors,
     rotations: Float[Tensor, "batch links 3 3"],
     translations: Float[Tensor, "batch links 3"],
     points: Float[Tensor, "batch pairs 3"],

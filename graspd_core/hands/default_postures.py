@@ -25,7 +25,7 @@ from graspd_core.hands.fingers import (
     straight_joints,
     units,
 )
-from graspd_core.hands.kinematics import forward, make_kinematics, place, placement
+from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples
@@ -40,7 +40,7 @@ _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 60.0
 _SPOT = 0.02
 
 
-def guess_palm(hand: HandModel) -> HandModel:
+def default_palm(hand: HandModel) -> HandModel:
     """The hand with a palm centre, a palm normal and an approach, and a warning that they are guessed."""
     fingers = find_fingers(hand)
     normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
@@ -57,7 +57,7 @@ def guess_palm(hand: HandModel) -> HandModel:
     )
 
 
-def guess_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed")) -> HandModel:
+def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed")) -> HandModel:
     """The hand with those postures guessed that `which` names, to suit its palm, and a warning that they are."""
     fingers = find_fingers(hand)
     ahead = hand.palm_center + _AHEAD * fingers.length * hand.palm_normal
@@ -134,7 +134,7 @@ def _around_ball(
         return torch.where(still, wrist, lower + half * (share.clamp(-1.0, 1.0) + 1.0))
 
     def cost() -> Float[Tensor, "starts"]:
-        away = place(matrix, *forward(kinematics, posture())) - (origin + fingers.length * shift[:, None])
+        away = place_points(matrix, *forward(kinematics, posture())) - (origin + fingers.length * shift[:, None])
         outside = (share.abs() - 1.0).clamp_min(0.0).square().sum(-1)
         bent = _REST * (share - home).square().mean(-1)
         if directions is not None:

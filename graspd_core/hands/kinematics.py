@@ -112,7 +112,7 @@ def placement(
     return matrix.flatten(1)
 
 
-def place(
+def place_points(
     matrix: Float[Tensor, "points columns"],
     rotations: Float[Tensor, "batch links 3 3"],
     translations: Float[Tensor, "batch links 3"],
@@ -132,7 +132,7 @@ def points_in_base(
 ) -> Float[Tensor, "batch points 3"]:
     """Link-frame points at joint values q, base frame [m]. For a fixed set of points keep its `placement` instead."""
     rotations, translations = forward(kinematics, q)
-    return place(placement(translations.shape[1], points, links), rotations, translations)
+    return place_points(placement(translations.shape[1], points, links), rotations, translations)
 
 
 def point_jacobian(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from graspd_core.errors import HandError
-from graspd_core.hands.default_postures import guess_palm, guess_postures
+from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.readers.description import apply_description, read_description
@@ -46,7 +46,7 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600) -> HandModel:
         description = read_description(path)
         hand = apply_description(_with_effort(read_hand_file(description.urdf)), description)
     else:
-        hand = guess_postures(guess_palm(_with_effort(read_hand_file(path))))
+        hand = default_postures(default_palm(_with_effort(read_hand_file(path))))
     hand = replace(hand, adjacent=adjacent_links(hand))
     points, normals, links = surface_candidates(hand, candidates, _CANDIDATE_SEED)
     return replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.hands.kinematics import forward, make_kinematics, place, placement
+from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.link_distance import hand_sdf
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import dense_samples, parent_groups
@@ -30,7 +30,7 @@ def link_overlaps(
     """
     rotations, translations = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q).double())
     owner = torch.as_tensor(links)
-    base = place(placement(hand.num_links, torch.as_tensor(points).double(), owner), rotations, translations)
+    base = place_points(placement(hand.num_links, torch.as_tensor(points).double(), owner), rotations, translations)
     depth = np.zeros((len(q), hand.num_links, hand.num_links))
     for link in range(hand.num_links):
         if not hand.primitives_of[link]:

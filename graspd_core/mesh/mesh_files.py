@@ -12,7 +12,7 @@ from torch.quasirandom import SobolEngine
 
 from graspd_core.errors import MeshError
 from graspd_core.mesh.collada import read_dae
-from graspd_core.mesh.small_components import without_specks
+from graspd_core.mesh.small_components import drop_small_components
 from graspd_core.mesh.topology import (
     drop_degenerate,
     drop_repeated,
@@ -91,7 +91,7 @@ def check_mesh(
         mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
     if dusty:
         # Before all else that is said of the mesh: its size and its holes could be the dust's.
-        mesh, specks = without_specks(mesh)
+        mesh, specks = drop_small_components(mesh)
         if specks:
             warnings.append(f"{source}: dropped {specks} tiny pieces that float clear of the rest")
     faces = mesh.faces

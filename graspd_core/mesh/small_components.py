@@ -15,13 +15,13 @@ from graspd_core.types import TriangleMesh
 TINY, STAYS = 0.05, 0.98
 
 
-def without_specks(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
+def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """The mesh without its dust, and how many pieces of it there were.
 
     Dust is what shares no vertex with the rest, is tiny, and lies farther from all that is not tiny than it is large:
     a bump, a screw's head or a loose triangle that touches the body stays.
     """
-    piece = face_pieces(mesh)
+    piece = face_components(mesh)
     count = int(piece.max()) + 1
     if count == 1:
         return mesh, 0
@@ -42,7 +42,7 @@ def without_specks(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(dust.sum())
 
 
-def face_pieces(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
+def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
     """Number of the piece that each face belongs to; pieces share no vertex."""
     a, b, c = mesh.faces.T
     rows, columns = np.concatenate([a, b]), np.concatenate([b, c])

@@ -8,7 +8,7 @@ from dataclasses import replace
 from graspd_core.config import PlanConfig
 
 
-def at_effort(config: PlanConfig, effort: float) -> PlanConfig:
+def at_budget(config: PlanConfig, effort: float) -> PlanConfig:
     """The settings at an effort: below one that share of the steps, above it as many times the starts.
 
     Steps are what a small batch costs, and fewer of them do on easy objects; starts are what hard objects want. Only

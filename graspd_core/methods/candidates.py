@@ -13,23 +13,23 @@ from torch import Tensor
 from graspd_core.config import PlanConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
-from graspd_core.methods.annealing.annealing import search_annealing
+from graspd_core.methods.annealing.annealing import plan_annealing
 from graspd_core.methods.closed_form.closed_form import ClosedForm
 from graspd_core.methods.grasp_stages import (
+    ContactSet,
     Squeeze,
-    Touches,
     approach_depth,
-    find_touches,
-    open_clear,
+    find_contacts,
+    find_pregrasp,
     self_overlap,
     squeeze,
 )
-from graspd_core.methods.graspd2022.graspd2022 import search_graspd2022
+from graspd_core.methods.graspd2022.graspd2022 import plan_graspd2022
 from graspd_core.methods.loop import Hooks, Poses, minimise
 from graspd_core.methods.obstacle_distance import intrusion
-from graspd_core.methods.planner import Found, Search, Task, problem_of, starts_of
+from graspd_core.methods.planner import Planner, PlannerInput, PlannerOutput, problem_of, starts_of
 from graspd_core.methods.problem import Problem
-from graspd_core.methods.random_closure.random_closure import search_random_closure
+from graspd_core.methods.random_closure.random_closure import plan_random_closure
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 
@@ -49,7 +49,7 @@ class Candidates:
     interrupted: str
 
 
-def search_closed_form(task: Task) -> Found:
+def plan_closed_form(task: PlannerInput) -> PlannerOutput:
     """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
     settings = task.config.closed_form
     problem = problem_of(task)
@@ -57,18 +57,18 @@ def search_closed_form(task: Task) -> Found:
     starts = starts_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
     solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
     solution = minimise(solver, problem, starts, task.hooks)
-    return Found(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
+    return PlannerOutput(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
 
 
-SEARCHES: dict[str, Search] = {
-    "closed_form": search_closed_form,
-    "graspd2022": search_graspd2022,
-    "annealing": search_annealing,
-    "random_closure": search_random_closure,
+SEARCHES: dict[str, Planner] = {
+    "closed_form": plan_closed_form,
+    "graspd2022": plan_graspd2022,
+    "annealing": plan_annealing,
+    "random_closure": plan_random_closure,
 }
 
 
-def synthesise(
+def find_candidates(
     scene: Scene,
     hand: HandModel,
     *,
@@ -80,7 +80,7 @@ def synthesise(
     dtype: torch.dtype = torch.float32,
 ) -> Candidates:
     """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless."""
-    found = SEARCHES[config.method](Task(scene, hand, count, seed, config, hooks, device, dtype))
+    found = SEARCHES[config.method](PlannerInput(scene, hand, count, seed, config, hooks, device, dtype))
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
     return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)
@@ -95,16 +95,16 @@ def assemble(
     How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
     to its pregrasp is refused by a trial before its first step.
     """
-    touches = find_touches(problem, poses, config.postures.touch_reach)
+    contact_set = find_contacts(problem, poses, config.postures.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.lower)
-    pressed = squeeze(problem, poses, touches, effort, config.postures)
-    opened, clearance = open_clear(problem, poses, config.postures, stop)
+    pressed = squeeze(problem, poses, contact_set, effort, config.postures)
+    opened, clearance = find_pregrasp(problem, poses, config.postures, stop)
     adjacent = torch.as_tensor(hand.adjacent, device=problem.lower.device)
     overlap = self_overlap(problem, poses.joints, adjacent)
     if any(primitive.kind == "hull" for primitive in hand.primitives):
         depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
         overlap = torch.maximum(overlap, depth.to(overlap))
-    scores = score(touches, pressed, clearance, overlap)
+    scores = score(contact_set, pressed, clearance, overlap)
     if problem.obstacles is not None:
         ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
         depth = intrusion(problem.obstacles, problem.kinematics, poses.quaternion, *ends)
@@ -112,14 +112,14 @@ def assemble(
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     order = scores.argsort(descending=True)
     return tuple(
-        _grasp(problem, hand, int(i), poses, opened, pressed, touches, float(scores[i]))
+        _grasp(problem, hand, int(i), poses, opened, pressed, contact_set, float(scores[i]))
         for i in order
         if scores[i] > -1e3
     )
 
 
 def score(
-    touches: Touches,
+    contact_set: ContactSet,
     pressed: Squeeze,
     clearance: Float[Tensor, "batch"],
     overlap: Float[Tensor, "batch"],
@@ -133,7 +133,7 @@ def score(
     """
     force = pressed.forces.norm(dim=-1)
     largest_share = force.amax(-1) / force.sum(-1).clamp_min(1e-9)
-    depth = (-touches.distance.amin(-1)).clamp_min(0.0) / 0.001
+    depth = (-contact_set.distance.amin(-1)).clamp_min(0.0) / 0.001
     return (
         -1.7 * (largest_share + 0.01).log()
         - 1.3 * (pressed.imbalance + 1e-3).log10()
@@ -150,7 +150,7 @@ def _grasp(
     poses: Poses,
     opened: Poses,
     pressed: Squeeze,
-    touches: Touches,
+    contact_set: ContactSet,
     value: float,
 ) -> Grasp:
     quaternion = poses.quaternion[row] / poses.quaternion[row].norm()
@@ -161,14 +161,14 @@ def _grasp(
         return Posture(translation.double().cpu().numpy(), quaternion.double().cpu().numpy(), inside)
 
     # One contact a link: of its active slots, the one nearest to the surface.
-    active = torch.nonzero(touches.active[row]).flatten()
-    active = active[touches.distance[row, active].abs().argsort(descending=True)]
-    nearest = {int(touches.link[slot]): int(slot) for slot in active}
+    active = torch.nonzero(contact_set.active[row]).flatten()
+    active = active[contact_set.distance[row, active].abs().argsort(descending=True)]
+    nearest = {int(contact_set.link[slot]): int(slot) for slot in active}
     contacts = tuple(
         Contact(
             hand.link_names[link],
-            tuple(touches.position[row, slot].tolist()),
-            tuple(touches.normal[row, slot].tolist()),
+            tuple(contact_set.position[row, slot].tolist()),
+            tuple(contact_set.normal[row, slot].tolist()),
         )
         for link, slot in sorted(nearest.items())
     )

@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from graspd_core.hands.collision_spheres import proxy_spheres
+from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.collision_tensors import solid_distance
-from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.hands.kinematics import place_points
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.loop import Poses
-from graspd_core.methods.problem import Placed, Problem, place
+from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
 
 # A finger whose step is halved to this share has arrived; steps are full travels of the closing over `close_steps`.
 _ARRIVED = 1 / 32
@@ -133,7 +133,7 @@ def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing
         target=torch.as_tensor(np.where(travel > 0, hand.upper, hand.lower)).to(problem.lower),
         moves=torch.as_tensor(moves, device=device),
         finger_links=torch.as_tensor((same.astype(int) @ moves) > 0, device=device),
-        sphere_links=torch.as_tensor(proxy_spheres(hand)[2], device=device),
+        sphere_links=torch.as_tensor(collision_spheres(hand)[2], device=device),
         close_steps=close_steps,
     )
 
@@ -163,7 +163,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
     Adjacent links are never near each other; a link without candidates and solids is infinitely far from all.
     """
-    placed = place(problem, problem.fine, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(problem, problem.fine, poses.translation, poses.quaternion, poses.joints)
     count = placed.link_translations.shape[1]
     gaps = [_least(sample_sdf(problem.sdf, placed.points)[0], problem.fine.links, count)]
     if len(problem.features) and len(problem.solids.link):
@@ -174,9 +174,9 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
     return torch.stack([torch.stack(gaps).amin(0), overlap], 1)
 
 
-def sphere_overlap(problem: Problem, placed: Placed) -> Float[Tensor, "batch spheres"]:
+def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
     """Greatest depth of each proxy sphere in one of a link that is not adjacent, zero where clear [m]."""
-    centers = place_in_base(problem.sphere_matrix, placed.link_rotations, placed.link_translations)
+    centers = place_points(problem.sphere_matrix, placed.link_rotations, placed.link_translations)
     reach = problem.sphere_radii[:, None] + problem.sphere_radii[None, :]
     depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.sphere_weight > 0)
     return torch.maximum(depth.amax(-1), depth.amax(-2))

@@ -14,15 +14,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from graspd_core.config import PostureConfig
+from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.collision_tensors import pair_distance, solid_distance
-from graspd_core.hands.kinematics import forward
-from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.hands.kinematics import forward, place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods import losses
 from graspd_core.methods.loop import Poses
-from graspd_core.methods.obstacle_distance import RETREAT, RETREAT_SHARES, Obstacles, obstacle_gaps
-from graspd_core.methods.problem import OBSTACLE_MARGIN, Placed, Problem, place
+from graspd_core.methods.obstacle_distance import RETREAT, RETREAT_SHARES, ObstacleTensors, obstacle_gaps
+from graspd_core.methods.problem import OBSTACLE_MARGIN, HandPlacement, Problem, hand_forward
 from graspd_core.se3 import rotation_from_quaternion, transform_points
 
 _CONE_EDGES = 8
@@ -35,7 +34,7 @@ _WAY = (0.0, 0.4, 0.8)
 
 
 @dataclass(frozen=True)
-class Touches:
+class ContactSet:
     """Where a batch of hands touches: some slots for every link, of which only the active ones count.
 
     Attributes:
@@ -54,13 +53,13 @@ class Touches:
 
 
 @torch.no_grad()
-def find_touches(problem: Problem, poses: Poses, reach: float) -> Touches:
+def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
     """For every link its nearest candidate, the two that spread that contact farthest, and its nearest sharp point.
 
     Slots within `reach` [m] of the surface are active.
     """
     points = problem.fine
-    placed = place(problem, points, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(problem, points, poses.translation, poses.quaternion, poses.joints)
     distance, normal = sample_sdf(problem.sdf, placed.points)
     links = torch.unique(points.links)
     members = points.links[None, :] == links[:, None]
@@ -79,7 +78,7 @@ def find_touches(problem: Problem, poses: Poses, reach: float) -> Touches:
     apart = torch.cat([torch.ones_like(gap[:, :1], dtype=torch.bool).expand(-1, len(links))[..., None]] + [
         (placed.points[rows, c] - placed.points[rows, chosen[0]]).norm(dim=-1)[..., None] > 0.004 for c in chosen[1:]
     ], -1).flatten(1)  # fmt: skip
-    found = Touches(
+    found = ContactSet(
         links.repeat_interleave(_SPREAD + 1),
         placed.points[rows, slots] - gap[..., None] * n,
         n,
@@ -89,7 +88,9 @@ def find_touches(problem: Problem, poses: Poses, reach: float) -> Touches:
     return _with_features(problem, poses, placed, found, reach) if len(problem.features) else found
 
 
-def _with_features(problem: Problem, poses: Poses, placed: Placed, found: Touches, reach: float) -> Touches:
+def _with_features(
+    problem: Problem, poses: Poses, placed: HandPlacement, found: ContactSet, reach: float
+) -> ContactSet:
     """Add one slot per solid: the object's sharp point nearest to it, with the solid's own normal turned round."""
     in_base = (problem.features - poses.translation[:, None]) @ placed.rotation
     frames = (placed.link_rotations, placed.link_translations)
@@ -100,7 +101,7 @@ def _with_features(problem: Problem, poses: Poses, placed: Placed, found: Touche
         points = in_base[rows, pick].requires_grad_(True)
         (directions,) = torch.autograd.grad(pair_distance(problem.solids, *frames, points, solids).sum(), points)
     outward = directions @ placed.rotation.transpose(-1, -2)
-    return Touches(
+    return ContactSet(
         torch.cat([found.link, problem.solids.link]),
         torch.cat([found.position, problem.features[pick]], 1),
         torch.cat([found.normal, -outward], 1),
@@ -117,7 +118,7 @@ def self_overlap(
     if len(problem.solids.link) == 0:
         return joints.new_zeros(len(joints))
     frames = forward(problem.kinematics, joints)
-    points = place_in_base(problem.fine.matrix, *frames)
+    points = place_points(problem.fine.matrix, *frames)
     depth = -solid_distance(problem.solids, *frames, points)
     checked = ~adjacent[problem.fine.links][:, problem.solids.link]
     return torch.where(checked, depth, 0.0).amax((-1, -2)).clamp_min(0.0)
@@ -139,18 +140,18 @@ class Squeeze:
 
 
 def squeeze(
-    problem: Problem, poses: Poses, touches: Touches, effort: Float[Tensor, "joints"], config: PostureConfig
+    problem: Problem, poses: Poses, contact_set: ContactSet, effort: Float[Tensor, "joints"], config: GraspStagesConfig
 ) -> Squeeze:
     """Forces in the friction cones with zero net wrench (non-negative least squares), as joint offsets JᵀF / kp."""
     unit_forces, imbalance = balanced_forces(
-        (touches.position - problem.center).double().cpu().numpy(),
-        touches.normal.double().cpu().numpy(),
-        touches.active.cpu().numpy(),
+        (contact_set.position - problem.center).double().cpu().numpy(),
+        contact_set.normal.double().cpu().numpy(),
+        contact_set.active.cpu().numpy(),
         problem.length,
         problem.friction,
     )
     forces = torch.as_tensor(unit_forces).to(problem.lower)
-    torque = joint_torques(problem, poses, touches, forces)
+    torque = joint_torques(problem, poses, contact_set, forces)
     limit = (effort * config.effort_share / torque.abs().clamp_min(1e-9)).amin(-1)
     scale = limit.clamp(max=config.grip_force)[:, None]
     stiffness = torch.where(problem.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
@@ -159,13 +160,13 @@ def squeeze(
 
 
 def joint_torques(
-    problem: Problem, poses: Poses, touches: Touches, forces: Float[Tensor, "batch slots 3"]
+    problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Float[Tensor, "batch joints"]:
     """τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
     rotation = rotation_from_quaternion(poses.quaternion)
-    x = (touches.position - poses.translation[:, None]) @ rotation
+    x = (contact_set.position - poses.translation[:, None]) @ rotation
     joints = poses.joints.detach().requires_grad_(True)
-    rotations, translations = (t[:, touches.link] for t in forward(problem.kinematics, joints))
+    rotations, translations = (t[:, contact_set.link] for t in forward(problem.kinematics, joints))
     with torch.no_grad():
         material = rotations.transpose(-1, -2) @ (x - translations)[..., None]
     moved = (rotations @ material).squeeze(-1) + translations
@@ -219,8 +220,8 @@ def balanced_forces(
     return forces, imbalance
 
 
-def open_clear(
-    problem: Problem, poses: Poses, config: PostureConfig, stop: Callable[[], bool] = lambda: False
+def find_pregrasp(
+    problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Poses, Float[Tensor, "batch"]]:
     """A nearby posture (base shifted, never turned) from which the hand closes without sweeping through the object.
 
@@ -275,7 +276,10 @@ def open_clear(
 
 
 def _obstacle_cost(
-    obstacles: Obstacles, problem: Problem, rotation: Float[Tensor, "batch 3 3"], x: Float[Tensor, "batch variables"]
+    obstacles: ObstacleTensors,
+    problem: Problem,
+    rotation: Float[Tensor, "batch 3 3"],
+    x: Float[Tensor, "batch variables"],
 ) -> Float[Tensor, "batch"]:
     """The loss term of obstacles for rows of translation and joints."""
     frames = forward(problem.kinematics, x[:, 3:])
@@ -284,7 +288,7 @@ def _obstacle_cost(
 
 
 @torch.no_grad()
-def approach_depth(problem: Problem, obstacles: Obstacles, pregrasp: Poses) -> Float[Tensor, "batch"]:
+def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Float[Tensor, "batch"]:
     """How deep the hand is in the object on its straight way from the retreat to the pregrasp [m], zero where clear.
 
     What a pregrasp itself leaves is not looked at here.
@@ -305,5 +309,5 @@ def hand_distance(
     joints: Float[Tensor, "batch joints"],
 ) -> Float[Tensor, "batch points"]:
     """Signed distance of every contact candidate to the object [m]."""
-    points = place_in_base(problem.coarse.matrix, *forward(problem.kinematics, joints))
+    points = place_points(problem.coarse.matrix, *forward(problem.kinematics, joints))
     return sample_sdf(problem.sdf, transform_points(rotation, translation, points))[0]

@@ -13,7 +13,7 @@ from graspd_core.hands.kinematics import forward, link_poses, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.loop import Poses
-from graspd_core.methods.obstacle_distance import RETREAT, Obstacles, make_obstacles, obstacle_gaps
+from graspd_core.methods.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.methods.problem import fingertip_groups
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle
@@ -40,7 +40,7 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
     Where there are obstacles, hands that would reach into them, or could not have come there, are drawn last.
     """
     generator = torch.Generator().manual_seed(seed)
-    obstacles = make_obstacles(scene, hand, "cpu", torch.float64)
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     pool = (_POOL if obstacles is None else _POOL_AMONG_OBSTACLES) * count
     points, normals = surface_samples(convex_hull(scene.object.mesh), pool, seed)
 
@@ -79,7 +79,7 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
 
 
 def raise_clear(
-    obstacles: Obstacles,
+    obstacles: ObstacleTensors,
     rotation: Float[Tensor, "batch 3 3"],
     translation: Float[Tensor, "batch 3"],
     frames: tuple[Float[Tensor, "batch links 3 3"], Float[Tensor, "batch links 3"]],
@@ -89,7 +89,7 @@ def raise_clear(
     `frames` are the link poses in the base frame.
     """
     if obstacles.normal is not None:
-        depth = -obstacle_gaps(replace(obstacles, neighbours=()), rotation, translation, *frames).amin(-1)
+        depth = -obstacle_gaps(replace(obstacles, obstacles=()), rotation, translation, *frames).amin(-1)
         translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
     behind = translation + RETREAT * (rotation @ obstacles.retreat)
     gaps = [obstacle_gaps(obstacles, rotation, at, *frames).amin(-1) for at in (translation, behind)]

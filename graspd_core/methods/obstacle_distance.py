@@ -15,12 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.hands.collision_spheres import proxy_spheres
-from graspd_core.hands.kinematics import Kinematics, forward, link_poses, placement
-from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.hands.collision_spheres import collision_spheres
+from graspd_core.hands.kinematics import Kinematics, forward, link_poses, place_points, placement
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
-from graspd_core.scene.scene import Neighbour, Scene
+from graspd_core.scene.scene import Obstacle, Scene
 from graspd_core.se3 import rotation_from_quaternion, transform_points
 
 # The hand comes to the pregrasp straight along its approach, from as far as this [m]; where it is looked at on the way.
@@ -32,7 +31,7 @@ _RIM, _HULL = 12, 32
 
 
 @dataclass(frozen=True)
-class Obstacles:
+class ObstacleTensors:
     """Support and neighbours, and the points of the hand that are held against them.
 
     Attributes:
@@ -52,14 +51,16 @@ class Obstacles:
     sphere_radii: Float[Tensor, "spheres"]
     normal: Float[Tensor, "3"] | None
     offset: float
-    neighbours: tuple[GridSDF, ...]
+    obstacles: tuple[GridSDF, ...]
     retreat: Float[Tensor, "3"]
 
 
-def make_obstacles(scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> Obstacles | None:
+def make_obstacle_tensors(
+    scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype
+) -> ObstacleTensors | None:
     """The scene's obstacles as this hand meets them; None where it meets none, so that nothing is ever evaluated."""
-    neighbours = [n for n in scene.neighbours if _in_reach(n, scene, hand)]
-    if scene.support is None and not neighbours:
+    obstacles = [n for n in scene.obstacles if _in_reach(n, scene, hand)]
+    if scene.support is None and not obstacles:
         return None
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -69,20 +70,20 @@ def make_obstacles(scene: Scene, hand: HandModel, device: torch.device | str, dt
         return placement(hand.num_links, tensor(points), torch.as_tensor(links, device=device, dtype=torch.long))
 
     corners, radii, links = extreme_points(hand)
-    centers, sphere_radii, sphere_links = proxy_spheres(hand)
-    return Obstacles(
+    centers, sphere_radii, sphere_links = collision_spheres(hand)
+    return ObstacleTensors(
         corner_matrix=placed(corners, links),
         corner_radii=tensor(radii),
         sphere_matrix=placed(centers, sphere_links),
         sphere_radii=tensor(sphere_radii),
         normal=None if scene.support is None else tensor(scene.support.normal),
         offset=0.0 if scene.support is None else scene.support.offset,
-        neighbours=tuple(n.sdf.to(device, dtype) for n in neighbours),
+        obstacles=tuple(n.sdf.to(device, dtype) for n in obstacles),
         retreat=tensor(-hand.approach),
     )
 
 
-def _in_reach(neighbour: Neighbour, scene: Scene, hand: HandModel) -> bool:
+def _in_reach(neighbour: Obstacle, scene: Scene, hand: HandModel) -> bool:
     """Whether a hand whose palm lies on the object, or comes from a retreat, could touch the neighbour."""
     reach = hand_reach(hand) + RETREAT
     gap, _ = sample_sdf(neighbour.sdf, torch.as_tensor(scene.object.mesh.vertices).to(neighbour.sdf.field))
@@ -132,7 +133,7 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
 
 
 def obstacle_gaps(
-    obstacles: Obstacles,
+    obstacles: ObstacleTensors,
     rotation: Float[Tensor, "batch 3 3"],
     translation: Float[Tensor, "batch 3"],
     link_rotations: Float[Tensor, "batch links 3 3"],
@@ -140,21 +141,21 @@ def obstacle_gaps(
 ) -> Float[Tensor, "batch gaps"]:
     """Signed distances [m] of the hand's points to every obstacle, negative inside; link poses in the base frame."""
     frames = (link_rotations, link_translations)
-    corners = transform_points(rotation, translation, place_in_base(obstacles.corner_matrix, *frames))
+    corners = transform_points(rotation, translation, place_points(obstacles.corner_matrix, *frames))
     gaps = []
     if obstacles.normal is not None:
         gaps.append(corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii)
-    if obstacles.neighbours:
-        spheres = transform_points(rotation, translation, place_in_base(obstacles.sphere_matrix, *frames))
+    if obstacles.obstacles:
+        spheres = transform_points(rotation, translation, place_points(obstacles.sphere_matrix, *frames))
         points = torch.cat([corners, spheres], 1)
         radii = torch.cat([obstacles.corner_radii, obstacles.sphere_radii])
-        gaps.extend(sample_sdf(sdf, points)[0] - radii for sdf in obstacles.neighbours)
+        gaps.extend(sample_sdf(sdf, points)[0] - radii for sdf in obstacles.obstacles)
     return torch.cat(gaps, -1)
 
 
 @torch.no_grad()
 def intrusion(
-    obstacles: Obstacles,
+    obstacles: ObstacleTensors,
     kinematics: Kinematics,
     quaternion: Float[Tensor, "batch 4"],
     pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],

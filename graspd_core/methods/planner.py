@@ -16,7 +16,7 @@ from graspd_core.scene.scene import Scene
 
 
 @dataclass(frozen=True)
-class Found:
+class PlannerOutput:
     """What a search ended with.
 
     Attributes:
@@ -31,7 +31,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Task:
+class PlannerInput:
     """What is searched for, and with what means.
 
     Attributes:
@@ -54,10 +54,10 @@ class Task:
 
 
 # How poses are found; one for every `config.Method`. Numerical trouble is a pose that is not there, never an exception.
-Search = Callable[[Task], Found]
+Planner = Callable[[PlannerInput], PlannerOutput]
 
 
-def problem_of(task: Task) -> Problem:
+def problem_of(task: PlannerInput) -> Problem:
     """The problem by the closed form's settings, in which every method's poses are made into grasps and ranked."""
     settings = task.config.closed_form
     return build_problem(
@@ -70,10 +70,10 @@ def problem_of(task: Task) -> Problem:
         seed=task.seed,
         device=task.device,
         dtype=task.dtype,
-        trust_floor=settings.trust_floor,
+        confidence_floor=settings.confidence_floor,
     )
 
 
-def starts_of(task: Task, count: int) -> Poses:
+def starts_of(task: PlannerInput, count: int) -> Poses:
     """`count` seeded starts on the object's hull."""
     return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype)

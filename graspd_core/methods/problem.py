@@ -12,16 +12,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
-from graspd_core.hands.collision_spheres import proxy_spheres
-from graspd_core.hands.collision_tensors import Solids, make_solids, pair_distance, solid_bound
-from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics, placement
-from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.hands.collision_spheres import collision_spheres
+from graspd_core.hands.collision_tensors import CollisionTensors, make_collision_tensors, pair_distance, solid_bound
+from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.mesh.sharp_features import sharp_points, thin_share
 from graspd_core.methods import losses
-from graspd_core.methods.obstacle_distance import Obstacles, make_obstacles, obstacle_gaps
-from graspd_core.scene.confidence import sample_trust
+from graspd_core.methods.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
+from graspd_core.scene.confidence import sample_confidence
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion, transform_points
 
@@ -89,7 +88,7 @@ class Problem:
     coarse: PointSet
     fine: PointSet
     reach: Float[Tensor, "groups"]
-    solids: Solids
+    solids: CollisionTensors
     group_of_solid: Int[Tensor, "solids"]
     features: Float[Tensor, "features 3"]
     coarse_features: int
@@ -104,8 +103,8 @@ class Problem:
     center: Float[Tensor, "3"]
     length: float
     friction: float
-    obstacles: Obstacles | None = None
-    trust: Float[Tensor, "x y z"] | None = None
+    obstacles: ObstacleTensors | None = None
+    confidence: Float[Tensor, "x y z"] | None = None
 
 
 class Terms(NamedTuple):
@@ -133,7 +132,7 @@ def build_problem(
     seed: int,
     device: str,
     dtype: torch.dtype,
-    trust_floor: float = 0.0,
+    confidence_floor: float = 0.0,
 ) -> Problem:
     """Lay scene and hand out as tensors.
 
@@ -143,7 +142,7 @@ def build_problem(
         directions: number of disturbance wrenches.
         friction: coefficient planned with.
         seed: of the spread of disturbances beyond the signed axes.
-        trust_floor: what a contact on surface that was only guessed counts.
+        confidence_floor: what a contact on surface that was only guessed counts.
     """
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -164,9 +163,9 @@ def build_problem(
         )
 
     thin = thin_share(scene.object.mesh) > _THIN_WALLED
-    solids = make_solids(hand, device, dtype)
+    solids = make_collision_tensors(hand, device, dtype)
     group_of_solid = hand.link_group[solids.link.cpu().numpy()]
-    centers, radii, sphere_links = proxy_spheres(hand)
+    centers, radii, sphere_links = collision_spheres(hand)
     checked = ~hand.adjacent[np.ix_(sphere_links, sphere_links)]
     return Problem(
         kinematics=make_kinematics(hand, device, dtype),
@@ -189,8 +188,10 @@ def build_problem(
         center=tensor(scene.object.center_of_mass),
         length=scene.object.radius,
         friction=friction,
-        obstacles=make_obstacles(scene, hand, device, dtype),
-        trust=None if scene.trust is None else trust_floor + (1 - trust_floor) * scene.trust.to(device, dtype),
+        obstacles=make_obstacle_tensors(scene, hand, device, dtype),
+        confidence=None
+        if scene.confidence is None
+        else confidence_floor + (1 - confidence_floor) * scene.confidence.to(device, dtype),
     )
 
 
@@ -214,7 +215,7 @@ def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"])
     return np.stack([np.resize(m if len(m) else [0], width) for m in members])
 
 
-class Placed(NamedTuple):
+class HandPlacement(NamedTuple):
     """A batch of hands: base rotations `R_object_base`, link poses in the base frame, candidates in the object's."""
 
     rotation: Float[Tensor, "batch 3 3"]
@@ -223,22 +224,25 @@ class Placed(NamedTuple):
     points: Float[Tensor, "batch points 3"]
 
 
-def place(
+def hand_forward(
     problem: Problem,
     points: PointSet,
     translation: Float[Tensor, "batch 3"],
     quaternion: Float[Tensor, "batch 4"],
     joints: Float[Tensor, "batch joints"],
-) -> Placed:
+) -> HandPlacement:
     """Where links and contact candidates are, for a batch of poses."""
     rotation = rotation_from_quaternion(quaternion)
     frames = forward(problem.kinematics, joints)
-    in_base = place_in_base(points.matrix, *frames)
-    return Placed(rotation, *frames, transform_points(rotation, translation, in_base))
+    in_base = place_points(points.matrix, *frames)
+    return HandPlacement(rotation, *frames, transform_points(rotation, translation, in_base))
 
 
 def feature_distance(
-    problem: Problem, features: Float[Tensor, "features 3"], placed: Placed, translation: Float[Tensor, "batch 3"]
+    problem: Problem,
+    features: Float[Tensor, "features 3"],
+    placed: HandPlacement,
+    translation: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
     """Signed distance of the object's sharp points to the hand's solids [m], of the nearest pairs; their solids."""
     in_base = (features - translation[:, None]) @ placed.rotation
@@ -277,7 +281,7 @@ def evaluate(
         activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
     """
     points = problem.fine if fine else problem.coarse
-    placed = place(problem, points, translation, quaternion, joints)
+    placed = hand_forward(problem, points, translation, quaternion, joints)
     distance, normal = sample_sdf(problem.sdf, placed.points)
     gap = (distance - radius[:, None])[:, points.groups].amin(-1)
     sunk = losses.penetration(distance, radius)
@@ -292,8 +296,8 @@ def evaluate(
     )
     rows = torch.arange(len(near), device=near.device)[:, None]
     activation = activate(distance[rows, near], radius, delta)
-    if problem.trust is not None:
-        activation = activation * sample_trust(problem.trust, problem.sdf, placed.points[rows, near])
+    if problem.confidence is not None:
+        activation = activation * sample_confidence(problem.confidence, problem.sdf, placed.points[rows, near])
     support = wrench_support(
         (placed.points[rows, near] - problem.center) / problem.length,
         normal[rows, near],
@@ -302,7 +306,7 @@ def evaluate(
         problem.friction,
     )
     frames = (placed.link_rotations, placed.link_translations)
-    spheres = place_in_base(problem.sphere_matrix, *frames)
+    spheres = place_points(problem.sphere_matrix, *frames)
     obstacle = None
     if problem.obstacles is not None:
         gaps = obstacle_gaps(problem.obstacles, placed.rotation, translation, *frames)

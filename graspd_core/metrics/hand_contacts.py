@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.hands.kinematics import forward
 from graspd_core.mesh.mesh_distance import signed_distance
-from graspd_core.metrics.metrics_context import Judge
+from graspd_core.metrics.metrics_context import MetricsContext
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture
 
@@ -41,16 +41,16 @@ class PlacedHand:
     translations: Float[np.ndarray, "links 3"]
 
 
-def place_hand(judge: Judge, posture: Posture) -> PlacedHand:
+def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
     """Put the hand's samples where a posture puts them, and measure every sample's distance to the object."""
-    surface = judge.surface
+    surface = context.surface
     joints = torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None]
     in_base = forward(surface.kinematics, joints)
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
     rotations = base @ in_base[0][0].numpy()
     translations = in_base[1][0].numpy() @ base.T + posture.position
     placed = np.einsum("nij,nj->ni", rotations[surface.links], surface.points) + translations[surface.links]
-    distance = signed_distance(judge.query, placed, reach=_REACH)
+    distance = signed_distance(context.query, placed, reach=_REACH)
     return PlacedHand(placed, surface.links, surface.areas, distance, rotations, translations)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.hands.link_distance import hand_sdf
 from graspd_core.mesh.mesh_distance import inside, unsigned_distance
 from graspd_core.metrics.hand_contacts import PlacedHand
-from graspd_core.metrics.metrics_context import Judge
+from graspd_core.metrics.metrics_context import MetricsContext
 
 VOXEL = 0.001
 # Cells are halved until they are voxels: 16 mm, 8, 4, 2, 1.
@@ -23,9 +23,9 @@ def penetration(placed: PlacedHand) -> float:
     return float(max(0.0, -placed.distance.min()))
 
 
-def self_penetration(judge: Judge, placed: PlacedHand) -> float:
+def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
     """Greatest depth of a hand sample inside a link that is not adjacent to its own [m]."""
-    hand, surface = judge.hand, judge.surface
+    hand, surface = context.hand, context.surface
     worst = 0.0
     for link in np.flatnonzero(surface.radii > 0):
         others = placed.points[~hand.adjacent[link][placed.links]]
@@ -36,44 +36,46 @@ def self_penetration(judge: Judge, placed: PlacedHand) -> float:
     return worst
 
 
-def intersection_volume(judge: Judge, placed: PlacedHand) -> float:
+def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
     """Volume of the hand inside the object [m³], counted in 1 mm voxels of a lattice fixed in the hand's base frame.
 
     An octree finds them: a cell is dropped when its centre is farther outside hand or object than its half diagonal,
     and known to be wholly inside the object when it is that far inside; no overlap is too small or too thin to be
     visited. Cells have integer coordinates in voxels, so nothing is counted twice.
     """
-    links = _links_within_reach(judge, placed)
-    cells = _root_cells(judge, placed, links)
+    links = _links_within_reach(context, placed)
+    cells = _root_cells(context, placed, links)
     # Whether a cell is known to lie inside the object as a whole.
     known = np.zeros(len(cells), dtype=bool)
     for halving in range(_HALVINGS + 1):
         size = 2 ** (_HALVINGS - halving)
         half_diagonal = _HALF_DIAGONAL * size * VOXEL if size > 1 else 0.0
         centers = (cells + 0.5 * size) * VOXEL @ placed.rotations[0].T + placed.translations[0]
-        kept = _touches_hand(judge, placed, links, centers, half_diagonal)
+        kept = _touches_hand(context, placed, links, centers, half_diagonal)
         cells, known, centers = cells[kept], known[kept], centers[kept]
         if size == 1:
-            return float((known.sum() + inside(judge.query, centers[~known]).sum()) * VOXEL**3)
-        kept, known = _against_object(judge, centers, known, half_diagonal)
+            return float((known.sum() + inside(context.query, centers[~known]).sum()) * VOXEL**3)
+        kept, known = _against_object(context, centers, known, half_diagonal)
         cells, known = _halve(cells[kept], size // 2), np.repeat(known[kept], 8)
     return 0.0
 
 
-def _links_within_reach(judge: Judge, placed: PlacedHand) -> Int[np.ndarray, "near"]:
+def _links_within_reach(context: MetricsContext, placed: PlacedHand) -> Int[np.ndarray, "near"]:
     """Links whose ball of solids reaches the object."""
-    surface = judge.surface
+    surface = context.surface
     centers = np.einsum("lij,lj->li", placed.rotations, surface.centers) + placed.translations
-    distance = unsigned_distance(judge.query, centers)
-    within = (distance < surface.radii) | inside(judge.query, centers)
+    distance = unsigned_distance(context.query, centers)
+    within = (distance < surface.radii) | inside(context.query, centers)
     return np.flatnonzero(within & (surface.radii > 0))
 
 
-def _root_cells(judge: Judge, placed: PlacedHand, links: Int[np.ndarray, "near"]) -> Int[np.ndarray, "cells 3"]:
+def _root_cells(
+    context: MetricsContext, placed: PlacedHand, links: Int[np.ndarray, "near"]
+) -> Int[np.ndarray, "cells 3"]:
     """Cells of the coarsest size over the box about the near links' balls, base frame, in voxels."""
     if len(links) == 0:
         return np.zeros((0, 3), dtype=np.int64)
-    surface, base = judge.surface, placed.rotations[0]
+    surface, base = context.surface, placed.rotations[0]
     centers = np.einsum("lij,lj->li", placed.rotations[links], surface.centers[links]) + placed.translations[links]
     centers, radii = (centers - placed.translations[0]) @ base, surface.radii[links, None]
     size = 2**_HALVINGS
@@ -84,13 +86,16 @@ def _root_cells(judge: Judge, placed: PlacedHand, links: Int[np.ndarray, "near"]
 
 
 def _against_object(
-    judge: Judge, centers: Float[np.ndarray, "cells 3"], known: Bool[np.ndarray, "cells"], half_diagonal: float
+    context: MetricsContext,
+    centers: Float[np.ndarray, "cells 3"],
+    known: Bool[np.ndarray, "cells"],
+    half_diagonal: float,
 ) -> tuple[Bool[np.ndarray, "cells"], Bool[np.ndarray, "cells"]]:
     """Which cells may share space with the object, and which are known to lie inside it as a whole."""
     kept, whole = np.ones(len(centers), dtype=bool), known.copy()
     unknown = np.flatnonzero(~known)
-    clear = unknown[unsigned_distance(judge.query, centers[unknown]) > half_diagonal]
-    whole[clear] = kept[clear] = inside(judge.query, centers[clear])
+    clear = unknown[unsigned_distance(context.query, centers[unknown]) > half_diagonal]
+    whole[clear] = kept[clear] = inside(context.query, centers[clear])
     return kept, whole
 
 
@@ -100,14 +105,18 @@ def _halve(cells: Int[np.ndarray, "cells 3"], size: int) -> Int[np.ndarray, "chi
 
 
 def _touches_hand(
-    judge: Judge, placed: PlacedHand, links: Int[np.ndarray, "near"], points: Float[np.ndarray, "n 3"], within: float
+    context: MetricsContext,
+    placed: PlacedHand,
+    links: Int[np.ndarray, "near"],
+    points: Float[np.ndarray, "n 3"],
+    within: float,
 ) -> Bool[np.ndarray, "n"]:
     """Which points of the object frame are nearer than `within` [m] to one of some links; about hulls, perhaps more."""
     touches = np.zeros(len(points), dtype=bool)
     for link in links:
         local = (points - placed.translations[link]) @ placed.rotations[link]
-        reach = judge.surface.radii[link] + within
-        near = np.flatnonzero(~touches & (((local - judge.surface.centers[link]) ** 2).sum(1) < reach**2))
+        reach = context.surface.radii[link] + within
+        near = np.flatnonzero(~touches & (((local - context.surface.centers[link]) ** 2).sum(1) < reach**2))
         if len(near):
-            touches[near] = hand_sdf(judge.hand, int(link), torch.as_tensor(local[near])).numpy() < within
+            touches[near] = hand_sdf(context.hand, int(link), torch.as_tensor(local[near])).numpy() < within
     return touches

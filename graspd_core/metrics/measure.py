@@ -9,7 +9,7 @@ from graspd_core.mesh.mesh_distance import DistanceQuery, signed_distance
 from graspd_core.mesh.sharp_features import farthest_points
 from graspd_core.metrics import hand_contacts as contacts
 from graspd_core.metrics import intersection as overlap
-from graspd_core.metrics.metrics_context import Judge
+from graspd_core.metrics.metrics_context import MetricsContext
 from graspd_core.metrics.wrench_hull import wrench_hull
 from graspd_core.types import GraspMetrics, Posture
 
@@ -20,23 +20,23 @@ MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
 _STEP = 2e-4
 
 
-def measure(judge: Judge, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:
+def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:
     """All static metrics of the judge's hand at `posture` on the judge's object.
 
     ε and volume are those of at most `max_contacts` contacts.
     """
-    target = judge.target
-    placed = contacts.place_hand(judge, posture)
+    target = context.target
+    placed = contacts.placed_hand(context, posture)
     touching = placed.points[contacts.touching(placed)]
     chosen = touching[farthest_points(touching, max_contacts)]
-    normals = surface_normals(judge.query, chosen)
+    normals = surface_normals(context.query, chosen)
     epsilon, volume = wrench_hull(chosen - target.center_of_mass, normals, target.friction, target.radius)
     return GraspMetrics(
         contact_area=contacts.contact_area(placed),
         contact_links=contacts.contact_links(placed),
-        intersection_volume=overlap.intersection_volume(judge, placed),
+        intersection_volume=overlap.intersection_volume(context, placed),
         penetration=overlap.penetration(placed),
-        self_penetration=overlap.self_penetration(judge, placed),
+        self_penetration=overlap.self_penetration(context, placed),
         epsilon=epsilon,
         volume=volume,
         contact_area_5mm=contacts.contact_area(placed, 0.005),

@@ -41,8 +41,8 @@ class HandSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
-    """An object and a hand, ready to measure grasps: build with `make_judge`, ask with `quality.measure`."""
+class MetricsContext:
+    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `quality.measure`."""
 
     target: ObjectModel
     hand: HandModel
@@ -50,9 +50,9 @@ class Judge:
     query: DistanceQuery
 
 
-def make_judge(target: ObjectModel, hand: HandModel) -> Judge:
+def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext:
     """Sample the hand and prepare the object's distance, once for all grasps of that object by that hand."""
-    return Judge(target, hand, hand_surface(hand), make_distance_query(target.mesh))
+    return MetricsContext(target, hand, hand_surface(hand), make_distance_query(target.mesh))
 
 
 @lru_cache(maxsize=8)

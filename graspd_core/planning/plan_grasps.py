@@ -10,56 +10,23 @@ import torch
 
 from graspd_core.config import VERIFICATIONS, PlanConfig, load_preset
 from graspd_core.errors import ConfigError
-from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.hands.model import HandModel, Mount, all_joint_names, all_joint_positions
+from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.feasibility import out_of_reach
 from graspd_core.methods.loop import Hooks
 from graspd_core.metrics.measure import measure
-from graspd_core.metrics.metrics_context import make_judge
+from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.planning.run_clock import Run
-from graspd_core.planning.verification import by_robustness, open_court, parts_in_background, try_in_order
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.pointcloud.point_cloud import PointCloud, transform_cloud
-from graspd_core.runtime.heap import give_memory_back, share_arenas
-from graspd_core.runtime.worker_process import elsewhere, work_elsewhere
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.planning.verification import make_trial_context, parts_in_background, rank_by_robustness, run_trials
+from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.runtime.worker_process import run_isolated, start_worker_process
 from graspd_core.scene.scene import Scene
 from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.segmentation.target_selection import Target
-from graspd_core.trials.lift_trial import retreat_posture
 from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
-
-__all__ = [
-    "HandModel",
-    "Mount",
-    "PinholeCamera",
-    "PointCloud",
-    "Scene",
-    "Target",
-    "all_joint_names",
-    "all_joint_positions",
-    "check_request",
-    "cloud_from_depth",
-    "elsewhere",
-    "give_memory_back",
-    "hand_names",
-    "link_poses",
-    "load_hand",
-    "load_scene",
-    "plan_grasps",
-    "retreat_posture",
-    "scene_from_views",
-    "share_arenas",
-    "transform_cloud",
-    "warm_up",
-]
 
 # How far apart the seeds of two rounds are.
 _SEED_STEP = 1_000_003
@@ -114,29 +81,29 @@ def plan_grasps(
         stop=run.over,
     )
     grasps: tuple[Grasp, ...] = ()
-    court = first = None
+    trial_context = first = None
     good, optimising = 0, 0.0
     # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
     for attempt, settings in enumerate(rounds):
         began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
         wanted = count - good
         with enough_memory(f"{wanted} grasps at once"):
-            found = synthesise(scene, hand, count=wanted, seed=seeded, config=settings, hooks=hooks, device=device)
+            found = find_candidates(scene, hand, count=wanted, seed=seeded, config=settings, hooks=hooks, device=device)
         optimising += time.perf_counter() - began
         if parts is None:
-            metrics_judge = make_judge(scene.object, hand)
-            new = tuple(replace(g, metrics=measure(metrics_judge, g.grasp)) for g in found.grasps[:wanted])
+            metrics_context = make_metrics_context(scene.object, hand)
+            new = tuple(replace(g, metrics=measure(metrics_context, g.grasp)) for g in found.grasps[:wanted])
         else:
-            if court is None and found.grasps:
-                court = open_court(run, scene, hand, parts, verify)
-            new, passed_at = try_in_order(run, court, found.grasps, wanted, good) if court else ((), None)
+            if trial_context is None and found.grasps:
+                trial_context = make_trial_context(run, scene, hand, parts, verify)
+            new, passed_at = run_trials(run, trial_context, found.grasps, wanted, good) if trial_context else ((), None)
             first = first or passed_at
         grasps = tuple(sorted((*grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
         good = sum(g.verdict is not Verdict.FAILED for g in grasps)
         if good >= count or run.over():
             break
-    if court and config.robust.rank:
-        grasps = by_robustness(run, court, grasps, config.robust, seed)
+    if trial_context and config.robust.rank:
+        grasps = rank_by_robustness(run, trial_context, grasps, config.robust, seed)
     finished = time.perf_counter()
     load, sdf = scene.timing
     timing = Timing(
@@ -171,10 +138,10 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     """Do the first-use work of all libraries on a small sphere, so that the first request is as fast as others.
 
-    For a process that serves: from then on what goes through `elsewhere`, and cutting objects into convex parts, is
+    For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
     done in a child process, since threads beside would stand still meanwhile.
     """
-    work_elsewhere()
+    start_worker_process()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
-    scene = elsewhere(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
+    scene = run_isolated(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
     plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)

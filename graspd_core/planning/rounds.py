@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graspd_core.config import PlanConfig
-from graspd_core.methods.budget import at_effort
+from graspd_core.methods.budget import at_budget
 from graspd_core.scene.scene import Scene
 
 
@@ -14,8 +14,8 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     is known and that has nothing about it.
     """
     rounds = config.rounds
-    cheap = verify != "none" and scene.support is None and not scene.neighbours and scene.trust is None
-    first = rounds.first_effort if cheap else 1.0
-    most = rounds.first_effort * rounds.growth ** (rounds.most - 1)
+    cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None
+    first = rounds.first_budget if cheap else 1.0
+    most = rounds.first_budget * rounds.growth ** (rounds.most - 1)
     efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
-    return [at_effort(config, effort) for effort in efforts]
+    return [at_budget(config, effort) for effort in efforts]

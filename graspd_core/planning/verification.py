@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from graspd_core.config import RobustConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.metrics.measure import measure
-from graspd_core.metrics.metrics_context import Judge, make_judge
+from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_context
 from graspd_core.planning.run_clock import Run
 from graspd_core.scene.scene import Scene, object_parts
-from graspd_core.trials.hold_trial import hold_trial, judge
+from graspd_core.trials.hold_trial import hold_trial, with_trials
 from graspd_core.trials.lift_trial import lift_trial
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.world import PROTOCOLS, Protocol, World, at_friction, build_world
@@ -36,7 +36,7 @@ _NOISE = 0x6E6F697365
 
 
 @dataclass(frozen=True)
-class Court:
+class TrialContext:
     """What grasps are tried and measured with.
 
     Attributes:
@@ -51,7 +51,7 @@ class Court:
     protocol: Protocol
     alone: World
     around: World | None
-    judge: Judge
+    with_trials: MetricsContext
 
 
 def parts_in_background(run: Run, scene: Scene) -> Parts:
@@ -71,7 +71,7 @@ def parts_in_background(run: Run, scene: Scene) -> Parts:
     return future
 
 
-def open_court(run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str) -> Court | None:
+def make_trial_context(run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str) -> TrialContext | None:
     """The worlds, as soon as the parts are there; None where the run ended first."""
     while not run.over() and not wait([parts], timeout=_POLL).done:
         pass
@@ -79,13 +79,13 @@ def open_court(run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: st
         return None
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     alone, around = build_world(hand, scene.object, parts.result(), protocol), None
-    if scene.support is not None or scene.neighbours:
-        around = build_world(hand, scene.object, parts.result(), protocol, scene.support, scene.neighbours)
-    return Court(hand, protocol, alone, around, make_judge(scene.object, hand))
+    if scene.support is not None or scene.obstacles:
+        around = build_world(hand, scene.object, parts.result(), protocol, scene.support, scene.obstacles)
+    return TrialContext(hand, protocol, alone, around, make_metrics_context(scene.object, hand))
 
 
-def try_in_order(
-    run: Run, court: Court, candidates: tuple[Grasp, ...], count: int, before: int
+def run_trials(
+    run: Run, trial_context: TrialContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> tuple[tuple[Grasp, ...], float | None]:
     """Try candidates in rank order until `count` held; `before` did already.
 
@@ -98,15 +98,15 @@ def try_in_order(
     for index, grasp in enumerate(candidates):
         if len(verified) == count or run.over():
             break
-        hold = hold_trial(court.alone, grasp, court.protocol, stop=run.over)
+        hold = hold_trial(trial_context.alone, grasp, trial_context.protocol, stop=run.over)
         lift = None
-        if court.around is not None and hold.passed:
-            lift = lift_trial(court.around, court.hand, grasp, court.protocol, stop=run.over)
+        if trial_context.around is not None and hold.passed:
+            lift = lift_trial(trial_context.around, trial_context.hand, grasp, trial_context.protocol, stop=run.over)
         passed = hold.passed and (lift is None or lift.passed)
         if run.over() and not passed:
             # A trial that was cut short says nothing of the grasp.
             break
-        tried = judge(replace(grasp, metrics=measure(court.judge, grasp.grasp)), hold, lift)
+        tried = with_trials(replace(grasp, metrics=measure(trial_context.with_trials, grasp.grasp)), hold, lift)
         if passed:
             first = first or time.perf_counter()
             verified.append(tried)
@@ -116,8 +116,8 @@ def try_in_order(
     return (*verified, *failed), first
 
 
-def by_robustness(
-    run: Run, court: Court, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
+def rank_by_robustness(
+    run: Run, trial_context: TrialContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
     """The grasps with those first that still hold when the object is not quite where it was thought to be.
 
@@ -128,9 +128,9 @@ def by_robustness(
     measured: list[Grasp] = []
     # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
     errors = pose_errors((_NOISE, seed), config.trials)
-    protocol = replace(court.protocol, hold_time=config.hold_time)
+    protocol = replace(trial_context.protocol, hold_time=config.hold_time)
     for index, grasp in enumerate(verified):
-        share = None if run.over() else noisy_share(court.alone, grasp, protocol, errors, stop=run.over)
+        share = None if run.over() else noisy_share(trial_context.alone, grasp, protocol, errors, stop=run.over)
         if grasp.metrics is not None:
             grasp = replace(grasp, metrics=replace(grasp.metrics, robustness=share))
         measured.append(grasp)

@@ -27,7 +27,7 @@ TOLERANCE = 0.004
 
 
 @dataclass(frozen=True)
-class Sight:
+class ViewDepth:
     """One camera's depth image of the object, in directions from the camera (a pinhole of focal length 1).
 
     Attributes:
@@ -49,7 +49,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FreeSpace:
     """All that is known of where the object is not.
 
     Attributes:
@@ -59,17 +59,17 @@ class Evidence:
             end too high by up to this.
     """
 
-    sights: tuple[Sight, ...]
+    view_depths: tuple[ViewDepth, ...]
     standing: bool
     lowest: float = 0.0
 
 
-def make_sights(views: Sequence[PointCloud]) -> tuple[Sight, ...]:
+def make_view_depths(views: Sequence[PointCloud]) -> tuple[ViewDepth, ...]:
     """The depth images that views' points make, of those that make any."""
-    return tuple(sight for view in views if (sight := _make_sight(view)) is not None)
+    return tuple(view_depth for view in views if (view_depth := _make_view_depth(view)) is not None)
 
 
-def _make_sight(view: PointCloud) -> Sight | None:
+def _make_view_depth(view: PointCloud) -> ViewDepth | None:
     """The depth image that a view's points make; holes of a few cells are missing pixels, not the object's.
 
     None where they make none: fewer than five before the camera, or all in one line of sight.
@@ -99,72 +99,72 @@ def _make_sight(view: PointCloud) -> Sight | None:
     _, at = distance_transform_edt(~seen, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     depth = (total / np.maximum(count, 1))[tuple(at)]
     beside = np.asarray(distance_transform_edt(~mask))
-    return Sight(view.viewpoint, frame, low, cell, depth, minimum_filter(depth, 3), beside)
+    return ViewDepth(view.viewpoint, frame, low, cell, depth, minimum_filter(depth, 3), beside)
 
 
-def empty_depth(evidence: Evidence, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+def empty_depth(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
     """How deep points lie in the support, or in space that a camera saw to be empty [m]; 0: nothing is against them."""
-    return _judge(evidence, points, None)[1]
+    return _judge(free_space, points, None)[1]
 
 
 def weigh(
-    evidence: Evidence, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"]
+    free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
-    confirmed, deep = _judge(evidence, points, normals)
+    confirmed, deep = _judge(free_space, points, normals)
     return confirmed, np.clip((deep - SLACK) / CONTRADICTION, 0.0, 1.0)
 
 
-def on_seen(evidence: Evidence, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
+def on_seen(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
     """Whether points lie on, or a finger's breadth of noise off, a surface that was seen."""
     found = np.zeros(points.shape[:-1], dtype=bool)
-    for sight in evidence.sights:
-        empty, behind = _look(sight, points)
+    for view_depth in free_space.view_depths:
+        empty, behind = _look(view_depth, points)
         found |= (empty < 1.5 * TOLERANCE) & (np.where(np.isfinite(behind), np.abs(behind), 0.0) < 1.5 * TOLERANCE)
     return found
 
 
 def facing(
-    evidence: Evidence, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+    free_space: FreeSpace, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
     """Cosine between normals and the way to the camera that they face most."""
     most = np.full(len(points), -1.0)
-    for sight in evidence.sights:
-        way = sight.eye - points
+    for view_depth in free_space.view_depths:
+        way = view_depth.eye - points
         most = np.maximum(most, (way * normals).sum(1) / np.linalg.norm(way, axis=1))
     return most
 
 
 def _judge(
-    evidence: Evidence, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"] | None
+    free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"] | None
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     confirmed = np.zeros(points.shape[:-1], dtype=bool)
     deepest = np.zeros(points.shape[:-1])
-    for sight in evidence.sights:
-        empty, behind = _look(sight, points)
+    for view_depth in free_space.view_depths:
+        empty, behind = _look(view_depth, points)
         deepest = np.maximum(deepest, empty)
         if normals is not None:
-            confirmed |= (np.abs(behind) < TOLERANCE) & (((sight.eye - points) * normals).sum(-1) > 0)
-    if evidence.standing:
+            confirmed |= (np.abs(behind) < TOLERANCE) & (((view_depth.eye - points) * normals).sum(-1) > 0)
+    if free_space.standing:
         height = points[..., 2]
-        deepest = np.maximum(deepest - np.clip(evidence.lowest - height, 0.0, evidence.lowest), -height)
+        deepest = np.maximum(deepest - np.clip(free_space.lowest - height, 0.0, free_space.lowest), -height)
     return confirmed, np.maximum(deepest, 0.0)
 
 
 def _look(
-    sight: Sight, points: Float[np.ndarray, "*batch 3"]
+    view_depth: ViewDepth, points: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """How deep points lie in empty space [m], and how far behind the seen surface (infinite beside the outline)."""
-    local = (points - sight.eye) @ sight.frame
+    local = (points - view_depth.eye) @ view_depth.frame
     forward = np.maximum(local[..., 2], 1e-6)
-    place = (local[..., :2] / forward[..., None] - sight.low) / sight.cell
-    inner = np.clip(place, 0, np.array(sight.depth.shape) - 1)
+    place = (local[..., :2] / forward[..., None] - view_depth.low) / view_depth.cell
+    inner = np.clip(place, 0, np.array(view_depth.depth.shape) - 1)
     index = tuple(np.moveaxis(inner.astype(int), -1, 0))
     # Beyond the image's edge, the way to the edge adds up.
-    beside = (sight.beside[index] + np.abs(place - inner).sum(-1)) * sight.cell * forward
-    before = np.maximum(sight.nearest[index] - local[..., 2], 0.0)
-    within = sight.beside[index] == 0
-    return np.where(within, before, beside), np.where(within, local[..., 2] - sight.depth[index], np.inf)
+    beside = (view_depth.beside[index] + np.abs(place - inner).sum(-1)) * view_depth.cell * forward
+    before = np.maximum(view_depth.nearest[index] - local[..., 2], 0.0)
+    within = view_depth.beside[index] == 0
+    return np.where(within, before, beside), np.where(within, local[..., 2] - view_depth.depth[index], np.inf)
 
 
 def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:

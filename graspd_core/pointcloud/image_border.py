@@ -20,7 +20,7 @@ LONG = 0.1
 PARTS, FILLED = 20, 0.6
 
 
-def reaches_border(
+def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"]
 ) -> bool:
     """Whether the points of an object lie on a side of the view's outline on which other points lie too."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.config import SegmentConfig
+from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud, measured
 
@@ -24,7 +24,7 @@ UNITS, NEAREST = (("millimetres", 1000), ("centimetres", 100)), 0.1
 
 
 @dataclass(frozen=True)
-class ThinScene:
+class VoxelScene:
     """All views' points inside the workspace, and one mean point for each voxel.
 
     Attributes:
@@ -58,7 +58,7 @@ class ThinScene:
         return slice(start, start + len(self.rows[view]))
 
 
-def thin_scene(views: Sequence[PointCloud], settings: SegmentConfig) -> ThinScene:
+def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) -> VoxelScene:
     """Crop and thin.
 
     Raises:
@@ -89,11 +89,11 @@ def thin_scene(views: Sequence[PointCloud], settings: SegmentConfig) -> ThinScen
         within = float(np.ptp(points, axis=0).max())
         unit = f", within {1e3 * within:.2g} mm: are they in metres?" if within else "; no surface is seen"
         raise CloudError(f"cloud: all {len(points)} points are in one place{unit}")
-    return ThinScene(points, distance, rows, voxel, mean, np.bincount(voxel, distance) / count, count, size)
+    return VoxelScene(points, distance, rows, voxel, mean, np.bincount(voxel, distance) / count, count, size)
 
 
 def _inside(
-    view: PointCloud, stride: int, settings: SegmentConfig
+    view: PointCloud, stride: int, settings: SegmentationConfig
 ) -> tuple[Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], int]:
     """Every so many-th row of a view if inside the workspace, positions, distances, and how many were measured."""
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.pointcloud.free_space import SLACK, Evidence, empty_depth, facing
+from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth, facing
 from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
 
 # A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
@@ -20,7 +20,7 @@ LOW = 0.015
 ENCLOSED = 0.6
 
 
-def extrude(seen: Surfels, evidence: Evidence, step: float) -> Surfels:
+def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """Walls from the outline of what was seen from above, down to the support.
 
     Only beneath outlines that are proven: outwards of them the cameras saw nothing; and only walls that they do not
@@ -45,17 +45,17 @@ def extrude(seen: Surfels, evidence: Evidence, step: float) -> Surfels:
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
     _, nearest = KDTree(seen.points).query(place)
     # A surface that turns away from the camera at the outline goes on behind it; one that is level there ends.
-    level = (seen.normals[nearest, 2] > LEVEL) & (facing(evidence, seen.points, seen.normals)[nearest] > FACING)
-    proven = (empty_depth(evidence, place + OUTWARDS * outward) > SLACK) & level
+    level = (seen.normals[nearest, 2] > LEVEL) & (facing(free_space, seen.points, seen.normals)[nearest] > FACING)
+    proven = (empty_depth(free_space, place + OUTWARDS * outward) > SLACK) & level
     levels = np.arange(0.5 * step, max(float(height.max()), step), step)
     row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
     points = np.column_stack([place[row, :2], levels[level]])
-    wrong = empty_depth(evidence, points) > SLACK
+    wrong = empty_depth(free_space, points) > SLACK
     bad = np.bincount(row, wrong, len(place)) > 0.15 * np.bincount(row, minlength=len(place))
     return take(Surfels(points, outward[row]), ~bad[row])
 
 
-def stand(surfels: Surfels, evidence: Evidence, step: float) -> Surfels:
+def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """What joins walls that end just above the support to it, and the base between them."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
@@ -70,10 +70,10 @@ def stand(surfels: Surfels, evidence: Evidence, step: float) -> Surfels:
     points = (feet.points[:, None] + down[:, None] * fall[:, None]).reshape(-1, 3)
     skirt = Surfels(points, np.repeat(feet.normals, len(fall), 0))
     skirt = thin(take(skirt, (points[:, 2] > 0) & (points[:, 2] < lowest)), step)
-    return join(skirt, _base((feet.points + down * feet.points[:, 2:])[:, :2], evidence, step))
+    return join(skirt, _base((feet.points + down * feet.points[:, 2:])[:, :2], free_space, step))
 
 
-def _base(feet: Float[np.ndarray, "n 2"], evidence: Evidence, step: float) -> Surfels:
+def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
     """The support within the feet's outline, facing down, where it is hidden."""
     from scipy.spatial import ConvexHull, KDTree, QhullError
 
@@ -91,5 +91,5 @@ def _base(feet: Float[np.ndarray, "n 2"], evidence: Evidence, step: float) -> Su
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     within = grid[(grid @ hull.equations[:, :2].T + hull.equations[:, 2] < -0.5 * step).all(1)]
     base = np.column_stack([within, np.zeros(len(within))])
-    base = base[empty_depth(evidence, base) < SLACK]
+    base = base[empty_depth(free_space, base) < SLACK]
     return Surfels(base, np.tile(np.array([0.0, 0.0, -1.0]), (len(base), 1)))

@@ -84,8 +84,8 @@ def orient_view(view: PointCloud, step: float) -> Surfels:
     if len(points) <= NEIGHBOURS:
         return nothing()
     distance, near = KDTree(points).query(points, k=NEIGHBOURS)
-    sight = points - view.viewpoint
-    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    view_depth = points - view.viewpoint
+    view_depth /= np.linalg.norm(view_depth, axis=1, keepdims=True)
     centre, normals = points[near].mean(1), np.zeros_like(points)
     weights = np.ones(near.shape)
     # The second pass leaves out what lies across an edge from the first one's plane.
@@ -97,12 +97,12 @@ def orient_view(view: PointCloud, step: float) -> Surfels:
         normals = axes[:, :, 0]
         off = np.einsum("nkd,nd->nk", spread, normals)
         weights = np.exp(-np.square(off / (1.5 * step)) - np.square(distance / distance[:, -1:]))
-    normals *= -np.sign(np.einsum("nd,nd->n", normals, sight))[:, None]
-    slope = -np.einsum("nd,nd->n", normals, sight)
+    normals *= -np.sign(np.einsum("nd,nd->n", normals, view_depth))[:, None]
+    slope = -np.einsum("nd,nd->n", normals, view_depth)
     shift = np.einsum("nd,nd->n", points - centre, normals) / np.maximum(slope, 1e-3)
     crowded = distance[:, -1] < 2.5 * np.median(distance[:, -1])
     kept = (slope > GRAZING) & (np.abs(shift) < STRAY) & crowded
-    smooth = points + shift[:, None] * sight
+    smooth = points + shift[:, None] * view_depth
     return Surfels(smooth[kept], normals[kept])
 
 
@@ -123,13 +123,13 @@ def thin(surfels: Surfels, step: float) -> Surfels:
 
 def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
     """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
-    sight = view.points - view.viewpoint
-    distance = np.linalg.norm(sight, axis=1)
+    view_depth = view.points - view.viewpoint
+    distance = np.linalg.norm(view_depth, axis=1)
     width = step / float(np.median(distance))
-    axis = sight.mean(0) / np.linalg.norm(sight.mean(0))
+    axis = view_depth.mean(0) / np.linalg.norm(view_depth.mean(0))
     right = perpendicular(axis)
-    depth = np.maximum(sight @ axis, 1e-6)
-    cells = np.floor(np.column_stack([sight @ right, sight @ np.cross(axis, right)]) / depth[:, None] / width)
+    depth = np.maximum(view_depth @ axis, 1e-6)
+    cells = np.floor(np.column_stack([view_depth @ right, view_depth @ np.cross(axis, right)]) / depth[:, None] / width)
     _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     order = np.lexsort([distance, which.reshape(-1)])
     first = np.concatenate([[0], np.cumsum(count)[:-1]])

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError
 from graspd_core.mesh.surface_queries import closest_points, make_surface
-from graspd_core.pointcloud.free_space import SLACK, Evidence, empty_depth
+from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.types import TriangleMesh
 
@@ -74,7 +74,7 @@ def part_walls(surfels: Surfels) -> Surfels:
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 
 
-def close_surface(surface: TriangleMesh, surfels: Surfels, evidence: Evidence) -> TriangleMesh:
+def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace) -> TriangleMesh:
     """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
     from scipy.ndimage import gaussian_filter
 
@@ -84,10 +84,12 @@ def close_surface(surface: TriangleMesh, surfels: Surfels, evidence: Evidence) -
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     value = _signed(surface, nodes, cell)
     inner = value < BAND * cell
-    beyond = np.maximum(empty_depth(evidence, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell)) - SLACK
+    beyond = (
+        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell)) - SLACK
+    )
     value[inner] = np.maximum(value[inner], beyond)
     value = gaussian_filter(value, 0.5)
-    if evidence.standing:
+    if free_space.standing:
         value = np.maximum(value, -nodes[..., 2])
     return march(_one_solid(value, cell), axes)
 

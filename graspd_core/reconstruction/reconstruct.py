@@ -16,18 +16,18 @@ from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import check_mesh, simplify
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
-from graspd_core.pointcloud.free_space import Evidence, make_sights
+from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
 from graspd_core.reconstruction.extrusion import LOW, stand
 from graspd_core.reconstruction.merge_views import NEIGHBOURS, Surfels, join, merge_views, point_step
 from graspd_core.reconstruction.poisson import close_surface, fit_poisson, part_walls
-from graspd_core.reconstruction.shape_completion import OPEN, complete
-from graspd_core.reconstruction.unposed_cloud import is_all_round, orient_all_round
+from graspd_core.reconstruction.shape_completion import OPEN, complete_shape
+from graspd_core.reconstruction.unposed_cloud import is_unposed, orient_unposed
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 
 # Seen surface is trusted fully to the first distance from a seen point [m], guessed surface not at all past the second.
-TRUSTED, GUESSED = 0.004, 0.02
+SEEN_CONFIDENCE, GUESSED = 0.004, 0.02
 # Faces of the result at most.
 MOST_FACES = 16_000
 # Share of the seen points that must lie within this [m] of the result.
@@ -48,7 +48,7 @@ class Reconstruction:
     """
 
     mesh: TriangleMesh
-    trust: Float[np.ndarray, "vertices"]
+    confidence: Float[np.ndarray, "vertices"]
     method: str
     warnings: tuple[str, ...]
 
@@ -70,23 +70,23 @@ def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) ->
     step = point_step(local)
     standing = support is not None
     method, warnings = "poisson", ()
-    if len(local) == 1 and is_all_round(local[0]):
-        seen, evidence = orient_all_round(local[0], step), Evidence((), standing)
+    if len(local) == 1 and is_unposed(local[0]):
+        seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing)
         known = seen
     else:
         seen = merge_views(local, step)
         lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
-        evidence = Evidence(make_sights(local), standing, lowest)
-        guess = complete(seen, evidence, step)
+        free_space = FreeSpace(make_view_depths(local), standing, lowest)
+        guess = complete_shape(seen, free_space, step)
         known = join(seen, guess.surfels)
-        known = join(known, stand(known, evidence, step)) if standing else known
+        known = join(known, stand(known, free_space, step)) if standing else known
         method += f", {guess.method}" if guess.method else ""
         if guess.method or guess.openness > OPEN:
             warnings = (_sentence(len(views), guess.method),)
     known = part_walls(known)
-    mesh = _finished(close_surface(fit_poisson(known), known, evidence), seen)
-    trust = _trust(mesh, np.concatenate([view.points for view in local]))
-    return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), trust, method, warnings)
+    mesh = _finished(close_surface(fit_poisson(known), known, free_space), seen)
+    confidence = _confidence(mesh, np.concatenate([view.points for view in local]))
+    return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), confidence, method, warnings)
 
 
 def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
@@ -171,12 +171,12 @@ def _fewer(mesh: TriangleMesh) -> TriangleMesh:
     return slow if is_closed(slow) else mesh
 
 
-def _trust(mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "vertices"]:
+def _confidence(mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "vertices"]:
     """1 near seen points, less the farther from them."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(seen).query(mesh.vertices)
-    return np.clip((GUESSED - distance) / (GUESSED - TRUSTED), 0.0, 1.0)
+    return np.clip((GUESSED - distance) / (GUESSED - SEEN_CONFIDENCE), 0.0, 1.0)
 
 
 def _sentence(views: int, method: str) -> str:

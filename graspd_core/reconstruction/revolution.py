@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.pointcloud.free_space import Evidence, weigh
+from graspd_core.pointcloud.free_space import FreeSpace, weigh
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.reconstruction.revolution_axis import (
     FEWEST,
@@ -50,20 +50,20 @@ class Revolution:
     share: float
 
 
-def find_revolution(surfels: Surfels, evidence: Evidence, step: float) -> Revolution | None:
+def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Revolution | None:
     """The revolution that shows most: about an upright axis, if the object stands, or one that all normals meet."""
     met = meeting_direction(surfels)
     # A ball has all axes: one across the view shows its back.
-    axes = [fit_axis(surfels, UP if evidence.standing else ACROSS)]
+    axes = [fit_axis(surfels, UP if free_space.standing else ACROSS)]
     # What nearly stands upright does: the support is known better than any axis.
-    if not evidence.standing or abs(met @ UP) < UPRIGHT:
+    if not free_space.standing or abs(met @ UP) < UPRIGHT:
         axes.append(settle_axis(surfels, fit_axis(surfels, met), step))
-    found = [revolve(surfels, evidence, axis, step) for axis in axes]
+    found = [revolve(surfels, free_space, axis, step) for axis in axes]
     good = [f for f in found if f is not None]
     return max(good, key=lambda f: f.share + 4 * f.agree * (1 - f.agree) - WEIGHT * f.wrong) if good else None
 
 
-def revolve(surfels: Surfels, evidence: Evidence, axis: Axis, step: float) -> Revolution | None:
+def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
     """The seen profile turned about the axis; rings that the cameras contradict are left out."""
     _, rows = half_plane(surfels, axis)
     fits = turned(rows, step)
@@ -74,7 +74,7 @@ def revolve(surfels: Surfels, evidence: Evidence, axis: Axis, step: float) -> Re
     up = np.cross(axis.direction, right)
     judged = _ring(profile, axis, right, up, np.full(len(profile), TURNS))
     row = np.repeat(np.arange(len(profile)), TURNS)
-    confirmed, wrong = weigh(evidence, judged.points, judged.normals)
+    confirmed, wrong = weigh(free_space, judged.points, judged.normals)
     good = np.bincount(row, wrong) / TURNS < BROKEN
     if good.sum() < 5:
         return None
@@ -82,12 +82,12 @@ def revolve(surfels: Surfels, evidence: Evidence, axis: Axis, step: float) -> Re
     kept = good[row]
     mean = lambda x: float((x * weight[row] / TURNS)[kept].sum())  # noqa: E731
     explained = _explained(profile[good], rows[:, :2], step)
-    closed = np.vstack([profile[good], *_ends(profile[good], axis, right, up, evidence, step)])
+    closed = np.vstack([profile[good], *_ends(profile[good], axis, right, up, free_space, step)])
     counts = np.maximum(np.ceil(2 * np.pi * closed[:, 1] / step), 3).astype(int)
     return Revolution(axis, _ring(closed, axis, right, up, counts), mean(confirmed), mean(wrong), explained)
 
 
-def _ends(profile: Rows, axis: Axis, right, up, evidence: Evidence, step: float) -> list[Rows]:
+def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
     """What closes a profile that stops away from the axis: a flat cap, or a curve down to the support.
 
     A cap only where the cameras saw the rim to be the end, and neither where they contradict it.
@@ -101,7 +101,7 @@ def _ends(profile: Rows, axis: Axis, right, up, evidence: Evidence, step: float)
         ended = way * profile[:, 0] > end - 2.5 * step
         if rim[1] < 3 * step or (way * profile[ended, 2] > 0.8).mean() > 0.2:
             continue
-        if evidence.standing and way * axis.direction[2] < -0.95:
+        if free_space.standing and way * axis.direction[2] < -0.95:
             # A ring has nothing near its axis to stand on.
             middle = profile[:, 1].min() < 0.3 * rim[1]
             patch = _foot(rim, way, float(axis.point[2]), step) if middle else np.zeros((0, 4))
@@ -109,11 +109,11 @@ def _ends(profile: Rows, axis: Axis, right, up, evidence: Evidence, step: float)
             patch = np.column_stack([np.full((n := int(rim[1] / step)), way * end), np.linspace(0.3 * step, rim[1], n)])
             patch = np.column_stack([patch, np.full(n, way), np.zeros(n)])
             beyond = patch[-1:] + np.array([[0.008 * way, 0, 0, 0]])
-            if (weigh(evidence, *_both(_ring(beyond, axis, right, up, np.full(1, TURNS))))[1] > 0.1).mean() < 0.2:
+            if (weigh(free_space, *_both(_ring(beyond, axis, right, up, np.full(1, TURNS))))[1] > 0.1).mean() < 0.2:
                 continue
         if (
             len(patch)
-            and weigh(evidence, *_both(_ring(patch, axis, right, up, np.full(len(patch), TURNS))))[1].mean() < 0.1
+            and weigh(free_space, *_both(_ring(patch, axis, right, up, np.full(len(patch), TURNS))))[1].mean() < 0.1
         ):
             found.append(patch)
     return found

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graspd_core.pointcloud.free_space import SLACK, Evidence, empty_depth
+from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth
 from graspd_core.reconstruction.extrusion import extrude, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
 from graspd_core.reconstruction.revolution import find_revolution
@@ -42,27 +42,27 @@ class Completion:
     openness: float
 
 
-def complete(seen: Surfels, evidence: Evidence, step: float) -> Completion:
+def complete_shape(seen: Surfels, free_space: FreeSpace, step: float) -> Completion:
     """The guess that the evidence favours: of rules that explain what was seen, the one that says most."""
     from scipy.spatial import KDTree
 
-    known = join(seen, stand(seen, evidence, step)) if evidence.standing else seen
+    known = join(seen, stand(seen, free_space, step)) if free_space.standing else seen
     missing = openness(known, step)
-    turned = find_revolution(seen, evidence, step)
+    turned = find_revolution(seen, free_space, step)
     if turned is not None and turned.share - FAULTS * turned.wrong > WHOLE:
-        guess = plausible(turned.surfels, seen, evidence, step)
+        guess = plausible(turned.surfels, seen, free_space, step)
         # What a handle hides of itself, and the like, is left to Poisson.
         return Completion("revolution" if _counts(guess, seen) else "", guess, missing)
     methods, guess = [], nothing()
     if missing < OPEN:
         return Completion("", guess, missing)
-    if evidence.standing:
-        guess = plausible(extrude(seen, evidence, step), seen, evidence, step)
+    if free_space.standing:
+        guess = plausible(extrude(seen, free_space, step), seen, free_space, step)
         methods = ["extrusion"] if _counts(guess, seen) else []
     known = join(seen, guess)
-    if openness(join(known, stand(known, evidence, step)) if evidence.standing else known, step) > OPEN:
-        name, raw = _symmetric(seen, evidence)
-        images = plausible(raw, known, evidence, step)
+    if openness(join(known, stand(known, free_space, step)) if free_space.standing else known, step) > OPEN:
+        name, raw = _symmetric(seen, free_space)
+        images = plausible(raw, known, free_space, step)
         if len(guess.points):
             # Where both speak, walls beneath seen outlines are the surer.
             apart = KDTree(guess.points).query(images.points)[0] > APART
@@ -81,18 +81,18 @@ def _counts(guess: Surfels, seen: Surfels) -> bool:
     return len(guess.points) > 0.03 * len(seen.points)
 
 
-def plausible(guess: Surfels, known: Surfels, evidence: Evidence, step: float) -> Surfels:
+def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """The guess, thinned, less what the cameras speak against and what lies where the surface is known."""
     from scipy.spatial import KDTree
 
-    guess = take(guess, empty_depth(evidence, guess.points) < SLACK)
+    guess = take(guess, empty_depth(free_space, guess.points) < SLACK)
     distance, nearest = KDTree(known.points).query(guess.points)
     alike = (guess.normals * known.normals[nearest]).sum(1) > 0
     return thin(take(guess, distance > np.where(alike, 2.5, 1.2) * step), step)
 
 
-def _symmetric(seen: Surfels, evidence: Evidence) -> tuple[str, Surfels]:
-    mirrors, centre = find_mirrors(seen, evidence), find_centre(seen, evidence)
+def _symmetric(seen: Surfels, free_space: FreeSpace) -> tuple[str, Surfels]:
+    mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
     value = {"mirror": 0.0, "point symmetry": 0.0}
     if mirrors and mirrors[0].wrong < DOUBTED:
         value["mirror"] = mirrors[0].worth

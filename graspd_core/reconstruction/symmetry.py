@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.pointcloud.free_space import Evidence, on_seen, weigh
+from graspd_core.pointcloud.free_space import FreeSpace, on_seen, weigh
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.se3 import perpendicular
 
@@ -77,42 +77,42 @@ def truth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares
     return agree * (0.3 + meets) - WEIGHT * wrong
 
 
-def find_mirrors(surfels: Surfels, evidence: Evidence) -> list[Symmetry]:
+def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
     """The mirror plane that shows most, and the one square to it, if that is true as well."""
     sample = _sample(surfels)
-    first, normal = _best_plane(_directions(evidence.standing), sample, evidence, worth)
-    if evidence.standing:
+    first, normal = _best_plane(_directions(free_space.standing), sample, free_space, worth)
+    if free_space.standing:
         square = np.cross(UP, normal)[None]
     else:
         side = perpendicular(normal)
         turn = np.linspace(0, np.pi, 12, endpoint=False)[:, None]
         square = np.cos(turn) * side + np.sin(turn) * np.cross(normal, side)
-    second, _ = _best_plane(square, sample, evidence, truth)
+    second, _ = _best_plane(square, sample, free_space, truth)
     both = second.agree > 0.5 * first.agree and second.wrong < 0.01
     return [first, second] if both else [first]
 
 
-def find_centre(surfels: Surfels, evidence: Evidence) -> Symmetry:
+def find_centre(surfels: Surfels, free_space: FreeSpace) -> Symmetry:
     """The best centre of symmetry; of a standing object, the best upright axis of half a turn."""
     sample = _sample(surfels)
     low, high = surfels.points.min(0), surfels.points.max(0)
     middle, size = 0.5 * (low + high), float((high - low).max())
-    across = np.linspace(-0.5, 0.5, 15 if evidence.standing else 11) * size
-    depths = np.zeros(1) if evidence.standing else np.linspace(-0.7, 0.2, 10) * size
-    linear = np.diag([-1.0, -1.0, 1.0]) if evidence.standing else -np.eye(3)
+    across = np.linspace(-0.5, 0.5, 15 if free_space.standing else 11) * size
+    depths = np.zeros(1) if free_space.standing else np.linspace(-0.7, 0.2, 10) * size
+    linear = np.diag([-1.0, -1.0, 1.0]) if free_space.standing else -np.eye(3)
     best = Symmetry(linear, np.zeros(3), 0.0, 1.0, 0.0)
     for finer in (1, 5, 25):
         grid = np.stack(np.meshgrid(across / finer, across / finer, depths / finer, indexing="ij"), -1).reshape(-1, 3)
         centres = middle + grid
         shift = centres - centres @ linear.T
         everywhere = np.broadcast_to(linear, (len(shift), 3, 3))
-        which, best = _pick(everywhere, shift, _rough(sample) if finer == 1 else sample, evidence, worth)
+        which, best = _pick(everywhere, shift, _rough(sample) if finer == 1 else sample, free_space, worth)
         middle = centres[which]
     return best
 
 
 def _best_plane(
-    normals: Float[np.ndarray, "k 3"], sample: _Sample, evidence: Evidence, score: Score
+    normals: Float[np.ndarray, "k 3"], sample: _Sample, free_space: FreeSpace, score: Score
 ) -> tuple[Symmetry, Float[np.ndarray, "3"]]:
     pivot = sample.few.points.mean(0)
     reach = (sample.few.points - pivot) @ normals.T
@@ -124,10 +124,10 @@ def _best_plane(
     for finer in (1, 3, 9):
         linear = np.eye(3) - 2 * np.einsum("ki,kj->kij", tried, tried)
         shift = 2 * (place + tried @ pivot)[:, None] * tried
-        which, best = _pick(linear, shift, judged, evidence, score)
+        which, best = _pick(linear, shift, judged, free_space, score)
         normal, at = tried[which], place[which]
         # Around the best: turned a little, moved a little.
-        turned = _around(normal, 0.1 / finer, evidence.standing)
+        turned = _around(normal, 0.1 / finer, free_space.standing)
         moves = np.linspace(-0.02, 0.02, 9) * size / finer
         tried, place = np.repeat(turned, len(moves), 0), at + np.tile(moves, len(turned))
         judged = sample
@@ -138,18 +138,18 @@ def _pick(
     linear: Float[np.ndarray, "k 3 3"],
     shift: Float[np.ndarray, "k 3"],
     sample: _Sample,
-    evidence: Evidence,
+    free_space: FreeSpace,
     score: Score,
 ) -> tuple[int, Symmetry]:
     """The best of several, and which it is."""
     few = sample.few
     points = np.einsum("kij,nj->kni", linear, few.points) + shift[:, None]
-    confirmed, against = weigh(evidence, points, np.einsum("kij,nj->kni", linear, few.normals))
+    confirmed, against = weigh(free_space, points, np.einsum("kij,nj->kni", linear, few.normals))
     agree, wrong = confirmed.mean(1), against.mean(1)
     # These motions are their own inverse: a rim point lies on the image where its image lies on what was seen.
     rim = np.einsum("kij,nj->kni", linear, sample.rim) + shift[:, None]
-    meets = on_seen(evidence, rim).mean(1) if len(sample.rim) else np.ones(len(agree))
-    closes = _closes(linear, few.normals.mean(0), evidence.standing)
+    meets = on_seen(free_space, rim).mean(1) if len(sample.rim) else np.ones(len(agree))
+    closes = _closes(linear, few.normals.mean(0), free_space.standing)
     which = int(score(agree, wrong, meets, closes).argmax())
     value = float(worth(agree, wrong, meets, closes)[which])
     return which, Symmetry(linear[which], shift[which], float(agree[which]), float(wrong[which]), value)

@@ -23,7 +23,7 @@ FITTED, PASSED = 24, 16
 JITTER = 0.02
 
 
-def is_all_round(view: PointCloud) -> bool:
+def is_unposed(view: PointCloud) -> bool:
     """Whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it."""
     from scipy.spatial import KDTree
 
@@ -42,7 +42,7 @@ def is_all_round(view: PointCloud) -> bool:
     return bool((far - near > STEEPEST * cell).mean() > LAYERED_SHARE)
 
 
-def orient_all_round(view: PointCloud, step: float) -> Surfels:
+def orient_unposed(view: PointCloud, step: float) -> Surfels:
     """Points of an all-round cloud, `step` [m] apart, with normals that agree with their neighbours'.
 
     Raises:

@@ -46,21 +46,21 @@ class TabletopScene:
 
     truth: TriangleMesh
     T_world_object: Float[np.ndarray, "4 4"]
-    neighbours: tuple[TriangleMesh, ...]
+    obstacles: tuple[TriangleMesh, ...]
     table: TriangleMesh
     support: Plane
 
     @property
     def meshes(self) -> tuple[TriangleMesh, ...]:
         """In the order of the labels of `depth_views`: the object 0, its neighbours 1 and on, the table last."""
-        return (self.truth, *self.neighbours, self.table)
+        return (self.truth, *self.obstacles, self.table)
 
 
 def tabletop(
     shape: str | TriangleMesh,
     *,
     yaw: float = 0.0,
-    neighbours: Sequence[tuple[str | TriangleMesh, float, float]] = (),
+    obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = (),
 ) -> TabletopScene:
     """A shape by name, or a mesh, on the table.
 
@@ -74,7 +74,7 @@ def tabletop(
     """
     mesh, pose = _at_rest(shape, yaw)
     others = []
-    for other, x, y in neighbours:
+    for other, x, y in obstacles:
         resting, T_world_other = _at_rest(other, 0.0)
         others.append(moved(resting, _translation(x, y, 0.0) @ T_world_other))
     return TabletopScene(moved(mesh, pose), pose, tuple(others), _table(), Plane(np.array([0.0, 0.0, 1.0]), 0.0))

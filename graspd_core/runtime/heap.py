@@ -8,7 +8,7 @@ import ctypes
 _M_ARENA_MAX, _ARENAS = -8, 2
 
 
-def give_memory_back() -> None:
+def trim_heap() -> None:
     """Let the C library return what was freed (glibc keeps it, scattered, for later); others do so by themselves."""
     try:
         trim = ctypes.CDLL(None).malloc_trim
@@ -17,7 +17,7 @@ def give_memory_back() -> None:
     trim(ctypes.c_size_t(0))
 
 
-def share_arenas() -> None:
+def limit_malloc_arenas() -> None:
     """Let all threads allocate from two arenas, from now on; glibc only.
 
     Else every thread that ever allocated holds freed memory of its own that no other thread can use, and a process with

@@ -1,6 +1,6 @@
 """Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
 
-A process that serves calls `work_elsewhere` once; from then on what goes through `elsewhere` is done in a child. All
+A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child. All
 others, the command line among them, do it themselves.
 """
 
@@ -16,12 +16,12 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from graspd_core.runtime.heap import give_memory_back, share_arenas
+from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
 
 T = TypeVar("T")
 
 
-class OwnProcess:
+class WorkerProcess:
     """Calls functions in a child process, which starts at once and ends with this one, however that ends.
 
     Calls come one at a time. A child that has died is replaced. Functions must be importable by their names;
@@ -81,16 +81,16 @@ class OwnProcess:
         theirs.close()
 
 
-_child: OwnProcess | None = None
+_child: WorkerProcess | None = None
 
 
-def work_elsewhere() -> None:
-    """From now on do what goes through `elsewhere` in a child process, so that threads beside do not stand still."""
+def start_worker_process() -> None:
+    """From now on do what goes through `run_isolated` in a child process, so that threads beside do not stand still."""
     global _child
-    _child = _child or OwnProcess()
+    _child = _child or WorkerProcess()
 
 
-def elsewhere(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
+def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
     """What the work gives or raises; done in the child where there is one, else here."""
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
@@ -98,7 +98,7 @@ def elsewhere(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
 def _serve(pipe: Connection) -> None:
     # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    share_arenas()
+    limit_malloc_arenas()
     while True:
         try:
             call = pipe.recv_bytes()
@@ -111,7 +111,7 @@ def _serve(pipe: Connection) -> None:
         except OSError:
             return
         del answer
-        give_memory_back()
+        trim_heap()
 
 
 def _answer(call: bytes) -> bytes:

@@ -18,21 +18,21 @@ from graspd_core.mesh.sdf import GridSDF
 _NEAR = 2.0
 
 
-def trust_grid(
-    vertices: Float[np.ndarray, "vertices 3"], trust: Float[np.ndarray, "vertices"], sdf: GridSDF
+def confidence_grid(
+    vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
     """The trust of the vertex nearest to each node by the surface; elsewhere, that of the nearest such node."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
     grid = np.zeros(near.shape)
-    grid[near] = trust[KDTree(vertices).query(nodes)[1]]
+    grid[near] = confidence[KDTree(vertices).query(nodes)[1]]
     # Far from the vertices a search among them costs a second; a step on the grid costs nothing.
     source: Any = distance_transform_edt(~near, return_distances=False, return_indices=True)
     return torch.as_tensor(grid[tuple(source)]).to(sdf.field)
 
 
-def sample_trust(
+def sample_confidence(
     grid: Float[Tensor, "x y z"], sdf: GridSDF, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points"]:
     """Trilinear; beyond the grid that of its border. Differentiable in the points."""

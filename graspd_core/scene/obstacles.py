@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
-from graspd_core.scene.scene import Neighbour
+from graspd_core.scene.scene import Obstacle
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 
@@ -32,9 +32,9 @@ PART, MOST_PARTS = 0.05, 8
 _TARGET_SAMPLES = 2000
 
 
-def make_neighbours(
+def make_obstacles(
     points: Sequence[Float[np.ndarray, "_ 3"]], support: Plane | None, target: TriangleMesh, reach: float
-) -> tuple[Neighbour, ...]:
+) -> tuple[Obstacle, ...]:
     """Neighbours from their seen points, in the frame of the points [m].
 
     Args:
@@ -49,22 +49,22 @@ def make_neighbours(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < FEWEST_POINTS or near.query(seen)[0].min() > reach:
             continue
-        whole = _neighbour(seen, support)
+        whole = _obstacle(seen, support)
         if not _swallows(whole, target):
             found.append(whole)
             continue
         # A tray, a box or a ring about the object: its hull is no obstacle but the object's own place.
         parts = [part for part in _cells(seen, support) if near.query(part)[0].min() <= reach]
-        found += [_neighbour(part, support) for part in parts]
+        found += [_obstacle(part, support) for part in parts]
     return tuple(found)
 
 
-def _neighbour(points: Float[np.ndarray, "n 3"], support: Plane | None) -> Neighbour:
+def _obstacle(points: Float[np.ndarray, "n 3"], support: Plane | None) -> Obstacle:
     mesh = padded_hull(points, support)
-    return Neighbour(mesh, build_sdf(mesh, resolution=RESOLUTION, padding=0.02))
+    return Obstacle(mesh, build_sdf(mesh, resolution=RESOLUTION, padding=0.02))
 
 
-def _swallows(neighbour: Neighbour, target: TriangleMesh) -> bool:
+def _swallows(neighbour: Obstacle, target: TriangleMesh) -> bool:
     """Whether a neighbour's hull holds part of the object, more than where one leans on the other."""
     at = torch.as_tensor(target.vertices).to(neighbour.sdf.field)
     return bool((sample_sdf(neighbour.sdf, at)[0] < -2 * PADDING).any())

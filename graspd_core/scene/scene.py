@@ -14,8 +14,8 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
 from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
 from graspd_core.runtime import disk_cache as cache
-from graspd_core.runtime.worker_process import elsewhere
-from graspd_core.scene.confidence import trust_grid
+from graspd_core.runtime.worker_process import run_isolated
+from graspd_core.scene.confidence import confidence_grid
 from graspd_core.types import Plane, TriangleMesh
 
 # Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.
@@ -57,7 +57,7 @@ class ObjectModel:
 
 
 @dataclass(frozen=True)
-class Neighbour:
+class Obstacle:
     """A thing that the hand must not touch.
 
     Attributes:
@@ -86,8 +86,8 @@ class Scene:
     sdf: GridSDF
     timing: tuple[float, float]
     support: Plane | None = None
-    neighbours: tuple[Neighbour, ...] = ()
-    trust: Float[torch.Tensor, "x y z"] | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+    confidence: Float[torch.Tensor, "x y z"] | None = None
 
 
 def build_scene(
@@ -102,8 +102,8 @@ def build_scene(
     warnings: tuple[str, ...] = (),
     started: float | None = None,
     support: Plane | None = None,
-    neighbours: tuple[Neighbour, ...] = (),
-    trust: Float[np.ndarray, "vertices"] | None = None,
+    obstacles: tuple[Obstacle, ...] = (),
+    confidence: Float[np.ndarray, "vertices"] | None = None,
 ) -> Scene:
     """The scene of a mesh already in metres; `scale` is what its file was multiplied by, for the record and for advice.
 
@@ -115,11 +115,13 @@ def build_scene(
     Raises:
         MeshError: see `load_scene`; or there is not one trust for every vertex.
     """
-    if trust is not None and len(trust) != len(mesh.vertices):
-        raise MeshError(f"{source}: {len(trust)} values of trust for {len(mesh.vertices)} vertices; valid: one each")
+    if confidence is not None and len(confidence) != len(mesh.vertices):
+        raise MeshError(
+            f"{source}: {len(confidence)} values of trust for {len(mesh.vertices)} vertices; valid: one each"
+        )
     started = time.perf_counter() if started is None else started
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
-    clean, found = check_mesh(mesh, source, MOST_FACES, scale=scale, dusty=trust is None)
+    clean, found = check_mesh(mesh, source, MOST_FACES, scale=scale, dusty=confidence is None)
     model = _object_model(clean, source, mass, friction, scale, warnings + found)
     loaded = time.perf_counter()
     sdf = object_sdf(model, resolution)
@@ -128,9 +130,9 @@ def build_scene(
         note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; it counts as a sheet"
         model = ObjectModel(**{**vars(model), "warnings": (*model.warnings, note)})
     sdf = sdf.to(device, sdf.field.dtype)
-    known = None if trust is None else trust_grid(mesh.vertices, trust, sdf)
+    known = None if confidence is None else confidence_grid(mesh.vertices, confidence, sdf)
     timing = (loaded - started, time.perf_counter() - loaded)
-    return Scene(model, sdf, timing, support, neighbours, known)
+    return Scene(model, sdf, timing, support, obstacles, known)
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
@@ -158,7 +160,7 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
 
     def build() -> cache.Arrays:
         # A second or two of Python's own work, beside the optimiser.
-        parts = elsewhere(convex_parts, model.mesh)
+        parts = run_isolated(convex_parts, model.mesh)
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
     def valid(arrays: cache.Arrays) -> bool:

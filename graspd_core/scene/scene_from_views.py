@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import torch
 
-from graspd_core.config import SegmentConfig
+from graspd_core.config import SegmentationConfig
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.reconstruction.reconstruct import reconstruct
-from graspd_core.scene.obstacles import make_neighbours
+from graspd_core.scene.obstacles import make_obstacles
 from graspd_core.scene.scene import Scene, build_scene, refuse_numbers
 from graspd_core.segmentation.segment import Segmentation, segment
 from graspd_core.segmentation.target_selection import Target
@@ -21,7 +21,7 @@ def scene_from_views(
     *,
     target: Target | None = None,
     alone: bool = False,
-    settings: SegmentConfig | None = None,
+    settings: SegmentationConfig | None = None,
     mass: float | None = 0.1,
     friction: float = 0.6,
     source: str = "cloud",
@@ -46,7 +46,7 @@ def scene_from_views(
     """
     started = time.perf_counter()
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
-    settings = settings or SegmentConfig()
+    settings = settings or SegmentationConfig()
     seen = Segmentation(tuple(views), None, (), ()) if alone else segment(views, target=target, settings=settings)
     whole = reconstruct(seen.views, support=seen.support)
     return build_scene(
@@ -59,6 +59,6 @@ def scene_from_views(
         warnings=seen.warnings + whole.warnings,
         started=started,
         support=seen.support,
-        neighbours=make_neighbours(seen.neighbours, seen.support, whole.mesh, settings.neighbour_reach),
-        trust=whole.trust,
+        obstacles=make_obstacles(seen.obstacles, seen.support, whole.mesh, settings.obstacle_range),
+        confidence=whole.confidence,
     )

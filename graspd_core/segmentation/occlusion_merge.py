@@ -28,7 +28,7 @@ IMAGE_GAP = 1.5
 WITHIN = 0.6
 
 
-def join_pieces(
+def merge_occluded(
     points: Float[np.ndarray, "n 3"],
     distance: Float[np.ndarray, "n"],
     label: Int[np.ndarray, "n"],

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.config import SegmentConfig
+from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.pointcloud.image_border import reaches_border
+from graspd_core.pointcloud.image_border import reaches_image_border
 from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
-from graspd_core.pointcloud.voxel_downsample import ThinScene, thin_scene
+from graspd_core.pointcloud.voxel_downsample import VoxelScene, voxel_downsample
 from graspd_core.segmentation.clusters import extent, link_length, link_points, renumber
-from graspd_core.segmentation.occlusion_merge import join_pieces
+from graspd_core.segmentation.occlusion_merge import merge_occluded
 from graspd_core.segmentation.planes import find_planes
 from graspd_core.segmentation.support_plane import Ground, find_ground, stands_on, voxels_of
-from graspd_core.segmentation.target_selection import Target, check_target, choose, seen
+from graspd_core.segmentation.target_selection import Target, check_target, seen, select_target
 from graspd_core.types import Plane
 
 # Scenes nearer than this to their cameras are in another unit than metres [m].
@@ -37,12 +37,12 @@ class Segmentation:
 
     views: tuple[PointCloud, ...]
     support: Plane | None
-    neighbours: tuple[Float[np.ndarray, "_ 3"], ...]
+    obstacles: tuple[Float[np.ndarray, "_ 3"], ...]
     warnings: tuple[str, ...]
 
 
 def segment(
-    views: Sequence[PointCloud], *, target: Target | None = None, settings: SegmentConfig | None = None
+    views: Sequence[PointCloud], *, target: Target | None = None, settings: SegmentationConfig | None = None
 ) -> Segmentation:
     """Find the object in one or several views of a scene, or take a cloud of an object alone as it is.
 
@@ -56,8 +56,8 @@ def segment(
         CloudError: empty, all NaN, too few points, or a target that cannot be meant.
         NoObjectError: the scene is seen, and what was asked for is not in it.
     """
-    settings, target = settings or SegmentConfig(), target or Target()
-    scene = thin_scene(views, settings)
+    settings, target = settings or SegmentationConfig(), target or Target()
+    scene = voxel_downsample(views, settings)
     check_target(target, views)
     eyes = np.array([view.viewpoint for view in views], dtype=float)
     parts = find_planes(
@@ -69,24 +69,24 @@ def segment(
     marked = target.box is not None or target.mask is not None
     if not free and not (marked and label.max(initial=-1) >= 0):
         raise NoObjectError(_nothing(scene, label, ground, settings))
-    chosen = choose(scene, label, free, target, views, reach=settings.target_reach)
+    chosen = select_target(scene, label, free, target, views, reach=settings.target_reach)
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found)
     if total < FEWEST_POINTS:
         raise CloudError(f"cloud: only {total} points show the object; at least {FEWEST_POINTS} are needed")
     support = None if ground.support is None else ground.support.plane
-    neighbours = _neighbours(scene, label, chosen, ground, settings)
-    return Segmentation(found, support, neighbours, _doubts(scene, eyes, chosen, ground, bool(neighbours), settings))
+    obstacles = _obstacles(scene, label, chosen, ground, settings)
+    return Segmentation(found, support, obstacles, _doubts(scene, eyes, chosen, ground, bool(obstacles), settings))
 
 
 def _things(
-    scene: ThinScene, ground: Ground, eyes: Float[np.ndarray, "views 3"], settings: SegmentConfig
+    scene: VoxelScene, ground: Ground, eyes: Float[np.ndarray, "views 3"], settings: SegmentationConfig
 ) -> Int[np.ndarray, "voxels"]:
     """The thing that each voxel is part of, numbered from the largest; -1: background or noise."""
     points = scene.mean[ground.left]
     link = link_length(points, settings.gap)
     label = link_points(points, scene.weight[ground.left], link)
-    label = join_pieces(
+    label = merge_occluded(
         points,
         scene.mean_distance[ground.left],
         label,
@@ -104,7 +104,7 @@ def _things(
     return renumber(label)
 
 
-def _tiny(scene: ThinScene, rows: Int[np.ndarray, "rows"], ground: Ground, settings: SegmentConfig) -> bool:
+def _tiny(scene: VoxelScene, rows: Int[np.ndarray, "rows"], ground: Ground, settings: SegmentationConfig) -> bool:
     """Whether a cluster is no larger than noise: a speck, or a bump of the support."""
     points = scene.mean[rows]
     if extent(points) < settings.smallest_object:
@@ -113,7 +113,7 @@ def _tiny(scene: ThinScene, rows: Int[np.ndarray, "rows"], ground: Ground, setti
 
 
 def _candidates(
-    scene: ThinScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentConfig
+    scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentationConfig
 ) -> list[int]:
     """Things of a size to be grasped: those that stand on the support, else all."""
     things = range(int(label.max(initial=-1)) + 1)
@@ -126,7 +126,7 @@ def _candidates(
 
 
 def _cut_out(
-    views: Sequence[PointCloud], scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], ground: Ground
+    views: Sequence[PointCloud], scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], ground: Ground
 ) -> tuple[PointCloud, ...]:
     """The object's points of every view that shows it."""
     wanted = chosen[scene.voxel]
@@ -142,16 +142,16 @@ def _cut_out(
     return tuple(found)
 
 
-def _neighbours(
-    scene: ThinScene,
+def _obstacles(
+    scene: VoxelScene,
     label: Int[np.ndarray, "voxels"],
     chosen: Bool[np.ndarray, "voxels"],
     ground: Ground,
-    settings: SegmentConfig,
+    settings: SegmentationConfig,
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
     """Other things and large flat parts, as far as they are within reach of the object's bounding box."""
     mine = scene.mean[chosen]
-    low, high = mine.min(0) - settings.neighbour_reach, mine.max(0) + settings.neighbour_reach
+    low, high = mine.min(0) - settings.obstacle_range, mine.max(0) + settings.obstacle_range
     near = ((scene.mean >= low) & (scene.mean <= high)).all(1) & ~chosen
     masks = [near & (label == k) for k in range(int(label.max()) + 1)]
     masks += [near & part.inliers & (label < 0) for part in ground.background]
@@ -159,12 +159,12 @@ def _neighbours(
 
 
 def _doubts(
-    scene: ThinScene,
+    scene: VoxelScene,
     eyes: Float[np.ndarray, "views 3"],
     chosen: Bool[np.ndarray, "voxels"],
     ground: Ground,
     crowded: bool,
-    settings: SegmentConfig,
+    settings: SegmentationConfig,
 ) -> tuple[str, ...]:
     """What the user should know of how the object was found."""
     doubts = []
@@ -181,14 +181,14 @@ def _doubts(
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
         part = scene.of_view(k)
-        if reaches_border(scene.points[part], eyes[k], chosen[scene.voxel[part]]):
+        if reaches_image_border(scene.points[part], eyes[k], chosen[scene.voxel[part]]):
             doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
     return tuple(doubts)
 
 
-def _cut_off(scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], settings: SegmentConfig) -> bool:
+def _cut_off(scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], settings: SegmentationConfig) -> bool:
     mine = scene.mean[chosen]
     cut = bool((scene.mean_distance[chosen] > settings.max_range - 2 * scene.size).any())
     if settings.roi_low is not None:
@@ -198,7 +198,7 @@ def _cut_off(scene: ThinScene, chosen: Bool[np.ndarray, "voxels"], settings: Seg
     return cut
 
 
-def _nothing(scene: ThinScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentConfig) -> str:
+def _nothing(scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentationConfig) -> str:
     """What was seen instead of an object."""
     if label.max(initial=-1) >= 0:
         sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.config import SegmentConfig
-from graspd_core.pointcloud.voxel_downsample import ThinScene
+from graspd_core.config import SegmentationConfig
+from graspd_core.pointcloud.voxel_downsample import VoxelScene
 from graspd_core.segmentation.clusters import extent, link_length, link_points
 from graspd_core.segmentation.planes import FlatPart
 
@@ -53,7 +53,7 @@ class Ground:
 
 
 def find_ground(
-    scene: ThinScene, parts: list[FlatPart], viewpoints: Float[np.ndarray, "views 3"], settings: SegmentConfig
+    scene: VoxelScene, parts: list[FlatPart], viewpoints: Float[np.ndarray, "views 3"], settings: SegmentationConfig
 ) -> Ground:
     """Sort the flat parts."""
     parts = [part for part in parts if part.filled > FILLED and not _falls_off(scene, part)]
@@ -78,7 +78,7 @@ def find_ground(
 
 
 def _left(
-    scene: ThinScene, support: FlatPart | None, background: Sequence[Bool[np.ndarray, "voxels"]]
+    scene: VoxelScene, support: FlatPart | None, background: Sequence[Bool[np.ndarray, "voxels"]]
 ) -> Bool[np.ndarray, "voxels"]:
     """What is above the support and not part of the background."""
     left = np.ones(len(scene.mean), dtype=bool)
@@ -89,7 +89,7 @@ def _left(
     return left
 
 
-def _covered(scene: ThinScene, part: FlatPart) -> Bool[np.ndarray, "voxels"]:
+def _covered(scene: VoxelScene, part: FlatPart) -> Bool[np.ndarray, "voxels"]:
     """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
     from scipy.spatial import KDTree
 
@@ -112,7 +112,7 @@ def _covered(scene: ThinScene, part: FlatPart) -> Bool[np.ndarray, "voxels"]:
     return covered
 
 
-def _falls_off(scene: ThinScene, part: FlatPart) -> bool:
+def _falls_off(scene: VoxelScene, part: FlatPart) -> bool:
     """Whether the surface goes on downwards from the part's edge: a face of a body, or a flat spot on a curved one."""
     height, tolerance = part.height(scene.mean), part.tolerance(scene.mean_distance)
     below = (height < -tolerance) & (height > -BAND * tolerance)
@@ -121,7 +121,7 @@ def _falls_off(scene: ThinScene, part: FlatPart) -> bool:
 
 
 def _standing(
-    scene: ThinScene, part: FlatPart, left: Bool[np.ndarray, "voxels"], settings: SegmentConfig
+    scene: VoxelScene, part: FlatPart, left: Bool[np.ndarray, "voxels"], settings: SegmentationConfig
 ) -> tuple[int, int]:
     """How many voxels belong to things that touch that part, and to things that may stand on it."""
     points, distance = scene.mean[left], scene.mean_distance[left]
@@ -136,7 +136,7 @@ def _standing(
 
 
 def stands_on(
-    part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"], settings: SegmentConfig
+    part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"], settings: SegmentationConfig
 ) -> bool:
     """Whether a cluster of voxels is a thing on that support."""
     if not settings.smallest_object <= extent(thing) <= settings.largest_object:

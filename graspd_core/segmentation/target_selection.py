@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.pointcloud.voxel_downsample import ThinScene
+from graspd_core.pointcloud.voxel_downsample import VoxelScene
 
 # A thing of which a box or mask covers this share is meant as a whole; of less, the part that is covered.
 WHOLE = 0.8
@@ -59,8 +59,8 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
             raise CloudError("target: mask shows no point at all")
 
 
-def choose(
-    scene: ThinScene,
+def select_target(
+    scene: VoxelScene,
     label: Int[np.ndarray, "voxels"],
     free: Sequence[int],
     target: Target,
@@ -97,7 +97,7 @@ def choose(
     return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
 
 
-def seen(scene: ThinScene, label: Int[np.ndarray, "voxels"]) -> str:
+def seen(scene: VoxelScene, label: Int[np.ndarray, "voxels"]) -> str:
     """Where there are things, for errors: the centres of the largest."""
     many = int(label.max(initial=-1)) + 1
     if many == 0:
@@ -108,7 +108,7 @@ def seen(scene: ThinScene, label: Int[np.ndarray, "voxels"]) -> str:
 
 
 def _nearest(
-    scene: ThinScene, label: Int[np.ndarray, "voxels"], many: int, point: Float[np.ndarray, "3"], reach: float
+    scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, point: Float[np.ndarray, "3"], reach: float
 ) -> int:
     away = np.linalg.norm(scene.mean - point, axis=1)
     away[label < 0] = np.inf
@@ -119,7 +119,7 @@ def _nearest(
 
 
 def _masked(
-    scene: ThinScene, label: Int[np.ndarray, "voxels"], many: int, mask: Bool[np.ndarray, "points"]
+    scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, mask: Bool[np.ndarray, "points"]
 ) -> Bool[np.ndarray, "voxels"]:
     """A mask may cover several things, pieces of one that others hide in part; a few points of it may miss."""
     of_first = scene.voxel[scene.of_view(0)]
@@ -145,7 +145,7 @@ def _covered(
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 
 
-def _off_axis(thing: Float[np.ndarray, "n 3"], scene: ThinScene, views: Sequence[PointCloud]) -> float:
+def _off_axis(thing: Float[np.ndarray, "n 3"], scene: VoxelScene, views: Sequence[PointCloud]) -> float:
     """Angle between the axis of the first view that shows anything and a thing, to a twentieth of its points [rad]."""
     first = next(k for k, rows in enumerate(scene.rows) if len(rows))
     axis, viewpoint = views[first].forward, views[first].viewpoint

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.scene.scene import Neighbour, ObjectModel
+from graspd_core.scene.scene import ObjectModel, Obstacle
 from graspd_core.se3 import quaternion_from_rotation
 from graspd_core.types import Plane, TriangleMesh
 
@@ -103,7 +103,7 @@ def _turn_z_to(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
     return quaternion / length if length > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
-def add_neighbour(spec: Any, name: str, neighbour: Neighbour, target: ObjectModel, friction: Friction) -> None:
+def add_obstacle(spec: Any, name: str, neighbour: Obstacle, target: ObjectModel, friction: Friction) -> None:
     import mujoco
 
     body = spec.worldbody.add_body(name=name, mocap=True)

@@ -24,7 +24,7 @@ LOST = 0.1
 _CHECK_EVERY = 25
 
 
-def drop_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False) -> float:
+def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False) -> float:
     """Displacement [m] of the object's centre of mass from the start of the trial, mean over six gravity directions.
 
     The hand closes and squeezes as in the hold trial; then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.

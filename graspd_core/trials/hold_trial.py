@@ -61,7 +61,7 @@ def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst:
     """
     import mujoco
 
-    place_hand(world, data, grasp.pregrasp)
+    set_hand_pose(world, data, grasp.pregrasp)
     mujoco.mj_forward(world.model, data)
     depth = start_penetration(world, data)
     if depth > protocol.max_start_penetration:
@@ -80,7 +80,7 @@ def _result(worst: np.ndarray, reason: str) -> HoldResult:
     return HoldResult(not reason, float(worst[0]), float(worst[1]), reason)
 
 
-def judge(grasp: Grasp, hold: HoldResult, lift: LiftResult | None = None) -> Grasp:
+def with_trials(grasp: Grasp, hold: HoldResult, lift: LiftResult | None = None) -> Grasp:
     """The grasp with its verdict written down: verified when it passed every trial that was run."""
     failed = [trial.reason for trial in (hold, lift) if trial is not None and not trial.passed]
     verdict = Verdict.FAILED if failed else Verdict.VERIFIED
@@ -99,7 +99,7 @@ def axis_name(direction: np.ndarray) -> str:
     return f"{'-' if direction.min() < 0 else '+'}{'xyz'[int(np.abs(direction).argmax())]}"
 
 
-def place_hand(world: World, data: Any, posture: Posture) -> None:
+def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
     """Put base, joints and targets where a posture says; `mj_forward` is the caller's."""
     set_joints(world, data, posture.joint_positions)
     data.mocap_pos[0] = posture.position

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.trials.hold_trial import breach, place_hand, set_joints, set_targets
+from graspd_core.trials.hold_trial import breach, set_hand_pose, set_joints, set_targets
 from graspd_core.trials.world import Protocol, World
 from graspd_core.types import Grasp, LiftResult, Posture
 
@@ -93,7 +93,7 @@ def lift_trial(
         (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
         ("while held up", grasp.squeeze, grasp.squeeze, settings.hold_time),
     )
-    place_hand(world, data, begin)
+    set_hand_pose(world, data, begin)
     worst, touched = np.zeros(2), False
     for name, start, end, duration in stages:
         steps = round(duration / protocol.timestep)

@@ -21,13 +21,13 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, Mimic
-from graspd_core.scene.scene import Neighbour, ObjectModel
+from graspd_core.scene.scene import ObjectModel, Obstacle
 from graspd_core.se3 import quaternion_from_rotation
 from graspd_core.trials.bodies import (
     OBJECT,
     TABLE,
-    add_neighbour,
     add_object,
+    add_obstacle,
     add_primitive,
     add_support,
     full_inertia,
@@ -127,7 +127,7 @@ def build_world(
     parts: Sequence[TriangleMesh],
     protocol: Protocol,
     support: Plane | None = None,
-    neighbours: Sequence[Neighbour] = (),
+    obstacles: Sequence[Obstacle] = (),
 ) -> World:
     """Compile the world of one hand and one object.
 
@@ -158,12 +158,12 @@ def build_world(
     option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
     _add_hand(spec, hand, protocol)
     add_object(spec, target, parts, protocol.friction)
-    obstacles = [TABLE] if support is not None else []
+    fixed = [TABLE] if support is not None else []
     if support is not None:
         add_support(spec, hand, parts, protocol.friction, support)
-    for index, neighbour in enumerate(neighbours):
-        obstacles.append(f"neighbour {index + 1}")
-        add_neighbour(spec, obstacles[-1], neighbour, target, protocol.friction)
+    for index, neighbour in enumerate(obstacles):
+        fixed.append(f"neighbour {index + 1}")
+        add_obstacle(spec, fixed[-1], neighbour, target, protocol.friction)
     model = spec.compile()
     return World(
         model=model,
@@ -173,7 +173,7 @@ def build_world(
         object_body=int(model.body(OBJECT).id),
         center_of_mass=target.center_of_mass,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
-        obstacles=tuple((int(model.geom(name).id), name) for name in obstacles),
+        obstacles=tuple((int(model.geom(name).id), name) for name in fixed),
         up=None if support is None else support.normal,
         coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
         mimics=hand.mimics,

@@ -11,10 +11,10 @@ from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 from jaxtyping import Float
 
-from graspd_core import PointCloud, Scene, elsewhere, load_scene
+from graspd_core import PointCloud, Scene, load_scene, run_isolated
 from graspd_ros.inputs.mesh_path import resolve_mesh
 from graspd_ros.inputs.requests import Listener, Request, check_request, point_of, pose_matrix, settings_of
-from graspd_ros.inputs.sensor_frames import Sighting, Views, cloud_sighting, nanoseconds, scene_of_views, trimmed
+from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, nanoseconds, scene_of_views, trimmed
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings
 
@@ -26,7 +26,7 @@ SOURCES = {
 }
 
 
-class Intake:
+class RequestBuilder:
     """Makes requests, and holds what they may be made of: the newest sighting and the kept views.
 
     Used by the executor's thread only. Sightings and views are immutable, so that requests may hold on to them.
@@ -38,7 +38,7 @@ class Intake:
     """
 
     def __init__(self, hand: str, now: Callable[[], Time], lookup: Callable[[str, str, Time], np.ndarray]) -> None:
-        self.newest: Sighting | None = None
+        self.newest: SensorFrame | None = None
         self.views = Views()
         self._hand = hand
         self._now = now
@@ -68,7 +68,7 @@ class Intake:
         load = self._mesh_loader(uri, settings)
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True)
 
-    def from_sighting(self, request_id: str, settings: Settings, sighting: Sighting) -> Request:
+    def from_sighting(self, request_id: str, settings: Settings, sighting: SensorFrame) -> Request:
         """What a camera showed unasked. Raises RequestError: it is too old."""
         sighting.check_age(nanoseconds(self._now()), settings.cloud_max_age)
         load = _loader(lambda: (trimmed(sighting.read(), settings),), settings, None)
@@ -113,14 +113,14 @@ class Intake:
             timeless=timeless,
         )
 
-    def _sighting(self, message: GraspRequest, settings: Settings) -> Sighting:
+    def _sighting(self, message: GraspRequest, settings: Settings) -> SensorFrame:
         if message.source == GraspRequest.LATEST_CLOUD:
             return self._newest(settings)
-        sighting = cloud_sighting(message.cloud, nanoseconds(self._now()))
+        sighting = cloud_frame(message.cloud, nanoseconds(self._now()))
         sighting.check_age(nanoseconds(self._now()), settings.cloud_max_age)
         return sighting
 
-    def _newest(self, settings: Settings) -> Sighting:
+    def _newest(self, settings: Settings) -> SensorFrame:
         if self.newest is None:
             raise RequestError(ErrorCode.NO_CLOUD, "no cloud or depth image has come yet")
         self.newest.check_age(nanoseconds(self._now()), settings.cloud_max_age)
@@ -139,7 +139,7 @@ class Intake:
     def _mesh_loader(self, uri: str, settings: Settings) -> Callable[[int], Scene]:
         path = resolve_mesh(uri, settings.mesh_roots)
         mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
-        return lambda resolution: elsewhere(
+        return lambda resolution: run_isolated(
             load_scene, str(path), mass=mass, friction=friction, scale=scale, resolution=resolution
         )
 

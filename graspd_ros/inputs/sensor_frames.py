@@ -11,7 +11,7 @@ from builtin_interfaces.msg import Time
 from jaxtyping import Float, Int
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from graspd_core import PointCloud, Scene, Target, cloud_from_depth, elsewhere, scene_from_views, transform_cloud
+from graspd_core import PointCloud, Scene, Target, cloud_from_depth, run_isolated, scene_from_views, transform_cloud
 from graspd_core.bags.messages import points_from_message
 from graspd_ros.inputs.depth_stream import frame_of
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
@@ -23,7 +23,7 @@ MOST_VIEW_POINTS = 200_000  # kept of each view: 64 views take 300 MB at most
 
 
 @dataclass(frozen=True)
-class Sighting:
+class SensorFrame:
     """One cloud or depth image as it came.
 
     Attributes:
@@ -51,7 +51,7 @@ class Sighting:
             )
 
 
-def cloud_sighting(message: PointCloud2, arrived: int) -> Sighting:
+def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
     """A cloud message; it is read only when it is used. The camera is taken to stand at the origin of its frame.
 
     Raises:
@@ -61,17 +61,19 @@ def cloud_sighting(message: PointCloud2, arrived: int) -> Sighting:
         told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
         raise RequestError(ErrorCode.BAD_CLOUD, told)
     header = message.header
-    return Sighting("cloud", header.frame_id, header.stamp, arrived, lambda: _origin_view(points_from_message(message)))
+    return SensorFrame(
+        "cloud", header.frame_id, header.stamp, arrived, lambda: _origin_view(points_from_message(message))
+    )
 
 
-def depth_sighting(image: Image, info: CameraInfo, arrived: int) -> Sighting:
+def depth_sensor_frame(image: Image, info: CameraInfo, arrived: int) -> SensorFrame:
     """A depth image with its calibration; it is read only when it is used."""
 
     def read() -> PointCloud:
         frame = frame_of(image, info)
         return cloud_from_depth(frame.depth, frame.camera)
 
-    return Sighting("depth image", image.header.frame_id, image.header.stamp, arrived, read)
+    return SensorFrame("depth image", image.header.frame_id, image.header.stamp, arrived, read)
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Views:
     stamp: Time = field(default_factory=Time)
     clouds: tuple[PointCloud, ...] = ()
 
-    def add(self, sighting: Sighting, settings: Settings, lookup: Callable[[str, str, Time], np.ndarray]) -> Views:
+    def add(self, sighting: SensorFrame, settings: Settings, lookup: Callable[[str, str, Time], np.ndarray]) -> Views:
         """With one more view, moved to the frame of the others (the settings' fixed_frame, or that of the first).
 
         Args:
@@ -110,7 +112,7 @@ def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None, resolution: int
 ) -> Scene:
     """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m]."""
-    return elsewhere(
+    return run_isolated(
         scene_from_views,
         views,
         target=None if target is None else Target(point=target),

@@ -25,7 +25,7 @@ SHOWN = {
 LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 
-class Outlets:
+class Publishers:
     """One publisher for each type of message."""
 
     def __init__(self, node: Node) -> None:

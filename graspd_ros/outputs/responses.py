@@ -17,13 +17,13 @@ from std_msgs.msg import Header
 from graspd_core import HandModel
 from graspd_core.errors import GraspdError
 from graspd_core.types import Progress, ProgressHook
-from graspd_ros.counters import Tally
+from graspd_ros.counters import Counters
 from graspd_ros.inputs.requests import MOST_ID, Listener, Request
 from graspd_ros.outputs import messages
 from graspd_ros.outputs import status_json as convert
 from graspd_ros.outputs.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs.markers import result_markers
-from graspd_ros.outputs.publishers import Outlets
+from graspd_ros.outputs.publishers import Publishers
 from graspd_ros.outputs.trajectory import Pace
 from graspd_ros.request_planner import Planned, limited
 from graspd_ros.worker import Admission, Ending, Refusal, Report
@@ -40,12 +40,12 @@ _ENDINGS = {
 }
 
 
-class Answers:
+class Responses:
     """Tells of requests through `outlets`, and counts them in `tally`."""
 
     def __init__(self, node: Node, hand: HandModel) -> None:
-        self.outlets = Outlets(node)
-        self.tally = Tally()
+        self.outlets = Publishers(node)
+        self.tally = Counters()
         self._node = node
         self._hand = hand
         self._superseded = 0

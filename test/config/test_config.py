@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.config import LossWeights, PlanConfig, SegmentConfig, from_mapping, load_preset, preset_names
+from graspd_core.config import LossWeights, PlanConfig, SegmentationConfig, from_mapping, load_preset, preset_names
 from graspd_core.errors import ConfigError
 
 
@@ -87,8 +87,8 @@ def test_an_unknown_preset_lists_the_known(name: str):
 
 
 def test_places_are_read_with_their_signs():
-    read = from_mapping(SegmentConfig, {"roi_low": [-0.5, -1, 0.0], "roi_high": None})
-    assert read == SegmentConfig(roi_low=(-0.5, -1.0, 0.0))
+    read = from_mapping(SegmentationConfig, {"roi_low": [-0.5, -1, 0.0], "roi_high": None})
+    assert read == SegmentationConfig(roi_low=(-0.5, -1.0, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_places_are_read_with_their_signs():
 )
 def test_a_place_that_is_none_is_named(value: object, complaint: str):
     with pytest.raises(ConfigError, match=complaint):
-        from_mapping(SegmentConfig, {"roi_low": value})
+        from_mapping(SegmentationConfig, {"roi_low": value})
 
 
 def test_every_setting_is_explained():

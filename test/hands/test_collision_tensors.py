@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.hands.collision_tensors import Solids, make_solids, pair_distance, solid_distance
+from graspd_core.hands.collision_tensors import CollisionTensors, make_collision_tensors, pair_distance, solid_distance
 from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import hand_sdf, primitive_sdf
@@ -25,8 +25,8 @@ def hand() -> HandModel:
 
 
 @pytest.fixture(scope="module")
-def solids(hand: HandModel) -> Solids:
-    return make_solids(hand, "cpu", torch.float64)
+def solids(hand: HandModel) -> CollisionTensors:
+    return make_collision_tensors(hand, "cpu", torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_capsules_are_swept_segments_and_hulls_are_left_out(hand):
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     capsule = Primitive(1, "capsule", np.eye(3)[:, [1, 2, 0]], np.array([0.02, 0.0, 0.01]), (0.01, 0.03))
     hull = Primitive(1, "hull", np.eye(3), np.zeros(3), (), corners, faces)
-    found = make_solids(replace(hand, primitives=(hull, capsule)), "cpu", torch.float64)
+    found = make_collision_tensors(replace(hand, primitives=(hull, capsule)), "cpu", torch.float64)
     assert found.link.tolist() == [1]
     q, points = drawn(hand, 0)
     rotations, translations = forward(make_kinematics(hand, dtype=torch.float64), q)

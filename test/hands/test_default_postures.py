@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from graspd_core.errors import HandError
-from graspd_core.hands.default_postures import guess_palm, guess_postures
+from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel
@@ -24,13 +24,13 @@ HANDS = [name for name in hand_names() if (config_dir() / "hands" / f"{name}.urd
 def allegro() -> tuple[HandModel, HandModel]:
     """The described hand and the guessed one."""
     path = config_dir() / "hands" / "allegro_right.urdf"
-    return load_hand("allegro_right", candidates=10), guess_postures(guess_palm(read_hand_file(path)))
+    return load_hand("allegro_right", candidates=10), default_postures(default_palm(read_hand_file(path)))
 
 
 @pytest.mark.parametrize("name", HANDS)
 def test_the_palm_is_found(name: str) -> None:
     described = load_hand(name, candidates=10)
-    guessed = guess_palm(read_hand_file(Path(described.urdf)))
+    guessed = default_palm(read_hand_file(Path(described.urdf)))
     assert described.palm_normal @ guessed.palm_normal > np.cos(np.deg2rad(15.0))
     assert np.linalg.norm(described.palm_center - guessed.palm_center) < 0.02
     np.testing.assert_allclose(guessed.approach, guessed.palm_normal)
@@ -55,7 +55,7 @@ def test_postures_open_and_close_the_hand(allegro: tuple[HandModel, HandModel]) 
         assert ((guessed.lower <= posture) & (posture <= guessed.upper)).all()
         overlap = np.where(guessed.adjacent, 0.0, link_overlaps(guessed, posture[None], points, links)[0])
         assert overlap.max() < 1e-3
-    again = guess_postures(guess_palm(read_hand_file(Path(guessed.urdf))))
+    again = default_postures(default_palm(read_hand_file(Path(guessed.urdf))))
     np.testing.assert_array_equal(again.open_posture, guessed.open_posture)
 
 
@@ -69,7 +69,7 @@ def test_turning_the_base_turns_the_palm_with_it(allegro: tuple[HandModel, HandM
         text[:end] + '<link name="plate"/><joint name="bolt" type="fixed"><parent link="plate"/>'
         '<child link="base_link"/><origin xyz="0.1 -0.2 0.3" rpy="0.5 -0.7 1.1"/></joint></robot>'
     )
-    askew = guess_palm(read_hand_file(path))
+    askew = default_palm(read_hand_file(path))
     index = askew.link_index["base_link"]
     rotations, translations = link_poses(askew, askew.lower)
     # Surface points are drawn anew in another order: 3 mm of the palm's middle.

@@ -16,7 +16,7 @@ from graspd_core.hands.kinematics import (
     forward,
     link_poses,
     make_kinematics,
-    place,
+    place_points,
     placement,
     point_jacobian,
     points_in_base,
@@ -111,7 +111,7 @@ def test_link_poses_are_rigid_and_placing_agrees_with_them(allegro: HandModel, s
     eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
     expected = (rotations[:, links] @ torch.as_tensor(points)[None, :, :, None]).squeeze(-1)
-    turned = place(
+    turned = place_points(
         placement(allegro.num_links, torch.as_tensor(points), torch.as_tensor(links), directions=True),
         rotations,
         translations,

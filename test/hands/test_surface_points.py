@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.hands.collision_spheres import proxy_spheres
+from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import hand_sdf, primitive_sdf
@@ -153,7 +153,7 @@ def test_distance_moves_with_the_primitive(seed: int, kind: str) -> None:
 
 
 def test_proxy_spheres_fill_the_links_and_bulge_little(hand: HandModel) -> None:
-    centers, radii, links = proxy_spheres(hand)
+    centers, radii, links = collision_spheres(hand)
     assert 60 <= len(centers) <= 110
     points, owners, _ = dense_samples(hand, seed=5)
     for link in range(hand.num_links):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.mesh.small_components import face_pieces, without_specks
+from graspd_core.mesh.small_components import drop_small_components, face_components
 from graspd_core.scene.scene import build_scene
 from graspd_core.types import TriangleMesh
 
@@ -35,7 +35,7 @@ def soup(mesh: TriangleMesh, jitter: float) -> TriangleMesh:
 def test_dust_goes_and_the_body_stays_as_it_was(seed, count):
     rng = np.random.default_rng(seed)
     dust = [cube(0.0007, rng.choice([-1, 1], 3) * rng.uniform(0.05, 0.09, 3)) for _ in range(count)]
-    clean, dropped = without_specks(joined(BOX, *dust))
+    clean, dropped = drop_small_components(joined(BOX, *dust))
     assert dropped == count
     assert np.array_equal(clean.vertices[clean.faces], BOX.vertices[BOX.faces])
 
@@ -57,7 +57,7 @@ def test_dust_goes_and_the_body_stays_as_it_was(seed, count):
     ids=["box", "soup", "fine-soup", "mug", "hammer", "pair", "bump", "near", "gravel"],
 )
 def test_what_is_no_dust_stays(mesh):
-    clean, dropped = without_specks(mesh)
+    clean, dropped = drop_small_components(mesh)
     assert dropped == 0
     assert clean is mesh or np.array_equal(clean.vertices[clean.faces], mesh.vertices[mesh.faces])
 
@@ -76,10 +76,10 @@ def test_what_dust_looks_like_is_not_said_of_the_body():
 
 def test_a_reconstruction_is_left_alone():
     dusty = joined(BOX, cube(0.0007, (0.2, 0.0, 0.0)))
-    scene = build_scene(dusty, trust=np.ones(len(dusty.vertices)), resolution=16)
+    scene = build_scene(dusty, confidence=np.ones(len(dusty.vertices)), resolution=16)
     assert len(scene.object.mesh.faces) == len(dusty.faces)
 
 
 def test_pieces_are_numbered_by_the_vertices_they_share():
-    pieces = face_pieces(joined(BOX, cube(0.01, (0.1, 0, 0)), BOX))
+    pieces = face_components(joined(BOX, cube(0.01, (0.1, 0, 0)), BOX))
     assert pieces.tolist() == np.repeat([0, 1, 2], len(BOX.faces)).tolist()

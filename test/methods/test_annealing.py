@@ -18,16 +18,16 @@ from graspd_core.methods.annealing.annealing import (
     cooling,
     jump,
     make_annealing,
+    plan_annealing,
     quaternion_product,
     sampled_epsilon,
-    search_annealing,
 )
 from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
 from graspd_core.methods.finger_closing import finger_of
-from graspd_core.methods.grasp_stages import Touches, hand_distance
+from graspd_core.methods.grasp_stages import ContactSet, hand_distance
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, Poses, minimise
-from graspd_core.methods.planner import Found, Task
+from graspd_core.methods.planner import PlannerInput, PlannerOutput
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
 
@@ -97,12 +97,14 @@ def test_epsilon_of_contacts_worked_by_hand(problem_of):
     # about an axis by more than μ (its arm is one), and a force along an axis is resisted by the one contact behind it.
     problem = replace(problem_of("sphere", DOUBLE), center=torch.zeros(3, dtype=DOUBLE), length=1.0, friction=0.5)
     axes = torch.cat([torch.eye(3, dtype=DOUBLE), -torch.eye(3, dtype=DOUBLE)])[None]
-    touches = Touches(torch.arange(6), axes, axes, torch.zeros(1, 6, dtype=DOUBLE), torch.ones(1, 6, dtype=torch.bool))
+    contact_set = ContactSet(
+        torch.arange(6), axes, axes, torch.zeros(1, 6, dtype=DOUBLE), torch.ones(1, 6, dtype=torch.bool)
+    )
     signed_axes = disturbance_directions(12, 0)
-    assert sampled_epsilon(problem, touches, signed_axes).item() == pytest.approx(0.5, abs=1e-3)
-    assert sampled_epsilon(problem, touches, signed_axes[torch.tensor([0])]).item() == pytest.approx(1.0, abs=1e-3)
+    assert sampled_epsilon(problem, contact_set, signed_axes).item() == pytest.approx(0.5, abs=1e-3)
+    assert sampled_epsilon(problem, contact_set, signed_axes[torch.tensor([0])]).item() == pytest.approx(1.0, abs=1e-3)
     # A single contact closes nothing: whatever pulls away from it is not resisted.
-    alone = replace(touches, active=torch.tensor([[True] + [False] * 5]))
+    alone = replace(contact_set, active=torch.tensor([[True] + [False] * 5]))
     assert sampled_epsilon(problem, alone, signed_axes).item() < 2e-3
 
 
@@ -148,9 +150,9 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
     assert (found.joints <= problem.upper).all()
 
 
-def search(scene, hand, *, seed: int = 0, hooks: Hooks | None = None) -> Found:
+def search(scene, hand, *, seed: int = 0, hooks: Hooks | None = None) -> PlannerOutput:
     hooks = Hooks() if hooks is None else hooks
-    return search_annealing(Task(scene, hand, 4, seed, CONFIG, hooks, dtype=DOUBLE))
+    return plan_annealing(PlannerInput(scene, hand, 4, seed, CONFIG, hooks, dtype=DOUBLE))
 
 
 def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
@@ -171,7 +173,7 @@ def test_chains_that_never_leave_a_collision_give_nothing(scenes, hand):
     # The support ends a metre above the object: in two steps no hand gets out of it.
     buried = replace(scenes["sphere"], support=Plane(np.array([0.0, 0.0, 1.0]), 1.0))
     short = replace(CONFIG, annealing=replace(SETTINGS, steps=2))
-    found = search_annealing(Task(buried, hand, 2, 0, short, Hooks(), dtype=DOUBLE))
+    found = plan_annealing(PlannerInput(buried, hand, 2, 0, short, Hooks(), dtype=DOUBLE))
     assert (found.interrupted, len(found.poses.joints)) == ("", 0)
 
 

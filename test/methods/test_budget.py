@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.config import PlanConfig
-from graspd_core.methods.budget import at_effort
+from graspd_core.methods.budget import at_budget
 
 CONFIG = PlanConfig()
 STEPS, STARTS = ("explore_steps", "refine_steps", "polish_steps"), ("starts_per_grasp", "keep_per_grasp")
@@ -19,17 +19,17 @@ def figures(config: PlanConfig, names: tuple[str, ...]) -> list[float]:
 
 
 def test_an_effort_of_one_is_the_settings():
-    assert at_effort(CONFIG, 1.0) == CONFIG
+    assert at_budget(CONFIG, 1.0) == CONFIG
 
 
 def test_half_the_effort_is_half_the_steps_and_twice_is_twice_the_starts():
-    assert figures(at_effort(CONFIG, 0.5), STEPS) == [25, 40, 25]
-    assert figures(at_effort(CONFIG, 2.0), STARTS) == [8.0, 4.0]
+    assert figures(at_budget(CONFIG, 0.5), STEPS) == [25, 40, 25]
+    assert figures(at_budget(CONFIG, 2.0), STARTS) == [8.0, 4.0]
 
 
 @given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
 def test_more_effort_is_never_less_of_anything(one: float, other: float):
-    small, large = (at_effort(CONFIG, effort) for effort in sorted((one, other)))
+    small, large = (at_budget(CONFIG, effort) for effort in sorted((one, other)))
     for names in (STEPS, STARTS):
         assert all(a <= b for a, b in zip(figures(small, names), figures(large, names), strict=True))
     assert min(figures(small, STEPS)) >= 1
@@ -37,4 +37,4 @@ def test_more_effort_is_never_less_of_anything(one: float, other: float):
 
 def test_a_stage_without_steps_stays_so():
     without = replace(CONFIG, closed_form=replace(CONFIG.closed_form, polish_steps=0))
-    assert at_effort(without, 0.3).closed_form.polish_steps == 0
+    assert at_budget(without, 0.3).closed_form.polish_steps == 0

@@ -1,4 +1,4 @@
-"""Touches, balanced forces and the open posture, on cases that can be worked out by hand."""
+"""ContactSet, balanced forces and the open posture, on cases that can be worked out by hand."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.config import PostureConfig
+from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import link_poses, point_jacobian
 from graspd_core.mesh.shapes import SPHERE_RADIUS
 from graspd_core.methods.grasp_stages import (
     balanced_forces,
-    find_touches,
+    find_contacts,
+    find_pregrasp,
     hand_distance,
     joint_torques,
-    open_clear,
     self_overlap,
     squeeze,
 )
@@ -89,13 +89,13 @@ def closed_on(problem, hand, scene, count: int) -> Poses:
 
 
 def test_open_clear_opens_around_a_cylinder(problem_of, hand, scenes):
-    problem, config = problem_of("cylinder"), PostureConfig()
+    problem, config = problem_of("cylinder"), GraspStagesConfig()
     grasps = closed_on(problem, hand, scenes["cylinder"], 6)
     rotation = rotation_from_quaternion(grasps.quaternion)
     before = hand_distance(problem, rotation, grasps.translation, grasps.joints).amin(-1)
     touching = before < 0.004
     assert touching.sum() >= 3
-    opened, clearance = open_clear(problem, grasps, config)
+    opened, clearance = find_pregrasp(problem, grasps, config)
     after = hand_distance(problem, rotation, opened.translation, opened.joints).amin(-1)
     assert (clearance > 0.5).all()
     # The share is that of the worst place of the way, so the open end has at least this much.
@@ -125,36 +125,36 @@ def fingertip_on_sphere(problem, hand) -> tuple[Poses, int, torch.Tensor, torch.
 
 def test_a_known_contact_is_found(problem_of, hand):
     poses, link, contact, normal = fingertip_on_sphere(problem_of("sphere"), hand)
-    touches = find_touches(problem_of("sphere"), poses, reach=0.002)
-    found = torch.nonzero(touches.active[0] & (touches.link == link)).flatten()
+    contact_set = find_contacts(problem_of("sphere"), poses, reach=0.002)
+    found = torch.nonzero(contact_set.active[0] & (contact_set.link == link)).flatten()
     assert len(found)
-    away = (touches.position[0, found] - contact).norm(dim=-1)
+    away = (contact_set.position[0, found] - contact).norm(dim=-1)
     slot = found[away.argmin()]
     # Facets and grid cells of 2 mm flatten a sphere of 35 mm by less than 0.1 mm, and turn its normal by less than 3°.
     assert away.min() < 1e-4
-    assert abs(float(touches.distance[0, slot])) < 1e-4
-    assert touches.normal[0, slot] @ normal > np.cos(0.05)
-    assert (touches.distance[touches.active].abs() <= 0.002).all()
+    assert abs(float(contact_set.distance[0, slot])) < 1e-4
+    assert contact_set.normal[0, slot] @ normal > np.cos(0.05)
+    assert (contact_set.distance[contact_set.active].abs() <= 0.002).all()
 
 
 def test_nothing_touches_from_afar(problem_of, hand):
     poses, *_ = fingertip_on_sphere(problem_of("box"), hand)
     away = replace(poses, translation=poses.translation + 1.0)
     for name in ("sphere", "box"):
-        assert not find_touches(problem_of(name), away, reach=0.002).active.any()
+        assert not find_contacts(problem_of(name), away, reach=0.002).active.any()
 
 
 def test_torques_are_the_transposed_jacobian_times_forces(problem_of, hand, scenes):
     problem = problem_of("box")
     poses = closed_on(problem, hand, scenes["box"], 2)
-    touches = find_touches(problem, poses, reach=0.02)
+    contact_set = find_contacts(problem, poses, reach=0.02)
     generator = torch.Generator().manual_seed(0)
-    forces = torch.randn(touches.position.shape, generator=generator, dtype=torch.float64)
-    torques = joint_torques(problem, poses, touches, forces)
-    links = touches.link.numpy()
+    forces = torch.randn(contact_set.position.shape, generator=generator, dtype=torch.float64)
+    torques = joint_torques(problem, poses, contact_set, forces)
+    links = contact_set.link.numpy()
     for row in range(2):
         rotation = rotation_from_quaternion(poses.quaternion[row]).numpy()
-        in_base = (touches.position[row] - poses.translation[row]).numpy() @ rotation
+        in_base = (contact_set.position[row] - poses.translation[row]).numpy() @ rotation
         joints = poses.joints[row].numpy()
         rotations, translations = link_poses(hand, joints)
         in_link = np.einsum("pij,pi->pj", rotations[links], in_base - translations[links])
@@ -165,19 +165,19 @@ def test_torques_are_the_transposed_jacobian_times_forces(problem_of, hand, scen
 
 
 def test_the_squeeze_presses_within_effort_and_limits(problem_of, hand, scenes):
-    problem, config = problem_of("cylinder"), PostureConfig()
+    problem, config = problem_of("cylinder"), GraspStagesConfig()
     poses = closed_on(problem, hand, scenes["cylinder"], 4)
-    touches = find_touches(problem, poses, reach=0.02)
+    contact_set = find_contacts(problem, poses, reach=0.02)
     effort = torch.as_tensor(hand.effort)
-    pressed = squeeze(problem, poses, touches, effort, config)
+    pressed = squeeze(problem, poses, contact_set, effort, config)
     assert ((pressed.joints >= problem.lower) & (pressed.joints <= problem.upper)).all()
-    assert not pressed.forces[~touches.active].any()
-    pressing = -(pressed.forces * touches.normal).sum((-1, -2))
+    assert not pressed.forces[~contact_set.active].any()
+    pressing = -(pressed.forces * contact_set.normal).sum((-1, -2))
     assert (pressing > 0).any()
     assert (pressing <= config.grip_force * (1 + 1e-9)).all()
-    torque = joint_torques(problem, poses, touches, pressed.forces)
+    torque = joint_torques(problem, poses, contact_set, pressed.forces)
     assert (torque.abs() <= effort * config.effort_share * (1 + 1e-9)).all()
-    weak = squeeze(problem, poses, touches, effort / 10, config)
+    weak = squeeze(problem, poses, contact_set, effort / 10, config)
     assert (weak.forces.norm(dim=-1) <= pressed.forces.norm(dim=-1) + 1e-12).all()
 
 

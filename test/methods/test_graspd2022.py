@@ -18,12 +18,12 @@ from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.candidates import SEARCHES
 from graspd_core.methods.closed_form.closed_form import pack
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
-from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, search_graspd2022
+from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, plan_graspd2022
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
 from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import Hooks, Poses, minimise
-from graspd_core.methods.planner import Task
-from graspd_core.methods.problem import place
+from graspd_core.methods.planner import PlannerInput
+from graspd_core.methods.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
 SHORT = Graspd2022Config(steps=12, coarse_steps=6)
@@ -182,7 +182,7 @@ def test_published_starts_face_the_surface_from_ten_centimetres(problem, scenes,
     assert distance.numpy() == pytest.approx(np.full(6, 0.1), abs=5e-3)
     assert ((facing * normal).sum(-1) < -0.95).all()
     assert torch.equal(starts.joints, torch.as_tensor(hand.open_posture).expand(6, -1))
-    placed = place(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
+    placed = hand_forward(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
     assert (sample_sdf(problem.sdf, placed.points)[0] > 0).all()
 
 
@@ -228,7 +228,7 @@ def test_desired_forces_of_the_cone_stay_in_it(problem, starts, solver_of):
         before = state
         state = solver.step(problem, state, index)
     p = before.pose.value
-    normals = sample_sdf(problem.sdf, place(problem, problem.coarse, p[:, :3], p[:, 3:7], p[:, 7:]).points)[1]
+    normals = sample_sdf(problem.sdf, hand_forward(problem, problem.coarse, p[:, :3], p[:, 3:7], p[:, 7:]).points)[1]
     assert state.forces.value.abs().max() > 0
     kept = into_cone(state.forces.value, normals, 0.8)
     assert kept.numpy() == pytest.approx(state.forces.value.numpy(), abs=1e-9)
@@ -244,7 +244,7 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
     state = solver.step(problem, state, SHORT.coarse_steps)
     assert torch.isfinite(state.best_loss).all()
     by_code = solver_of(replace(SHORT, radius="code")).init(problem, starts).radius
-    placed = place(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
+    placed = hand_forward(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
     nearest = sample_sdf(problem.sdf, placed.points)[0].amin(-1)
     assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
 
@@ -268,15 +268,15 @@ def test_a_start_that_is_not_a_number_never_wins_and_harms_none(problem, starts,
 
 def test_the_search_obeys_limits_and_stop(hand, scenes):
     config = replace(PlanConfig(), graspd2022=SHORT)
-    task = Task(scenes["sphere"], hand, 2, 1, config, Hooks())
-    found = search_graspd2022(task)
+    task = PlannerInput(scenes["sphere"], hand, 2, 1, config, Hooks())
+    found = plan_graspd2022(task)
     assert len(found.poses.translation) == 2
     assert (found.poses.joints >= found.problem.lower).all()
     assert (found.poses.joints <= found.problem.upper).all()
     polls = iter([False, True])
-    stopped = search_graspd2022(replace(task, hooks=Hooks(stop=polls.__next__)))
+    stopped = plan_graspd2022(replace(task, hooks=Hooks(stop=polls.__next__)))
     assert stopped.interrupted == "cancelled"
-    assert SEARCHES["graspd2022"] is search_graspd2022
+    assert SEARCHES["graspd2022"] is plan_graspd2022
 
 
 def test_presets_name_this_method_and_change_what_they_say():

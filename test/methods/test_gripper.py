@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.config import ClosedFormConfig, PostureConfig
+from graspd_core.config import ClosedFormConfig, GraspStagesConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
 from graspd_core.methods.closed_form.closed_form import ClosedForm, adam_step, pack
-from graspd_core.methods.grasp_stages import find_touches, squeeze
+from graspd_core.methods.grasp_stages import find_contacts, squeeze
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, Poses, minimise
 from graspd_core.methods.problem import Problem, build_problem
@@ -93,13 +93,13 @@ def test_a_sliding_joint_is_told_to_go_on_by_force_over_stiffness(gripper: HandM
         torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=DOUBLE),
         torch.tensor([[0.035]], dtype=DOUBLE),
     )
-    config = PostureConfig(grip_force=10.0)
-    touches = find_touches(problem, poses, config.touch_reach)
-    pressed = squeeze(problem, poses, touches, torch.as_tensor(gripper.effort), config)
+    config = GraspStagesConfig(grip_force=10.0)
+    contact_set = find_contacts(problem, poses, config.touch_reach)
+    pressed = squeeze(problem, poses, contact_set, torch.as_tensor(gripper.effort), config)
     assert float(pressed.imbalance) < 0.05
     # Both jaws' forces add up on the one joint: all of the grip force, give or take the slant of cone edges.
     along = float(pressed.forces[0, :, 1].abs().sum())
     assert along == pytest.approx(config.grip_force, rel=0.05)
     assert float(poses.joints - pressed.joints) == pytest.approx(along / config.slide_stiffness, rel=1e-6)
-    weak = squeeze(problem, poses, touches, torch.tensor([4.0], dtype=DOUBLE), config)
+    weak = squeeze(problem, poses, contact_set, torch.tensor([4.0], dtype=DOUBLE), config)
     assert float(poses.joints - weak.joints) == pytest.approx(4.0 / config.slide_stiffness, rel=1e-6)

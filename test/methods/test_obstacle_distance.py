@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from graspd_core.config import ClosedFormConfig, PlanConfig
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.kinematics import forward
-from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form import pack
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks
-from graspd_core.methods.obstacle_distance import RETREAT, hand_reach, intrusion, make_obstacles, obstacle_gaps
+from graspd_core.methods.obstacle_distance import RETREAT, hand_reach, intrusion, make_obstacle_tensors, obstacle_gaps
 from graspd_core.methods.problem import Problem, build_problem, evaluate
-from graspd_core.scene.obstacles import make_neighbours
+from graspd_core.scene.obstacles import make_obstacles
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane, Posture
@@ -37,7 +37,7 @@ def beside(scene: Scene, x: float) -> Scene:
     """The scene with a wall 100 mm wide and high at x [m]."""
     y, z = np.meshgrid(np.linspace(-0.05, 0.05, 15), np.linspace(-0.045, 0.055, 15))
     wall = np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()])
-    return replace(scene, neighbours=make_neighbours([wall], scene.support, scene.object.mesh, 10.0))
+    return replace(scene, obstacles=make_obstacles([wall], scene.support, scene.object.mesh, 10.0))
 
 
 def problem(scene: Scene, hand, **more) -> Problem:
@@ -62,7 +62,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
     quaternion /= np.linalg.norm(quaternion)
     joints = hand.lower + (hand.upper - hand.lower) * rng.random(hand.num_joints)
     posture = Posture(rng.normal(size=3) * 0.1, quaternion, joints)
-    obstacles = make_obstacles(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
+    obstacles = make_obstacle_tensors(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
     assert obstacles is not None
     rotation = rotation_from_quaternion(torch.as_tensor(quaternion))[None]
     frames = forward(problem(scenes["box"], hand).kinematics, torch.as_tensor(joints)[None])
@@ -73,7 +73,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
 
 def test_a_free_object_pays_nothing(hand, scenes):
     free = problem(scenes["box"], hand)
-    assert (free.obstacles, free.trust) == (None, None)
+    assert (free.obstacles, free.confidence) == (None, None)
     starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
     terms = evaluate(free, starts.translation, starts.quaternion, starts.joints, torch.zeros(3, dtype=DOUBLE), 0.004)
     assert terms.obstacle is None
@@ -116,8 +116,8 @@ def test_trust_scales_what_a_contact_counts(hand, scenes):
     arguments = (x.translation, x.quaternion, x.joints, torch.zeros(4, dtype=DOUBLE), 0.02)
     ones = torch.ones_like(scenes["box"].sdf.field[0])
     known = evaluate(problem(scenes["box"], hand), *arguments)
-    seen = evaluate(problem(replace(scenes["box"], trust=ones), hand, trust_floor=0.4), *arguments)
-    guessed = evaluate(problem(replace(scenes["box"], trust=0 * ones), hand, trust_floor=0.4), *arguments)
+    seen = evaluate(problem(replace(scenes["box"], confidence=ones), hand, confidence_floor=0.4), *arguments)
+    guessed = evaluate(problem(replace(scenes["box"], confidence=0 * ones), hand, confidence_floor=0.4), *arguments)
     # Interpolating ones leaves rounding.
     assert seen.task.tolist() == pytest.approx(known.task.tolist(), rel=1e-12)
     # The support falls to 0.4 of itself, and its logarithm by −log 0.4, but for the floor that keeps it finite.
@@ -154,9 +154,9 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     assert scene.support is not None
     short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15, candidates=60, fine_candidates=120)
     config = PlanConfig(closed_form=short)
-    found = synthesise(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE)
+    found = find_candidates(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE)
     assert found.grasps
-    obstacles = make_obstacles(scene, hand, "cpu", DOUBLE)
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
     assert obstacles is not None
     kinematics = problem(scene, hand).kinematics
     for grasp in found.grasps:

@@ -12,15 +12,15 @@ import torch
 from graspd_core.config import ClosedFormConfig, PlanConfig, RandomClosureConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.finger_closing import link_gaps, make_closing
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.planner import Found, Task
+from graspd_core.methods.planner import PlannerInput, PlannerOutput
 from graspd_core.methods.random_closure.random_closure import (
     advance,
     draw_approaches,
-    search_random_closure,
+    plan_random_closure,
     touching_groups,
 )
 from graspd_core.se3 import rotation_from_quaternion
@@ -34,9 +34,9 @@ CONFIG = PlanConfig(
 )
 
 
-def search(scene, hand, *, count: int = 4, seed: int = 0, hooks: Hooks | None = None, config=CONFIG) -> Found:
+def search(scene, hand, *, count: int = 4, seed: int = 0, hooks: Hooks | None = None, config=CONFIG) -> PlannerOutput:
     hooks = Hooks() if hooks is None else hooks
-    return search_random_closure(Task(scene, hand, count, seed, config, hooks, dtype=DOUBLE))
+    return plan_random_closure(PlannerInput(scene, hand, count, seed, config, hooks, dtype=DOUBLE))
 
 
 def test_what_it_finds_touches_with_enough_links_and_sinks_nowhere(scenes, hand):
@@ -93,7 +93,7 @@ def test_what_asks_for_more_links_than_touch_gives_nothing(scenes, hand):
 
 
 def test_its_poses_become_ranked_grasps(scenes, hand):
-    candidates = synthesise(scenes["cylinder"], hand, count=3, seed=0, config=CONFIG, hooks=Hooks())
+    candidates = find_candidates(scenes["cylinder"], hand, count=3, seed=0, config=CONFIG, hooks=Hooks())
     assert 1 <= len(candidates.grasps) <= 3
     scores = [grasp.score for grasp in candidates.grasps]
     assert scores == sorted(scores, reverse=True)

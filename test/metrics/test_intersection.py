@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graspd_core.metrics.hand_contacts import contact_area, contact_links, place_hand, touching
+from graspd_core.metrics.hand_contacts import contact_area, contact_links, placed_hand, touching
 from graspd_core.metrics.intersection import intersection_volume, penetration, self_penetration
-from graspd_core.metrics.metrics_context import make_judge
+from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.types import TriangleMesh
 
 # The block's surface is 2·(40·30 + 30·20 + 20·40) = 5200 mm², seen by some 4000 samples: an area of A mm² is counted
@@ -21,12 +21,12 @@ def area_noise(area: float) -> float:
 
 @pytest.mark.parametrize("depth", [0.005, 0.012])
 def test_a_block_sunk_into_a_flat_face(depth, block, box, as_object, at):
-    judge = make_judge(as_object(box), block)
-    placed = place_hand(judge, at((0.05 - depth, 0, 0), (0.0,)))
+    context = make_metrics_context(as_object(box), block)
+    placed = placed_hand(context, at((0.05 - depth, 0, 0), (0.0,)))
     # The whole end of 30 x 20 mm lies `depth` below the face; Embree counts in float32.
     assert penetration(placed) == pytest.approx(depth, abs=1e-7)
     # Whole voxels fit this pose, so the count is exact.
-    assert intersection_volume(judge, placed) == pytest.approx(depth * 0.03 * 0.02, rel=1e-9)
+    assert intersection_volume(context, placed) == pytest.approx(depth * 0.03 * 0.02, rel=1e-9)
     assert contact_links(placed) == 1
     # Only the four sides come near the face, in a band as wide as twice the distance about a perimeter of 100 mm.
     assert contact_area(placed) == pytest.approx(0.1 * 0.004, abs=area_noise(0.0004))
@@ -38,10 +38,10 @@ def test_a_block_sunk_into_a_flat_face(depth, block, box, as_object, at):
 
 @pytest.mark.parametrize("gap", [0.001, 0.003])
 def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, box, as_object, at):
-    judge = make_judge(as_object(box), block)
-    placed = place_hand(judge, at((0.05 + gap, 0, 0), (0.0,)))
+    context = make_metrics_context(as_object(box), block)
+    placed = placed_hand(context, at((0.05 + gap, 0, 0), (0.0,)))
     assert penetration(placed) == 0.0
-    assert intersection_volume(judge, placed) == 0.0
+    assert intersection_volume(context, placed) == 0.0
     assert contact_links(placed) == touching(placed).any() == (gap < 0.002)
     # The end of 600 mm², and 1 mm of the sides.
     expected = 0.0006 + 0.1 * 0.001 if gap < 0.002 else 0.0
@@ -51,41 +51,43 @@ def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, b
 def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, box, as_object, at):
     # Three millimetres square, right through the block's 20 mm: most of it is far from the hand's surface.
     rod = TriangleMesh(box.vertices * np.array([0.0015, 0.0015, 0.045]) / np.array([0.03, 0.03, 0.045]), box.faces)
-    judge = make_judge(as_object(rod), block)
-    placed = place_hand(judge, at((0.0005, 0.0005, 0), (0.0,)))
-    assert intersection_volume(judge, placed) == pytest.approx(3 * 3 * 20 * MM3, rel=1e-9)
+    context = make_metrics_context(as_object(rod), block)
+    placed = placed_hand(context, at((0.0005, 0.0005, 0), (0.0,)))
+    assert intersection_volume(context, placed) == pytest.approx(3 * 3 * 20 * MM3, rel=1e-9)
 
 
 def test_the_overlap_of_a_block_wholly_inside_is_its_volume(block, box, as_object, at):
-    judge = make_judge(as_object(box), block)
+    context = make_metrics_context(as_object(box), block)
     # Turned by 1 rad about the x axis: 15 and 10 mm reach at most 18 mm, so that it stays within the box's 30 mm.
-    placed = place_hand(judge, at((0.0, 0, 0), (0.0,), (np.cos(0.5), np.sin(0.5), 0, 0)))
-    assert intersection_volume(judge, placed) == pytest.approx(40 * 30 * 20 * MM3, rel=1e-9)
+    placed = placed_hand(context, at((0.0, 0, 0), (0.0,), (np.cos(0.5), np.sin(0.5), 0, 0)))
+    assert intersection_volume(context, placed) == pytest.approx(40 * 30 * 20 * MM3, rel=1e-9)
     assert touching(placed).all()
 
 
 def test_a_slanted_overlap_is_within_the_voxels_error(block, box, as_object, at):
-    judge = make_judge(as_object(box), block)
+    context = make_metrics_context(as_object(box), block)
     # About z by 45°: a corner of the block goes in. Depth t of a right-angled edge over 20 mm: t² · 20 mm.
     turn = np.deg2rad(45.0)
     corner = np.array([-0.02 * np.cos(turn) - 0.015 * np.sin(turn), 0, 0])
     depth = 0.008
-    placed = place_hand(judge, at((0.03 - depth - corner[0], 0, 0), (0.0,), (np.cos(turn / 2), 0, 0, np.sin(turn / 2))))
+    placed = placed_hand(
+        context, at((0.03 - depth - corner[0], 0, 0), (0.0,), (np.cos(turn / 2), 0, 0, np.sin(turn / 2)))
+    )
     # A slanted face of 1 mm voxels: about half a voxel over a face of 16 x 20 mm, with signs that mostly cancel.
-    assert intersection_volume(judge, placed) == pytest.approx(depth**2 * 0.02, rel=0.05)
+    assert intersection_volume(context, placed) == pytest.approx(depth**2 * 0.02, rel=0.05)
     assert penetration(placed) == pytest.approx(depth, abs=0.0005)
 
 
 def test_fingers_that_pass_through_each_other(gripper, box, as_object, at):
-    judge = make_judge(as_object(box), gripper)
+    context = make_metrics_context(as_object(box), gripper)
     far = (0.0, 0.0, 1.0)
     # Inner faces are 45 mm − q from the middle: at 46 mm each is 2 mm inside the other finger.
-    assert self_penetration(judge, place_hand(judge, at(far, (0.046, 0.046)))) == pytest.approx(0.002, abs=1e-9)
-    assert self_penetration(judge, place_hand(judge, at(far, (0.044, 0.044)))) == 0.0
+    assert self_penetration(context, placed_hand(context, at(far, (0.046, 0.046)))) == pytest.approx(0.002, abs=1e-9)
+    assert self_penetration(context, placed_hand(context, at(far, (0.044, 0.044)))) == 0.0
 
 
 def test_a_hand_far_away_touches_nothing(gripper, box, as_object, at):
-    judge = make_judge(as_object(box), gripper)
-    placed = place_hand(judge, at((0.0, 0.0, 1.0), (0.0, 0.0)))
-    assert contact_area(placed, 0.01) == penetration(placed) == intersection_volume(judge, placed) == 0.0
+    context = make_metrics_context(as_object(box), gripper)
+    placed = placed_hand(context, at((0.0, 0.0, 1.0), (0.0, 0.0)))
+    assert contact_area(placed, 0.01) == penetration(placed) == intersection_volume(context, placed) == 0.0
     assert contact_links(placed) == 0

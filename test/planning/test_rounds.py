@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graspd_core.config import PlanConfig, RoundsConfig, load_preset
-from graspd_core.methods.budget import at_effort
+from graspd_core.methods.budget import at_budget
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import Plane
@@ -20,7 +20,7 @@ def scene():
 
 
 def efforts(*values: float) -> list[PlanConfig]:
-    return [at_effort(PlanConfig(), value) for value in values]
+    return [at_budget(PlanConfig(), value) for value in values]
 
 
 def test_a_known_object_alone_begins_cheaply(scene):
@@ -34,7 +34,7 @@ def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_step
 
 
 def test_rounds_are_a_setting(scene):
-    steady = PlanConfig(rounds=RoundsConfig(most=2, first_effort=1.0, growth=1.0))
+    steady = PlanConfig(rounds=RoundsConfig(most=2, first_budget=1.0, growth=1.0))
     assert rounds_of(scene, steady, "standard") == [steady, steady]
     for name in ("fast", "accurate"):
         assert rounds_of(scene, load_preset(name), "standard")[0] == load_preset(name)

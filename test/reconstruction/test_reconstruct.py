@@ -14,7 +14,7 @@ from graspd_core.mesh.shapes import SHAPES, make_shape, shape_volume
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.pointcloud.free_space import Evidence, empty_depth, make_sights
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.reconstruction.reconstruct import MOST_FACES, Reconstruction, reconstruct
 from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
@@ -84,22 +84,22 @@ def test_trust_is_full_where_seen_and_falls_where_guessed(name):
     _, views = seen(name)
     whole = made(name)
     away, _ = KDTree(views[0].points).query(whole.mesh.vertices)
-    assert whole.trust.shape == (len(whole.mesh.vertices),)
-    assert ((whole.trust >= 0) & (whole.trust <= 1)).all()
+    assert whole.confidence.shape == (len(whole.mesh.vertices),)
+    assert ((whole.confidence >= 0) & (whole.confidence <= 1)).all()
     # All but rows of pixels so oblique and alone that they pass for strays.
-    assert (whole.trust[away < 0.001] == 1).mean() > 0.97
-    assert (whole.trust[away > 0.022] == 0).all()
-    assert whole.trust[away > 0.01].max() < 0.8
+    assert (whole.confidence[away < 0.001] == 1).mean() > 0.97
+    assert (whole.confidence[away > 0.022] == 0).all()
+    assert whole.confidence[away > 0.01].max() < 0.8
     # One view shows less than all of it.
-    assert (whole.trust < 0.5).mean() > 0.05
+    assert (whole.confidence < 0.5).mean() > 0.05
 
 
 @pytest.mark.parametrize("name", sorted(SHAPES))
 def test_what_the_camera_saw_to_be_empty_stays_empty(name):
     _, views = seen(name)
-    evidence = Evidence(make_sights(views), standing=True, lowest=0.006)
+    free_space = FreeSpace(make_view_depths(views), standing=True, lowest=0.006)
     points, _ = surface_samples(made(name).mesh, 4000, 0)
-    deep = empty_depth(evidence, points)
+    deep = empty_depth(free_space, points)
     assert np.percentile(deep, 99) < 0.005
     # One spot of the mug's handle, of a few mm², is 12 mm deep: the surface is drawn over a gap of the view.
     assert (deep > 0.008).mean() < 0.001
@@ -144,7 +144,7 @@ def test_the_same_views_give_the_same_mesh():
     scene, views = seen("box")
     again = reconstruct(views, support=scene.support)
     assert np.array_equal(again.mesh.vertices, made("box").mesh.vertices)
-    assert np.array_equal(again.trust, made("box").trust)
+    assert np.array_equal(again.confidence, made("box").confidence)
 
 
 def test_without_a_support_a_single_view_is_completed_too():
@@ -162,7 +162,7 @@ def test_an_all_round_cloud_needs_no_camera(name):
     whole = reconstruct([PointCloud(points, np.array([0.5, 0.1, 0.3]))])
     assert is_closed(whole.mesh)
     assert (whole.method, whole.warnings) == ("poisson", ())
-    assert whole.trust.min() > 0.9
+    assert whole.confidence.min() > 0.9
     assert mass_properties(whole.mesh)[0] == pytest.approx(shape_volume(name), rel=0.05)
 
 
@@ -194,9 +194,9 @@ def test_a_view_of_next_to_nothing_does_not_spoil_the_others(few):
 
 def test_a_line_of_sight_gives_no_depth_image():
     along = np.outer(np.linspace(0.3, 0.5, 200), np.array([0, 0, 1.0]))
-    assert make_sights([PointCloud(along, np.zeros(3))]) == ()
-    assert make_sights([PointCloud(BALL[:4], np.array([0, 0, 0.5]))]) == ()
-    assert len(make_sights([PointCloud(BALL, np.array([0, 0, 0.5]))])) == 1
+    assert make_view_depths([PointCloud(along, np.zeros(3))]) == ()
+    assert make_view_depths([PointCloud(BALL[:4], np.array([0, 0, 0.5]))]) == ()
+    assert len(make_view_depths([PointCloud(BALL, np.array([0, 0, 0.5]))])) == 1
 
 
 def test_points_exactly_on_a_sphere_are_closed_too():

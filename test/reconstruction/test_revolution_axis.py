@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graspd_core.pointcloud.free_space import Evidence
+from graspd_core.pointcloud.free_space import FreeSpace
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.reconstruction.revolution import find_revolution
 from graspd_core.reconstruction.revolution_axis import fit_axis, half_plane, settle_axis
@@ -48,6 +48,6 @@ def test_half_a_ball_seen_from_any_side_has_its_back():
     normals = rng.standard_normal((6000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     normals = normals[normals[:, 2] > 0.15]
-    found = find_revolution(Surfels(0.03 * normals, normals), Evidence((), standing=False), 1.2e-3)
+    found = find_revolution(Surfels(0.03 * normals, normals), FreeSpace((), standing=False), 1.2e-3)
     assert found is not None
     assert found.surfels.points[:, 2].min() < -0.025

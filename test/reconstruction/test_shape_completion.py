@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import BOX_HALF, CYLINDER_HALF, CYLINDER_RADIUS, SPHERE_RADIUS, make_shape
-from graspd_core.pointcloud.free_space import Evidence, empty_depth, make_sights, weigh
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths, weigh
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.reconstruction.extrusion import extrude, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, point_step
 from graspd_core.reconstruction.revolution import find_revolution
 from graspd_core.reconstruction.revolution_axis import fit_axis
-from graspd_core.reconstruction.shape_completion import complete, openness, plausible
+from graspd_core.reconstruction.shape_completion import complete_shape, openness, plausible
 from graspd_core.reconstruction.symmetry import find_centre, find_mirrors, image
 
 EYE = np.array([0.3, 0.15, 0.35])
@@ -27,8 +27,8 @@ def front(name: str, height: float, eye: np.ndarray = EYE) -> PointCloud:
     return PointCloud(points[((eye - points) * normals).sum(1) > 0], eye)
 
 
-def looked_at(view: PointCloud, standing: bool = True) -> tuple[Surfels, Evidence, float]:
-    return merge_views([view]), Evidence(make_sights([view]), standing), point_step([view])
+def looked_at(view: PointCloud, standing: bool = True) -> tuple[Surfels, FreeSpace, float]:
+    return merge_views([view]), FreeSpace(make_view_depths([view]), standing), point_step([view])
 
 
 BOX, CYLINDER, BALL = front("box", BOX_HALF[2]), front("cylinder", CYLINDER_HALF), front("sphere", SPHERE_RADIUS)
@@ -39,27 +39,27 @@ def test_before_the_surface_it_is_empty_and_behind_it_is_not(along, behind):
     """A wall at z = 0 seen from a metre above its middle."""
     ticks = np.linspace(-0.1, 0.1, 60)
     wall = np.stack(np.meshgrid(ticks, ticks, [0.0], indexing="ij"), -1).reshape(-1, 3)
-    evidence = Evidence(make_sights([PointCloud(wall, np.array([0.0, 0.0, 1.0]))]), standing=False)
+    free_space = FreeSpace(make_view_depths([PointCloud(wall, np.array([0.0, 0.0, 1.0]))]), standing=False)
     before = np.array([[0.01, 0.0, along]])
-    assert empty_depth(evidence, before)[0] == pytest.approx(along, abs=1e-6)
-    assert empty_depth(evidence, np.array([[0.01, 0.0, -behind]]))[0] == 0
+    assert empty_depth(free_space, before)[0] == pytest.approx(along, abs=1e-6)
+    assert empty_depth(free_space, np.array([[0.01, 0.0, -behind]]))[0] == 0
     # Beside the outline, by how far: cells are 5 mm wide.
-    assert empty_depth(evidence, np.array([[0.13, 0.0, 0.0]]))[0] == pytest.approx(0.03, abs=0.006)
+    assert empty_depth(free_space, np.array([[0.13, 0.0, 0.0]]))[0] == pytest.approx(0.03, abs=0.006)
     up = np.array([[0.0, 0.0, 1.0]])
     on = np.array([[0.01, 0.0, 0.001]])
-    assert weigh(evidence, on, up)[0][0]
-    assert not weigh(evidence, on, -up)[0][0], "a surface that faces away was not seen"
+    assert weigh(free_space, on, up)[0][0]
+    assert not weigh(free_space, on, -up)[0][0], "a surface that faces away was not seen"
 
 
 def test_the_support_is_no_place_for_an_object():
-    evidence = Evidence((), standing=True)
-    assert empty_depth(evidence, np.array([[0, 0, -0.02], [0, 0, 0.02]])) == pytest.approx([0.02, 0.0])
+    free_space = FreeSpace((), standing=True)
+    assert empty_depth(free_space, np.array([[0, 0, -0.02], [0, 0, 0.02]])) == pytest.approx([0.02, 0.0])
 
 
 @pytest.mark.parametrize("view", [CYLINDER, BALL], ids=["cylinder", "ball"])
 def test_a_revolution_is_found_and_lies_on_the_body(view):
-    seen, evidence, step = looked_at(view)
-    turned = find_revolution(seen, evidence, step)
+    seen, free_space, step = looked_at(view)
+    turned = find_revolution(seen, free_space, step)
     assert turned is not None
     assert turned.wrong < 0.01
     assert turned.share > 0.9
@@ -96,8 +96,8 @@ def test_the_axis_is_where_the_normals_meet(x, y, tilt, turn):
 
 
 def test_the_mirrors_of_a_box_are_its_own():
-    seen, evidence, _ = looked_at(BOX)
-    mirrors = find_mirrors(seen, evidence)
+    seen, free_space, _ = looked_at(BOX)
+    mirrors = find_mirrors(seen, free_space)
     assert mirrors
     images = image(mirrors[0], seen)
     off = np.abs((np.abs(images.points - [0, 0, BOX_HALF[2]]) - BOX_HALF).max(1))
@@ -105,20 +105,20 @@ def test_the_mirrors_of_a_box_are_its_own():
 
 
 def test_the_half_turn_of_a_box_is_found():
-    seen, evidence, _ = looked_at(BOX)
-    centre = find_centre(seen, evidence)
+    seen, free_space, _ = looked_at(BOX)
+    centre = find_centre(seen, free_space)
     assert centre.wrong < 0.02
     # p ↦ 2c − p across: the centre is half the shift.
     assert centre.shift[:2] / 2 == pytest.approx([0, 0], abs=0.004)
 
 
 def test_a_box_is_extruded_to_its_unseen_walls_and_closed_below():
-    seen, evidence, step = looked_at(BOX)
-    walls = extrude(seen, evidence, step)
+    seen, free_space, step = looked_at(BOX)
+    walls = extrude(seen, free_space, step)
     off = np.abs(np.abs(walls.points[:, :2]) - BOX_HALF[:2]).min(1)
     assert np.percentile(off, 90) < 0.003
-    whole = join(seen, plausible(walls, seen, evidence, step))
-    closed = join(whole, stand(whole, evidence, step))
+    whole = join(seen, plausible(walls, seen, free_space, step))
+    closed = join(whole, stand(whole, free_space, step))
     assert openness(closed, step) < 0.15 < openness(seen, step)
     base = closed.points[closed.normals[:, 2] < -0.9]
     assert np.abs(base[:, 2]).max() < 1e-9
@@ -126,27 +126,27 @@ def test_a_box_is_extruded_to_its_unseen_walls_and_closed_below():
 
 
 def test_a_ball_has_no_base_and_is_not_extruded():
-    seen, evidence, step = looked_at(BALL)
-    assert len(stand(seen, evidence, step).points) == 0
-    walls = plausible(extrude(seen, evidence, step), seen, evidence, step)
+    seen, free_space, step = looked_at(BALL)
+    assert len(stand(seen, free_space, step).points) == 0
+    walls = plausible(extrude(seen, free_space, step), seen, free_space, step)
     assert len(walls.points) < 0.05 * len(seen.points)
 
 
 @pytest.mark.parametrize(("view", "method"), [(BOX, "extrusion"), (CYLINDER, "revolution"), (BALL, "revolution")])
 def test_the_evidence_chooses(view, method):
-    guess = complete(*looked_at(view))
+    guess = complete_shape(*looked_at(view))
     assert method in guess.method
-    evidence = looked_at(view)[1]
-    assert empty_depth(evidence, guess.surfels.points).max() < 0.004
+    free_space = looked_at(view)[1]
+    assert empty_depth(free_space, guess.surfels.points).max() < 0.004
 
 
 def test_guesses_in_empty_space_or_on_what_is_seen_are_dropped():
-    seen, evidence, step = looked_at(BOX)
+    seen, free_space, step = looked_at(BOX)
     towards = EYE - seen.points
     before = Surfels(seen.points + 0.1 * towards, seen.normals)
-    assert len(plausible(before, seen, evidence, step).points) == 0
-    assert len(plausible(seen, seen, evidence, step).points) == 0
+    assert len(plausible(before, seen, free_space, step).points) == 0
+    assert len(plausible(seen, seen, free_space, step).points) == 0
     whole, normals = surface_samples(make_shape("box"), 5000, 0)
     whole = whole + np.array([0.0, 0.0, BOX_HALF[2]])
     hidden = (normals @ np.array([-1.0, 0.0, 0.0])) > 0.9
-    assert len(plausible(Surfels(whole[hidden], normals[hidden]), seen, evidence, step).points) > 100
+    assert len(plausible(Surfels(whole[hidden], normals[hidden]), seen, free_space, step).points) > 100

@@ -59,7 +59,7 @@ def test_cameras_stand_on_a_ring_and_look_at_the_object():
 
 
 def test_without_noise_points_lie_on_what_their_pixel_shows():
-    scene = tabletop("box", neighbours=[("sphere", 0.12, 0.0)])
+    scene = tabletop("box", obstacles=[("sphere", 0.12, 0.0)])
     pose = ring_poses(1, elevation=0.7, azimuth=1.2)
     ((depth, label),) = depth_views(scene, SMALL, pose)
     (cloud,) = views_of(scene, SMALL, pose)

@@ -20,9 +20,9 @@ from graspd_core.bags.messages import add_transforms
 from graspd_core.errors import GraspdError
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.inputs.depth_stream import ImagePairs
-from graspd_ros.inputs.request_builder import Intake
+from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.requests import Request
-from graspd_ros.inputs.sensor_frames import cloud_sighting, depth_sighting
+from graspd_ros.inputs.sensor_frames import cloud_frame, depth_sensor_frame
 from graspd_ros.outputs.status_json import status_line
 from graspd_ros.parameters import Settings
 
@@ -84,7 +84,7 @@ def read(request: Request) -> None:
 @settings(max_examples=60)
 @given(message=requests, now=stamps)
 def test_any_request_is_taken_or_refused_in_one_line(tmp_path_factory, message: GraspRequest, now: Time):
-    intake = Intake(HAND, lambda: now, lambda target, source, stamp: np.eye(4))
+    intake = RequestBuilder(HAND, lambda: now, lambda target, source, stamp: np.eye(4))
     roots = Settings(mesh_roots=[str(tmp_path_factory.getbasetemp())])
     request, _ = refused(lambda: intake.from_message("r", roots, message))
     if request is not None and message.source == GraspRequest.CLOUD:
@@ -94,8 +94,8 @@ def test_any_request_is_taken_or_refused_in_one_line(tmp_path_factory, message: 
 @settings(max_examples=60)
 @given(message=clouds, now=stamps)
 def test_any_cloud_is_read_or_refused_in_one_line(message: PointCloud2, now: Time):
-    intake = Intake(HAND, lambda: now, lambda target, source, stamp: np.eye(4))
-    sighting = cloud_sighting(message, 5)
+    intake = RequestBuilder(HAND, lambda: now, lambda target, source, stamp: np.eye(4))
+    sighting = cloud_frame(message, 5)
     refused(lambda: intake.from_sighting("r", Settings(), sighting))
     view, _ = refused(sighting.read)
     if view is not None:
@@ -109,7 +109,7 @@ def test_any_depth_image_is_read_or_refused_in_one_line(image: Image, info: Came
     pairs.add_image(image)
     pairs.add_info(info)
     info.header.frame_id = image.header.frame_id
-    refused(depth_sighting(image, info, 5).read)
+    refused(depth_sensor_frame(image, info, 5).read)
 
 
 @settings(max_examples=60)

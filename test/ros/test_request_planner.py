@@ -62,9 +62,9 @@ def test_trouble_on_the_way_comes_out_as_it_is(hand):
     with pytest.raises(MeshError, match="no such thing"):
         planner(hand).plan(request(broken), never, lambda _: None)
     read: list[int] = []
-    elsewhere = replace(SETTINGS, output_frame="base")
+    run_isolated = replace(SETTINGS, output_frame="base")
     with pytest.raises(TransformError, match="object -> base"):
-        planner(hand).plan(request(read.append, elsewhere), never, lambda _: None)
+        planner(hand).plan(request(read.append, run_isolated), never, lambda _: None)
     assert not read, "the object was read before it was known that the result cannot be told"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.runtime.heap import give_memory_back
+from graspd_core.runtime.heap import trim_heap
 
 
 def resident() -> float:
@@ -23,7 +23,7 @@ def test_what_was_freed_between_things_that_stay_is_given_back():
     stay = blocks[::100]
     del blocks
     before = resident()
-    give_memory_back()
+    trim_heap()
     # 100 MB were freed; other tests may have left holes that a part of them came from.
     assert before - resident() > 50
     assert len(stay) == 250
@@ -32,15 +32,15 @@ def test_what_was_freed_between_things_that_stay_is_given_back():
 def test_where_the_c_library_has_no_such_thing_nothing_happens(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
     before = resident()
-    give_memory_back()
+    trim_heap()
     assert abs(resident() - before) < 50
 
 
 def test_threads_share_two_arenas_once_they_are_told_to():
     code = (
         "import threading, ctypes, sys\n"
-        "from graspd_core.runtime.heap import share_arenas\n"
-        "if sys.argv[1] == 'shared': share_arenas()\n"
+        "from graspd_core.runtime.heap import limit_malloc_arenas\n"
+        "if sys.argv[1] == 'shared': limit_malloc_arenas()\n"
         "wait = threading.Barrier(9)\n"
         "def work():\n"
         "    kept = ctypes.create_string_buffer(50_000)\n"

@@ -15,57 +15,57 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.runtime.worker_process import OwnProcess, elsewhere
+from graspd_core.runtime.worker_process import WorkerProcess, run_isolated
 
 
 @pytest.fixture
-def child() -> Iterator[OwnProcess]:
-    process = OwnProcess()
+def child() -> Iterator[WorkerProcess]:
+    process = WorkerProcess()
     yield process
     process.close()
 
 
-def test_the_work_is_done_elsewhere(child: OwnProcess):
+def test_the_work_is_done_elsewhere(child: WorkerProcess):
     assert child(os.getpid) == child(os.getpid) != os.getpid()
 
 
-def test_values_and_errors_come_back_and_the_child_lives_on(child: OwnProcess):
+def test_values_and_errors_come_back_and_the_child_lives_on(child: WorkerProcess):
     assert child(math.sqrt, 2.25) == 1.5
     with pytest.raises(ValueError, match="math domain"):
         child(math.sqrt, -1.0)
     assert child(math.sqrt, 4.0) == 2.0
 
 
-def test_arrays_tensors_and_named_arguments_travel(child: OwnProcess):
+def test_arrays_tensors_and_named_arguments_travel(child: WorkerProcess):
     points = np.arange(6.0).reshape(2, 3)
     assert child(np.sum, points, axis=0).tolist() == [3.0, 5.0, 7.0]
     field = torch.arange(5.0)
     assert torch.equal(child(torch.mul, field, 2.0), 2.0 * field)
 
 
-def test_an_error_says_where_it_came_from_and_one_that_cannot_travel_what_it_was(child: OwnProcess):
+def test_an_error_says_where_it_came_from_and_one_that_cannot_travel_what_it_was(child: WorkerProcess):
     with pytest.raises(ValueError, match="math domain") as caught:
         child(math.sqrt, -1.0)
-    assert "own_process.py" in caught.value.__notes__[0]
+    assert "worker_process.py" in caught.value.__notes__[0]
     with pytest.raises(RuntimeError, match="Homebound: no luggage"):
         child(exec, "class Homebound(Exception): pass\nraise Homebound('no luggage')")
     assert child(math.sqrt, 4.0) == 2.0
 
 
-def test_what_cannot_be_pickled_is_an_error_and_the_next_is_served(child: OwnProcess):
+def test_what_cannot_be_pickled_is_an_error_and_the_next_is_served(child: WorkerProcess):
     with pytest.raises((AttributeError, pickle.PicklingError)):
         child(lambda: 1)
     assert child(math.sqrt, 4.0) == 2.0
 
 
 def test_only_a_process_that_asked_for_it_has_its_work_done_elsewhere():
-    assert elsewhere(os.getpid) == os.getpid()
+    assert run_isolated(os.getpid) == os.getpid()
     program = (
         "import os\n"
-        "from graspd_core.runtime.worker_process import elsewhere, work_elsewhere\n"
+        "from graspd_core.runtime.worker_process import elsewhere, start_worker_process\n"
         "if __name__ == '__main__':\n"
-        "    work_elsewhere()\n"
-        "    work_elsewhere()\n"
+        "    start_worker_process()\n"
+        "    start_worker_process()\n"
         "    print(elsewhere(os.getpid) == elsewhere(os.getpid) != os.getpid())\n"
         "    print(elsewhere(elsewhere, os.getpid) == elsewhere(os.getpid))\n"
     )
@@ -73,25 +73,25 @@ def test_only_a_process_that_asked_for_it_has_its_work_done_elsewhere():
     assert done.stdout.split() == ["True", "True"]
 
 
-def test_when_the_child_is_killed_nothing_is_lost(child: OwnProcess):
+def test_when_the_child_is_killed_nothing_is_lost(child: WorkerProcess):
     first = child(os.getpid)
     os.kill(first, signal.SIGKILL)
     assert child(os.getpid) not in (first, os.getpid())
 
 
-def test_work_that_kills_its_process_does_not_kill_this_one(child: OwnProcess):
+def test_work_that_kills_its_process_does_not_kill_this_one(child: WorkerProcess):
     with pytest.raises(MemoryError, match="_exit: the process that it is done in died twice"):
         child(os._exit, 1)
     assert child(math.sqrt, 4.0) == 2.0
 
 
-def test_ctrl_c_in_the_terminal_leaves_the_child_alone(child: OwnProcess):
+def test_ctrl_c_in_the_terminal_leaves_the_child_alone(child: WorkerProcess):
     first = child(os.getpid)
     os.kill(first, signal.SIGINT)
     assert child(os.getpid) == first
 
 
-def test_an_answer_that_was_not_waited_for_is_not_the_next_ones(child: OwnProcess):
+def test_an_answer_that_was_not_waited_for_is_not_the_next_ones(child: WorkerProcess):
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -109,9 +109,9 @@ def test_an_answer_that_was_not_waited_for_is_not_the_next_ones(child: OwnProces
 def test_the_child_ends_with_its_parent():
     program = (
         "import os, signal, math\n"
-        "from graspd_core.runtime.worker_process import OwnProcess\n"
+        "from graspd_core.runtime.worker_process import WorkerProcess\n"
         "if __name__ == '__main__':\n"
-        "    aside = OwnProcess()\n"
+        "    aside = WorkerProcess()\n"
         "    assert aside(math.sqrt, 4.0) == 2.0\n"
         "    print(aside._process.pid, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from graspd_core.mesh.mesh_files import mass_properties
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.obstacles import PADDING, make_neighbours, padded_hull
+from graspd_core.scene.obstacles import PADDING, make_obstacles, padded_hull
 from graspd_core.types import Plane
 
 TARGET = make_shape("box")
@@ -25,7 +25,7 @@ def face(x: float, low: float) -> np.ndarray:
 
 
 def test_a_face_is_carried_down_to_the_table_and_stays_thin():
-    (neighbour,) = make_neighbours([face(0.15, 0.0)], TABLE, TARGET, 0.3)
+    (neighbour,) = make_obstacles([face(0.15, 0.0)], TABLE, TARGET, 0.3)
     low, high = neighbour.mesh.vertices.min(0), neighbour.mesh.vertices.max(0)
     # The skin reaches as far along every axis.
     assert low == pytest.approx([0.15 - PADDING, -0.05 - PADDING, -0.045 - PADDING])
@@ -35,7 +35,7 @@ def test_a_face_is_carried_down_to_the_table_and_stays_thin():
 
 
 def test_the_distance_is_that_of_the_hull():
-    (neighbour,) = make_neighbours([face(0.15, 0.0)], TABLE, TARGET, 0.3)
+    (neighbour,) = make_obstacles([face(0.15, 0.0)], TABLE, TARGET, 0.3)
     x = torch.tensor([[0.15, 0.0, 0.05], [0.15, 0.0, -0.02], [0.1, 0.0, 0.05], [0.2, 0.0, 0.05]])
     distance = sample_sdf(neighbour.sdf, x)[0].numpy()
     # Outside the grid is exact but for the blur of its cells; a slab of 10 mm between cells of 6 mm is less deep in it.
@@ -46,20 +46,20 @@ def test_the_distance_is_that_of_the_hull():
 
 def test_things_out_of_reach_and_specks_are_left_out():
     # The box's side is at 30 mm.
-    assert len(make_neighbours([face(0.15, 0.0), face(0.35, 0.0)], TABLE, TARGET, 0.2)) == 1
-    assert make_neighbours([face(0.15, 0.0)], TABLE, TARGET, 0.119) == ()
-    assert len(make_neighbours([face(0.15, 0.0)], TABLE, TARGET, 0.125)) == 1
+    assert len(make_obstacles([face(0.15, 0.0), face(0.35, 0.0)], TABLE, TARGET, 0.2)) == 1
+    assert make_obstacles([face(0.15, 0.0)], TABLE, TARGET, 0.119) == ()
+    assert len(make_obstacles([face(0.15, 0.0)], TABLE, TARGET, 0.125)) == 1
     holes = np.full((400, 3), np.nan)
     holes[:9] = face(0.15, 0.0)[:9]
-    assert make_neighbours([holes, np.zeros((0, 3))], TABLE, TARGET, 1.0) == ()
-    assert make_neighbours([], None, TARGET, 1.0) == ()
+    assert make_obstacles([holes, np.zeros((0, 3))], TABLE, TARGET, 1.0) == ()
+    assert make_obstacles([], None, TARGET, 1.0) == ()
 
 
 @pytest.mark.parametrize("support", [TABLE, None])
 def test_a_tray_about_the_object_leaves_it_room(support):
     turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 120), (-0.04, -0.02, 0.0))
     ring = np.column_stack([0.12 * np.cos(turn.ravel()), 0.12 * np.sin(turn.ravel()), height.ravel()])
-    found = make_neighbours([ring], support, TARGET, 0.3)
+    found = make_obstacles([ring], support, TARGET, 0.3)
     distance = np.stack([sample_sdf(n.sdf, torch.as_tensor(TARGET.vertices).float())[0].numpy() for n in found])
     assert distance.min() > 0.02
     # Each of its points is still in the way.

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from graspd_core.config import SegmentConfig
+from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import SHAPES, make_shape
@@ -26,7 +26,7 @@ from graspd_core.types import TriangleMesh
 # As a D415 with half its pixels each way.
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 POSE = ring_poses(1, elevation=0.7, azimuth=0.4)[0]
-THREE = tabletop("box", neighbours=[("cylinder", 0.02, 0.14), ("mug", -0.02, -0.15)])
+THREE = tabletop("box", obstacles=[("cylinder", 0.02, 0.14), ("mug", -0.02, -0.15)])
 
 
 def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> TriangleMesh:
@@ -73,7 +73,7 @@ def test_the_object_is_cut_out_of_a_table_scene(shape):
         clear = view.points[(label == 0) & (view.points[:, 2] > 0.008)]
         clear = clear[surface_distance(make_surface(scene.truth), clear) < 0.005]
         assert share_found(found, clear) > (0.98 if level == "none" else 0.95)
-        assert not found.neighbours
+        assert not found.obstacles
         assert not found.warnings
 
 
@@ -94,9 +94,9 @@ def test_the_one_that_was_asked_for_is_picked(kind, wanted):
     assert share_near(found.views[0].points, mesh, 0.009) > 0.99
     assert share_found(found, view.points[(label == wanted) & (view.points[:, 2] > 0.01)]) > 0.9
     others = [THREE.meshes[k] for k in range(3) if k != wanted]
-    assert len(found.neighbours) == 2
+    assert len(found.obstacles) == 2
     for other in others:
-        assert max(share_near(points, other, 0.009) for points in found.neighbours) > 0.95
+        assert max(share_near(points, other, 0.009) for points in found.obstacles) > 0.95
 
 
 @settings(max_examples=8)
@@ -125,7 +125,7 @@ def test_an_object_alone_passes_unharmed(shape):
             view, _ = seen([mesh], look_at(0.4 * np.array(direction) / np.linalg.norm(direction), (0, 0, 0)), noise)
             found = segment([view])
             assert found.support is None
-            assert (found.neighbours, found.warnings) == ((), ())
+            assert (found.obstacles, found.warnings) == ((), ())
             assert len(found.views[0].points) > least * len(view.points)
 
 
@@ -159,30 +159,30 @@ def test_before_a_wall_without_a_table_nothing_supports_it():
     assert share_found(found, view.points[label == 0]) > 0.98
     assert share_near(found.views[0].points, mug, 1e-3) == 1
     assert "no support" in found.warnings[0]
-    assert len(found.neighbours) == 1
+    assert len(found.obstacles) == 1
 
 
 @pytest.mark.parametrize(("gap", "level"), [(0.008, "none"), (0.012, "default"), (0.012, "high")])
 def test_neighbours_with_a_gap_are_not_merged(gap, level):
-    scene = tabletop("box", neighbours=[("box", 0.06 + gap, 0.0)])
+    scene = tabletop("box", obstacles=[("box", 0.06 + gap, 0.0)])
     camera = PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5)
     view = views_of(scene, camera, ring_poses(1, elevation=0.6, azimuth=-1.2), LEVELS[level])[0]
     found = segment([view], target=Target(point=np.array([0.0, 0.0, 0.05])))
     assert share_near(found.views[0].points, scene.truth, 0.009) > 0.98
-    assert len(found.neighbours) == 1
+    assert len(found.obstacles) == 1
 
 
 @pytest.mark.parametrize("kind", ["mask", "box"])
 def test_a_mask_or_box_parts_two_that_touch(kind):
-    scene = tabletop("box", neighbours=[("box", 0.06, 0.0)])
+    scene = tabletop("box", obstacles=[("box", 0.06, 0.0)])
     view, label = seen(scene.meshes, ring_poses(1, elevation=0.6, azimuth=-1.2)[0])
     mesh = scene.truth
     target = Target(mask=label == 0) if kind == "mask" else Target(box=(mesh.vertices.min(0), mesh.vertices.max(0)))
     found = segment([view], target=target)
     # The voxels at the seam hold points of both.
     assert share_near(found.views[0].points, scene.truth, 1e-3) > 0.97
-    assert len(found.neighbours) == 1
-    assert share_near(found.neighbours[0], scene.neighbours[0], 2e-3) > 0.95
+    assert len(found.obstacles) == 1
+    assert share_near(found.obstacles[0], scene.obstacles[0], 2e-3) > 0.95
 
 
 def test_a_cup_is_one_thing_though_its_near_wall_hides_how_it_goes_on():
@@ -192,17 +192,17 @@ def test_a_cup_is_one_thing_though_its_near_wall_hides_how_it_goes_on():
         found = segment([view])
         clear = (label == 0) & (view.points[:, 2] > 0.005)
         assert share_found(found, view.points[clear]) > 0.98, elevation
-        assert not found.neighbours
+        assert not found.obstacles
 
 
 # From where the box's foot is seen; behind the bowl (3.0) nothing tells it from the bowl's own far side.
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.0])
 def test_a_bowl_that_overhangs_its_foot_does_not_join_what_is_beside_it(turn):
-    scene = tabletop("bowl", neighbours=[("box", 0.115, 0.0)])
+    scene = tabletop("bowl", obstacles=[("box", 0.115, 0.0)])
     view, _ = seen(scene.meshes, ring_poses(1, elevation=0.9, azimuth=turn)[0], LEVELS["default"])
     found = segment([view], target=Target(point=np.array([0.0, 0.0, 0.01])))
     assert share_near(found.views[0].points, scene.truth, 0.009) > 0.99
-    assert len(found.neighbours) == 1
+    assert len(found.obstacles) == 1
 
 
 def test_flying_pixels_are_left_out():
@@ -234,13 +234,13 @@ def test_every_view_keeps_its_camera_and_those_that_do_not_show_it_are_left_out(
 def test_a_workspace_hides_what_is_outside():
     view, _ = seen(THREE.meshes)
     with pytest.raises(NoObjectError, match="nothing on it that is higher than 4 mm"):
-        segment([view], settings=SegmentConfig(roi_high=(1.0, 1.0, 0.006)))
-    found = segment([view], settings=SegmentConfig(roi_low=(-1.0, 0.09, -1.0), roi_high=(1.0, 0.3, 1.0)))
-    assert share_near(found.views[0].points, THREE.neighbours[0], 1e-3) > 0.99
-    half = segment([view], settings=SegmentConfig(roi_low=(-1.0, -0.1, -1.0), roi_high=(1.0, 0.0, 1.0)))
+        segment([view], settings=SegmentationConfig(roi_high=(1.0, 1.0, 0.006)))
+    found = segment([view], settings=SegmentationConfig(roi_low=(-1.0, 0.09, -1.0), roi_high=(1.0, 0.3, 1.0)))
+    assert share_near(found.views[0].points, THREE.obstacles[0], 1e-3) > 0.99
+    half = segment([view], settings=SegmentationConfig(roi_low=(-1.0, -0.1, -1.0), roi_high=(1.0, 0.0, 1.0)))
     assert any("border of the workspace" in warning for warning in half.warnings)
     with pytest.raises(CloudError, match=r"only 0 of \d+ points are within 0.1 m of the camera; at least 50"):
-        segment([view], settings=SegmentConfig(max_range=0.1))
+        segment([view], settings=SegmentationConfig(max_range=0.1))
 
 
 def test_an_empty_table_says_what_was_seen():
@@ -268,7 +268,7 @@ def test_nothing_at_the_target_lists_what_there_is(target, complaint):
 def test_what_is_too_large_to_be_grasped_is_told_as_that():
     view, _ = seen(THREE.meshes)
     with pytest.raises(NoObjectError, match=r"3 things are seen, .* each is larger than largest_object=0.03 m"):
-        segment([view], settings=SegmentConfig(largest_object=0.03))
+        segment([view], settings=SegmentationConfig(largest_object=0.03))
 
 
 @pytest.mark.parametrize("blind", [np.zeros((0, 3)), np.full((40, 3), np.nan)], ids=["empty", "all NaN"])

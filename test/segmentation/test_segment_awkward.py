@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from graspd_core.bench.stress.awkward_scenes import beside_a_step, half_out_of_view, zero_filled
-from graspd_core.config import SegmentConfig
+from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.point_cloud import PointCloud, measured
-from graspd_core.pointcloud.voxel_downsample import thin_scene
+from graspd_core.pointcloud.voxel_downsample import voxel_downsample
 from graspd_core.reconstruction.reconstruct import _clean
 from graspd_core.rendering.depth_noise import NONE
 from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core.segmentation import support_plane as support
-from graspd_core.segmentation.occlusion_merge import join_pieces
+from graspd_core.segmentation.occlusion_merge import merge_occluded
 from graspd_core.segmentation.planes import find_planes
 from graspd_core.segmentation.segment import segment
 from graspd_core.segmentation.target_selection import Target
@@ -92,7 +92,7 @@ def test_a_view_that_shows_nothing_is_told():
 
 
 def test_what_is_too_large_is_said_to_be_so_and_a_box_says_which_part_is_meant():
-    small = SegmentConfig(largest_object=0.03)
+    small = SegmentationConfig(largest_object=0.03)
     with pytest.raises(NoObjectError, match=r"one thing is seen, .*, 0\.1\d m long: larger than .*=0.03 m; a box"):
         segment([view_of_box()], settings=small)
     meant = Target(box=(np.array([-0.03, -0.03, 0.0]), np.array([0.03, 0.03, 0.2])))
@@ -106,8 +106,8 @@ def test_pieces_are_joined_no_further_than_the_largest_object():
     points, label = np.vstack(bars), np.repeat([0, 1, 2], len(step))
     eyes, distance = np.array([[0.15, 0.0, 0.6]]), np.full(len(points), 0.6)
     settings = {"link": 0.006, "support": None}
-    assert join_pieces(points, distance, label, eyes, largest=0.4, **settings).max() == 0
-    assert join_pieces(points, distance, label, eyes, largest=0.25, **settings).max() == 1
+    assert merge_occluded(points, distance, label, eyes, largest=0.4, **settings).max() == 0
+    assert merge_occluded(points, distance, label, eyes, largest=0.25, **settings).max() == 1
 
 
 def test_where_noise_makes_the_look_around_wide_some_points_stand_for_all(monkeypatch: pytest.MonkeyPatch):
@@ -118,7 +118,7 @@ def test_where_noise_makes_the_look_around_wide_some_points_stand_for_all(monkey
     points, eye = np.concatenate([table, board]), np.array([0.0, 0.0, 1.6])
     rays = points - eye
     points += rays * rng.normal(0, 0.003, (len(points), 1)) / np.linalg.norm(rays, axis=1)[:, None]
-    scene = thin_scene([PointCloud(points, eye)], SegmentConfig())
+    scene = voxel_downsample([PointCloud(points, eye)], SegmentationConfig())
     part = find_planes(scene.mean, scene.mean_distance, eye[None], least=0.004, smallest=0.1)[0]
     some = support._covered(scene, part)
     monkeypatch.setattr(support, "ASKED", 1e9)

@@ -143,7 +143,7 @@ def test_table_points_that_bleed_into_the_object_do_no_harm(hand):
 
 
 def test_of_two_touching_objects_the_masked_one_is_taken(hand):
-    stage = tabletop("box", neighbours=[("cylinder", 0.063, 0.0)])
+    stage = tabletop("box", obstacles=[("cylinder", 0.063, 0.0)])
     pose = ring_poses(1, elevation=0.9, azimuth=-1.57)
     ((depth, label),) = depth_views(stage, CAMERA, pose, DEFAULT)
     (view,) = views_of(stage, CAMERA, pose, DEFAULT)
@@ -151,15 +151,15 @@ def test_of_two_touching_objects_the_masked_one_is_taken(hand):
     assert stray(scene, stage) < 0.02
     # The other is in the way: a neighbour covers what the camera saw of it.
     other = view.points[label[depth > 0] == 1]
-    covered = [surface_distance(make_surface(near.mesh), other) < 0.01 for near in scene.neighbours]
+    covered = [surface_distance(make_surface(near.mesh), other) < 0.01 for near in scene.obstacles]
     assert np.any(covered, axis=0).mean() > 0.95
 
 
 def test_two_touching_objects_without_a_hint_are_at_worst_one_thing(hand):
-    stage = tabletop("box", neighbours=[("cylinder", 0.063, 0.0)])
+    stage = tabletop("box", obstacles=[("cylinder", 0.063, 0.0)])
     views = views_of(stage, CAMERA, ring_poses(1, elevation=0.9, azimuth=-1.57), DEFAULT)
     scene = scene_from_views(views)
-    both = np.vstack([stage.truth.vertices, stage.neighbours[0].vertices])
+    both = np.vstack([stage.truth.vertices, stage.obstacles[0].vertices])
     found = scene.object.mesh.vertices
     assert (found.min(0) > both.min(0) - 0.02).all()
     assert (found.max(0) < both.max(0) + 0.02).all()

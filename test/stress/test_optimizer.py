@@ -18,8 +18,8 @@ from graspd_core.methods.candidates import assemble
 from graspd_core.methods.closed_form.closed_form import ClosedForm, pack, unpack
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, Poses, minimise
-from graspd_core.methods.planner import Task, problem_of
-from graspd_core.methods.problem import Problem, evaluate, place
+from graspd_core.methods.planner import PlannerInput, problem_of
+from graspd_core.methods.problem import Problem, evaluate, hand_forward
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
@@ -41,7 +41,7 @@ def scene() -> Scene:
 
 
 def problem(scene: Scene, hand: HandModel, dtype: torch.dtype = torch.float32) -> Problem:
-    return problem_of(Task(scene, hand, 4, 0, PLAN, Hooks(), dtype=dtype))
+    return problem_of(PlannerInput(scene, hand, 4, 0, PLAN, Hooks(), dtype=dtype))
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     assert (sample_sdf(sound.sdf, at)[0] < -0.02).all()
     solution = minimise(ClosedForm(PLAN.closed_form, BATCH), sound, inside, Hooks())
     poses = solution.poses
-    placed = place(sound, sound.fine, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(sound, sound.fine, poses.translation, poses.quaternion, poses.joints)
     depth = -sample_sdf(sound.sdf, placed.points)[0].amin(-1)
     # As deep as starts outside end: a millimetre or two.
     assert (depth < 0.003).all()

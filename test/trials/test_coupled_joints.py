@@ -14,7 +14,7 @@ import pytest
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel, all_joint_positions
-from graspd_core.trials.hold_trial import hold_trial, place_hand, set_joints
+from graspd_core.trials.hold_trial import hold_trial, set_hand_pose, set_joints
 from graspd_core.trials.world import PROTOCOLS, World, build_world
 from graspd_core.types import Grasp, Posture
 
@@ -48,7 +48,7 @@ def errors(hand: HandModel, world: World, data: mujoco.MjData) -> np.ndarray:
 def test_every_link_is_placed_as_kinematics_say(hand, world):
     data = mujoco.MjData(world.model)
     q = 0.3 * hand.lower + 0.7 * hand.upper
-    place_hand(world, data, posture(q))
+    set_hand_pose(world, data, posture(q))
     mujoco.mj_forward(world.model, data)
     for name, rotation, translation in zip(hand.link_names, *link_poses(hand, q), strict=True):
         body = data.body(f"link:{name}")
@@ -64,7 +64,7 @@ def test_only_leaders_have_motors(hand, world):
 
 def test_followers_keep_up_while_the_hand_moves(hand, world):
     data = mujoco.MjData(world.model)
-    place_hand(world, data, posture(hand.open_posture))
+    set_hand_pose(world, data, posture(hand.open_posture))
     worst = np.zeros(len(hand.mimics))
     for step in range(200):
         # As fast as a trial closes.
@@ -78,7 +78,7 @@ def test_followers_keep_up_while_the_hand_moves(hand, world):
 def test_a_load_on_a_follower_is_carried_by_its_leaders_motor(hand, world):
     """Statics: a torque τ on a coupled joint turns up as multiplier · τ at the joint that it follows."""
     data = mujoco.MjData(world.model)
-    place_hand(world, data, posture(hand.closed_posture))
+    set_hand_pose(world, data, posture(hand.closed_posture))
     mimic = hand.mimics[0]
     load = 5.0 if hand.slides[mimic.joint] else 0.3
     data.qfrc_applied[world.model.joint(f"joint:{mimic.name}").dofadr[0]] = load
@@ -92,7 +92,7 @@ def test_a_jaw_that_follows_presses_as_hard(cube):
     world = build_world(hand, cube, (cube.mesh,), STANDARD)
     data = mujoco.MjData(world.model)
     # The cube of 40 mm between the jaws' ends, 110 mm before the mount.
-    place_hand(world, data, Posture(np.array([0.0, 0.0, -0.13]), np.array([1.0, 0, 0, 0]), np.array([0.0202])))
+    set_hand_pose(world, data, Posture(np.array([0.0, 0.0, -0.13]), np.array([1.0, 0, 0, 0]), np.array([0.0202])))
     data.ctrl[:] = 0.01
     mujoco.mj_step(world.model, data, 300)
     pressed = {"left": 0.0, "right": 0.0}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.trials.hold_trial import hold_trial, judge
+from graspd_core.trials.hold_trial import hold_trial, with_trials
 from graspd_core.trials.noisy_trial import displaced, noisy_trial, pose_error
 from graspd_core.trials.world import PROTOCOLS, Protocol, World, build_world
 from graspd_core.types import Posture, Verdict
@@ -30,7 +30,7 @@ def test_a_firm_squeeze_holds(world, closing):
     # 7.5 N on either side against 1 N: it gives by the springs' 1 N / 1000 N/m.
     assert hold.max_displacement < 0.003
     assert hold.max_rotation < np.deg2rad(1)
-    judged = judge(grasp, hold)
+    judged = with_trials(grasp, hold)
     assert (judged.verdict, judged.hold) == (Verdict.VERIFIED, hold)
 
 
@@ -54,7 +54,7 @@ def test_a_push_from_one_side_fails_while_squeezing(world, closing):
     hold = hold_trial(world, closing(0.015, 0.025, (0.04, 0.0)), STANDARD)
     assert not hold.passed
     assert "moved" in hold.reason or "turned" in hold.reason
-    judged = judge(closing(*GOOD), hold)
+    judged = with_trials(closing(*GOOD), hold)
     assert (judged.verdict, judged.reason) == (Verdict.FAILED, hold.reason)
 
 

@@ -14,8 +14,8 @@ import pytest
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.scene import Neighbour
-from graspd_core.trials.hold_trial import hold_trial, judge
+from graspd_core.scene.scene import Obstacle
+from graspd_core.trials.hold_trial import hold_trial, with_trials
 from graspd_core.trials.lift_trial import LiftSettings, lift_trial, retreat_posture
 from graspd_core.trials.world import PROTOCOLS, World, build_world
 from graspd_core.types import HoldResult, LiftResult, Plane, TriangleMesh, Verdict
@@ -29,11 +29,11 @@ GOOD = (0.015, 0.025, (0.04, 0.04))
 CLEAR = -0.052
 
 
-def box(centre: tuple[float, float, float], half: float) -> Neighbour:
+def box(centre: tuple[float, float, float], half: float) -> Obstacle:
     """A fixed cube [m]."""
     unit = make_shape("box")
     mesh = TriangleMesh(unit.vertices / np.array([0.03, 0.03, 0.045]) * half + np.array(centre), unit.faces)
-    return Neighbour(mesh, build_sdf(mesh, resolution=16))
+    return Obstacle(mesh, build_sdf(mesh, resolution=16))
 
 
 @pytest.fixture(scope="module")
@@ -151,13 +151,13 @@ def test_a_lift_can_be_stopped(table, hand, closing):
 def test_a_verdict_needs_both_trials(table, hand, cube, closing):
     held, lifted = HoldResult(True, 0.0, 0.0), LiftResult(True, 0.0, 0.0, 0.0)
     grasp = closing(*GOOD)
-    assert judge(grasp, held).verdict is Verdict.VERIFIED
-    assert judge(grasp, held, lifted).verdict is Verdict.VERIFIED
+    assert with_trials(grasp, held).verdict is Verdict.VERIFIED
+    assert with_trials(grasp, held, lifted).verdict is Verdict.VERIFIED
     # This one holds in free space and reaches through the table.
     hold = hold_trial(build_world(hand, cube, (cube.mesh,), STANDARD), grasp, STANDARD)
     lift = lift_trial(table, hand, grasp, STANDARD)
     assert hold.passed
-    judged = judge(grasp, hold, lift)
+    judged = with_trials(grasp, hold, lift)
     assert (judged.verdict, judged.reason, judged.lift) == (Verdict.FAILED, lift.reason, lift)
     lost = replace(held, passed=False, reason="the object moved")
-    assert judge(grasp, lost, lifted).reason == "the object moved"
+    assert with_trials(grasp, lost, lifted).reason == "the object moved"

@@ -128,17 +128,19 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
 
 
 def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
-    place = {p.name: (p.x[1], p.y[1]) for p in points}
+    place_points = {p.name: (p.x[1], p.y[1]) for p in points}
     for p in points:
-        (x, y), colour, parent = place[p.name], COLOURS[p.method], parent_of(p.name)
-        if parent in place:
-            axis.plot(*zip(place[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2)
+        (x, y), colour, parent = place_points[p.name], COLOURS[p.method], parent_of(p.name)
+        if parent in place_points:
+            axis.plot(
+                *zip(place_points[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2
+            )
         bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
         axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
         filling = "white" if parent else colour
         axis.plot(x, y, MARKERS[p.method], color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
     # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
-    spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
+    spots = np.array([place_points[p.name] for p in points if p.held] or list(place_points.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
     axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
     axis.set_xscale("log")

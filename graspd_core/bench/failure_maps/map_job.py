@@ -15,7 +15,7 @@ from graspd_core.config import PlanConfig, load_preset
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.trials.hold_trial import hold_trial
@@ -116,7 +116,7 @@ def plan(job: Job, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
     """The hand, and the first of the method's own ranking, none filtered by a trial."""
     config = settings(job.preset)
     hand = hand_for(config.closed_form.fine_candidates)
-    found = synthesise(scene, hand, count=job.count, seed=job.seed, config=config, hooks=Hooks())
+    found = find_candidates(scene, hand, count=job.count, seed=job.seed, config=config, hooks=Hooks())
     return hand, found.grasps[: job.count]
 
 

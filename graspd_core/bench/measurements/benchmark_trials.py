@@ -17,7 +17,7 @@ from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
 from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.scene import ObjectModel
-from graspd_core.trials.gravity_trial import drop_trial
+from graspd_core.trials.gravity_trial import gravity_trial
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.noisy_trial import noisy_trial
 from graspd_core.trials.world import PROTOCOLS, build_world
@@ -51,7 +51,7 @@ def _noisy(tried: Tried) -> Trial:
 def _gravity(tried: Tried) -> Trial:
     protocol = PROTOCOLS["standard"]
     world = build_world(tried.hand, tried.target, tried.parts, protocol)
-    return lambda grasp: {"displacement_cm": drop_trial(world, grasp, protocol) * 100}
+    return lambda grasp: {"displacement_cm": gravity_trial(world, grasp, protocol) * 100}
 
 
 def _displacement(tried: Tried) -> Trial:

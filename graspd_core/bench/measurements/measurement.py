@@ -17,7 +17,7 @@ from graspd_core.config import METHODS, PlanConfig
 Kind = Literal["raw", "verified", "pace", "start"]
 
 # Parts of the package that no figure of a cell depends on; of the benchmark itself, one folder counts.
-_BESIDE = ("cli", "bags", "doctor.py", "html.py", "bench")
+_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench")
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def cell_file(cell: Cell) -> str:
 
 
 @lru_cache
-def code_version(bench: str = "cells") -> str:
+def code_version(bench: str = "measurements") -> str:
     """The package's version and a hash of the sources that figures depend on: all but command line, charts and bags.
 
     Of the benchmark itself only the folder `bench` counts.

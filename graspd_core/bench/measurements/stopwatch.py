@@ -11,7 +11,7 @@ from pathlib import Path
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-class Laps:
+class Stopwatch:
     """Seconds by name, added up over all stretches of that name.
 
     CPU seconds are of the whole process (`time.process_time`): on one thread they are what the work took, however busy

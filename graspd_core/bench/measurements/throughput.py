@@ -9,9 +9,9 @@ import time
 from typing import Any
 
 from graspd_core.bench.measurements.measurement import Cell
-from graspd_core.bench.measurements.stopwatch import Laps
+from graspd_core.bench.measurements.stopwatch import Stopwatch
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
 from graspd_core.scene.load_scene import load_scene
 
@@ -38,11 +38,11 @@ def run_pace(cell: Cell) -> dict[str, Any]:
     """
     hand = load_hand(cell.hand, candidates=cell.settings.closed_form.fine_candidates)
     scene = load_scene(cell.source, resolution=cell.settings.resolution)
-    runs: list[Laps] = []
+    runs: list[Stopwatch] = []
     for run in range(_RUNS + 1):
-        laps = Laps()
+        laps = Stopwatch()
         with laps("optimise"):
-            synthesise(scene, hand, count=cell.count, seed=cell.seed + run, config=cell.settings, hooks=Hooks())
+            find_candidates(scene, hand, count=cell.count, seed=cell.seed + run, config=cell.settings, hooks=Hooks())
         runs.append(laps)
     best = min(runs[1:], key=lambda laps: laps.cpu["optimise"])
     return {"cpu": best.cpu, "wall": best.wall, "grasp_steps": grasp_steps(cell)}

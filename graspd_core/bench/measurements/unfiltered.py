@@ -7,24 +7,24 @@ from typing import Any
 
 from graspd_core.bench.measurements.benchmark_trials import TRIALS, Tried
 from graspd_core.bench.measurements.measurement import Cell
-from graspd_core.bench.measurements.stopwatch import Laps
+from graspd_core.bench.measurements.stopwatch import Stopwatch
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import synthesise
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
 from graspd_core.metrics.measure import measure
-from graspd_core.metrics.metrics_context import make_judge
+from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import object_parts
 
 
 def run_raw(cell: Cell) -> dict[str, Any]:
     """Figures of one raw cell. Grasps that a method does not find are missing from the list, and count as failed."""
-    laps = Laps()
+    laps = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.closed_form.fine_candidates)
     with laps("scene"):
         scene = load_scene(cell.source, resolution=cell.settings.resolution)
     with laps("optimise"):
-        found = synthesise(scene, hand, count=cell.count, seed=cell.seed, config=cell.settings, hooks=Hooks())
+        found = find_candidates(scene, hand, count=cell.count, seed=cell.seed, config=cell.settings, hooks=Hooks())
     grasps = found.grasps[: cell.count]
     with laps("parts"):
         tried = Tried(hand, scene.object, object_parts(scene.object))
@@ -40,7 +40,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
             if name == "standard" and first is None and result[name]["passed"]:
                 # The parts are built beside the optimiser in `plan_grasps`: in CPU seconds they count all the same.
                 first = {"cpu": sum(laps.cpu.values()), "wall": sum(laps.wall.values())}
-    judge = make_judge(scene.object, hand)
+    judge = make_metrics_context(scene.object, hand)
     for grasp, result in zip(grasps, results, strict=True):
         with laps("metrics"):
             result["metrics"] = dataclasses.asdict(measure(judge, grasp.grasp))

@@ -37,7 +37,7 @@ def half_out_of_view(shape: str) -> Views:
 
 def black_neighbour(shape: str) -> Views:
     """Beside the object a thing stands that gives no depth, and its place on the table with it."""
-    stage = tabletop(shape, yaw=YAW, neighbours=[("cylinder", 0.13, 0.03)])
+    stage = tabletop(shape, yaw=YAW, obstacles=[("cylinder", 0.13, 0.03)])
     ((depth, label),) = depth_views(stage, CAMERA, POSES[:1], DEFAULT, SEED)
     return [cloud_from_depth(np.where(label == 1, 0.0, depth), CAMERA, POSES[0])]
 
@@ -74,7 +74,7 @@ def zero_filled(shape: str) -> Views:
 
 def unequal_pair() -> Views:
     """A box, and a slab of a third of its height against it."""
-    stage = tabletop("box", neighbours=[(_box((0.08, 0.05, 0.03), (0.0, 0.0, 0.0)), 0.0702, 0.0)])
+    stage = tabletop("box", obstacles=[(_box((0.08, 0.05, 0.03), (0.0, 0.0, 0.0)), 0.0702, 0.0)])
     return views_of(stage, CAMERA, ring_poses(1, elevation=0.9, azimuth=-1.57), DEFAULT, SEED)
 
 
@@ -83,7 +83,7 @@ def _seen(stage: TabletopScene) -> Views:
 
 
 def _with(shape: str, other: TriangleMesh) -> TabletopScene:
-    return replace(tabletop(shape, yaw=YAW), neighbours=(other,))
+    return replace(tabletop(shape, yaw=YAW), obstacles=(other,))
 
 
 def _box(size: tuple[float, float, float], middle: tuple[float, float, float]) -> TriangleMesh:

@@ -37,7 +37,7 @@ _EYE = np.array([0.4, 0.2, 0.4])
 
 Views = Sequence[PointCloud]
 
-_PAIR = tabletop("box", neighbours=[("cylinder", 0.063, 0.0)])
+_PAIR = tabletop("box", obstacles=[("cylinder", 0.063, 0.0)])
 _SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
 
 

@@ -176,10 +176,10 @@ class _Reader(pickle._Unpickler):
 
     def _put(self) -> None:
         """PUT: the one opcode that names a place in the memo by a number of any length."""
-        place = int(self.readline()[:-1])
-        if not _is_plain(place):
+        place_points = int(self.readline()[:-1])
+        if not _is_plain(place_points):
             raise pickle.UnpicklingError("a place in the memo that no file needs")
-        self.memo[place] = self.stack[-1]
+        self.memo[place_points] = self.stack[-1]
 
     dispatch: ClassVar[dict[int, Any]] = {
         code: act for code, act in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES

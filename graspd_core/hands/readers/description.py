@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from graspd_core.config.yaml_text import YamlError, parse_yaml
 from graspd_core.errors import HandError, shown
-from graspd_core.hands.default_postures import guess_palm, guess_postures
+from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
 from graspd_core.hands.readers.mount import is_number, read_mount
@@ -137,14 +137,14 @@ def apply_description(hand: HandModel, description: HandDescription) -> HandMode
     given = {"open": description.open, "closed": description.closed}
     known = {key: _posture(hand, description, key, values) for key, values in given.items() if values is not None}
     if len(known) < len(given):
-        hand = guess_postures(hand, tuple(key for key in given if key not in known))
+        hand = default_postures(hand, tuple(key for key in given if key not in known))
     return replace(hand, **{f"{key}_posture": values for key, values in known.items()})
 
 
 def _with_palm(hand: HandModel, description: HandDescription) -> HandModel:
     center, normal = description.palm_center, description.palm_normal
     if center is None or normal is None:
-        hand = guess_palm(hand)
+        hand = default_palm(hand)
         return hand if description.approach is None else replace(hand, approach=description.approach)
     link = description.palm_link or hand.base_link
     fixed = [name for name, group in zip(hand.link_names, hand.link_group, strict=True) if group == 0]

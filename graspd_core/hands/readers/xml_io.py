@@ -53,10 +53,10 @@ def read_xml(path: Path) -> Element:
 def wrong(path: Path, element: ET.Element, message: str) -> HandError:
     """The error to raise about an element: names the file, the line, and the link or joint that it belongs to."""
     line, owner = getattr(element, "line", 0), getattr(element, "owner", "")
-    place = f"{path}:{line}" if line else f"{path}"
+    place_points = f"{path}:{line}" if line else f"{path}"
     if owner:
         message = f"{owner} {message}" if message.startswith(("is ", "has ")) else f"{owner}: {message}"
-    return HandError(f"{place}: {message}")
+    return HandError(f"{place_points}: {message}")
 
 
 def _decoded(data: bytes) -> str:

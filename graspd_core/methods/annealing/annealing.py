@@ -23,18 +23,17 @@ from torch import Tensor
 
 from graspd_core.config import AnnealingConfig
 from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
-from graspd_core.hands.collision_spheres import proxy_spheres
-from graspd_core.hands.kinematics import place as place_in_base
-from graspd_core.hands.kinematics import placement
+from graspd_core.hands.collision_spheres import collision_spheres
+from graspd_core.hands.kinematics import place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
 from graspd_core.methods.finger_closing import link_gaps, make_closing, sphere_overlap
-from graspd_core.methods.grasp_stages import Touches, find_touches
+from graspd_core.methods.grasp_stages import ContactSet, find_contacts
 from graspd_core.methods.loop import Hooks, Poses, minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.planner import Found, Task, problem_of, starts_of
-from graspd_core.methods.problem import Placed, Problem, place
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of, starts_of
+from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
 from graspd_core.se3 import transform_points
 
 # GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
@@ -143,10 +142,10 @@ class Annealing:
     def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
         """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
         poses = self.poses(x)
-        placed = place(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
+        placed = hand_forward(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
         frames = (placed.link_rotations, placed.link_translations)
-        points = transform_points(placed.rotation, poses.translation, place_in_base(self.contacts, *frames))
-        outward = place_in_base(self.normals, *frames) @ placed.rotation.transpose(-1, -2)
+        points = transform_points(placed.rotation, poses.translation, place_points(self.contacts, *frames))
+        outward = place_points(self.normals, *frames) @ placed.rotation.transpose(-1, -2)
         distance, normal = sample_sdf(problem.sdf, torch.cat([placed.points, points], 1))
         count = len(self.contacts)
         away = 1.0 + (outward * normal[:, -count:]).sum(-1)
@@ -154,7 +153,9 @@ class Annealing:
         legal = (distance.amin(-1) >= 0.0) & self.clear(problem, placed, poses.translation)
         return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
 
-    def clear(self, problem: Problem, placed: Placed, translation: Float[Tensor, "batch 3"]) -> Bool[Tensor, "batch"]:
+    def clear(
+        self, problem: Problem, placed: HandPlacement, translation: Float[Tensor, "batch 3"]
+    ) -> Bool[Tensor, "batch"]:
         """Whether the hand keeps clear of itself and of obstacles."""
         clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
         if problem.obstacles is None:
@@ -181,7 +182,7 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
     links = torch.as_tensor(hand.candidate_link[chosen]).to(problem.coarse.links)
     points, normals = tensor(hand.candidate_points[chosen]), tensor(hand.candidate_normals[chosen])
     stands = Poses(problem.center[None], torch.eye(4).to(problem.lower)[:1], tensor(hand.open_posture)[None])
-    opened = place(problem, problem.coarse, stands.translation, stands.quaternion, stands.joints)
+    opened = hand_forward(problem, problem.coarse, stands.translation, stands.quaternion, stands.joints)
     return Annealing(
         config=config,
         seed=seed,
@@ -193,7 +194,7 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
         upper=problem.upper,
         contacts=placement(hand.num_links, points, links),
         normals=placement(hand.num_links, normals, links, directions=True),
-        sphere_links=torch.as_tensor(proxy_spheres(hand)[2]).to(links),
+        sphere_links=torch.as_tensor(collision_spheres(hand)[2]).to(links),
         self_overlap=_SELF_SLACK + float(sphere_overlap(problem, opened).max()),
     )
 
@@ -218,24 +219,24 @@ def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"])
 
 
 def sampled_epsilon(
-    problem: Problem, touches: Touches, directions: Float[Tensor, "directions 6"]
+    problem: Problem, contact_set: ContactSet, directions: Float[Tensor, "directions 6"]
 ) -> Float[Tensor, "batch"]:
     """Ferrari and Canny's ε for forces that sum to one, with hard contacts: min over directions of max over contacts.
 
     An upper bound of the true radius, because only these directions are looked at; zero without force closure.
     """
-    batch, slots = touches.active.shape
+    batch, slots = contact_set.active.shape
     support = wrench_support(
-        ((touches.position - problem.center) / problem.length).reshape(-1, 1, 3),
-        touches.normal.reshape(-1, 1, 3),
-        touches.active.to(problem.lower).reshape(-1, 1),
+        ((contact_set.position - problem.center) / problem.length).reshape(-1, 1, 3),
+        contact_set.normal.reshape(-1, 1, 3),
+        contact_set.active.to(problem.lower).reshape(-1, 1),
         directions,
         problem.friction,
     )
     return support.reshape(batch, slots, -1).amax(1).amin(-1)
 
 
-def search_annealing(task: Task) -> Found:
+def plan_annealing(task: PlannerInput) -> PlannerOutput:
     """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
     settings, hooks = task.config.annealing, task.hooks
     problem = problem_of(task)
@@ -244,12 +245,12 @@ def search_annealing(task: Task) -> Found:
     annealed = minimise(annealing, problem, starts, hooks)
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
     if annealed.interrupted == "cancelled" or len(legal) == 0:
-        return Found(problem, annealed.poses[legal], annealed.interrupted)
+        return PlannerOutput(problem, annealed.poses[legal], annealed.interrupted)
     # What the deadline cut short is closed all the same: open fingers would be no grasps.
     closing = make_closing(problem, task.hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
-    touches = find_touches(problem, closed.poses, task.config.postures.touch_reach)
+    contact_set = find_contacts(problem, closed.poses, task.config.postures.touch_reach)
     directions = disturbance_directions(settings.directions, task.seed).to(problem.lower)
-    epsilon = sampled_epsilon(problem, touches, directions)
+    epsilon = sampled_epsilon(problem, contact_set, directions)
     kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
-    return Found(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)
+    return PlannerOutput(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)

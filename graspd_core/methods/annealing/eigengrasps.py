@@ -70,18 +70,18 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
     facing = _facing(hand)
     group = hand.link_group[hand.candidate_link]
     rotation, translation = link_poses(hand, hand.open_posture)
-    place = np.einsum("pij,pj->pi", rotation[hand.candidate_link], hand.candidate_points)
-    place += translation[hand.candidate_link]
+    hand_forward = np.einsum("pij,pj->pi", rotation[hand.candidate_link], hand.candidate_points)
+    hand_forward += translation[hand.candidate_link]
     for number in np.unique(group):
         most = float(facing[group == number].max())
         if most < _LEAST_FACING:
             continue
         inside = np.flatnonzero((group == number) & (facing >= min(most, _FACING)))
-        middle = hand.palm_center if number == hand.link_group[0] else place[inside].mean(0)
-        away = np.linalg.norm(place[inside] - middle, axis=1)
+        middle = hand.palm_center if number == hand.link_group[0] else hand_forward[inside].mean(0)
+        away = np.linalg.norm(hand_forward[inside] - middle, axis=1)
         picks = [int(away.argmin())]
         for _ in range(min(per_link, len(inside)) - 1):
-            nearest = np.linalg.norm(place[inside][:, None] - place[inside][picks], axis=-1).min(1)
+            nearest = np.linalg.norm(hand_forward[inside][:, None] - hand_forward[inside][picks], axis=-1).min(1)
             picks.append(int(nearest.argmax()))
         chosen += inside[picks].tolist()
     return np.array(chosen, dtype=np.int64)

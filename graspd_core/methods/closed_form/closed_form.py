@@ -16,7 +16,7 @@ from graspd_core.config import ClosedFormConfig, LossWeights
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.loop import Poses
 from graspd_core.methods.losses import hard_contact, soft_contact
-from graspd_core.methods.problem import Problem, Terms, evaluate, place
+from graspd_core.methods.problem import Problem, Terms, evaluate, hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
 _BETA1, _BETA2, _ADAM_EPSILON = 0.9, 0.98, 1e-8
@@ -147,7 +147,7 @@ class ClosedForm:
 
 def evaluate_distance(problem: Problem, poses: Poses) -> Float[Tensor, "batch"]:
     """Least distance of any contact candidate to the object [m]."""
-    placed = place(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
     return sample_sdf(problem.sdf, placed.points)[0].amin(-1)
 
 

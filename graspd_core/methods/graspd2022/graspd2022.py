@@ -20,7 +20,7 @@ from torch import Tensor
 from graspd_core.config import Graspd2022Config
 from graspd_core.contact.free_body import FreeBody, make_body
 from graspd_core.contact.penalty_forces import contact_forces
-from graspd_core.hands.kinematics import place as place_in_base
+from graspd_core.hands.kinematics import place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods import losses
 from graspd_core.methods.closed_form.closed_form import evaluate_distance, pack, unpack
@@ -29,8 +29,8 @@ from graspd_core.methods.graspd2022.initial_poses_published import published_sta
 from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import Poses, minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.planner import Found, Task, problem_of, starts_of
-from graspd_core.methods.problem import OBSTACLE_MARGIN, PointSet, Problem, place
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of, starts_of
+from graspd_core.methods.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward
 
 # L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
 _ALL_MOTION = 60.0
@@ -185,7 +185,7 @@ class Graspd2022:
         """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
         config, body = self.config, self.body
         poses = unpack(pose)
-        placed = place(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
+        placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
         distance, normals = sample_sdf(problem.sdf, placed.points)
         arms = placed.points - body.center
         velocities = self.velocities
@@ -208,7 +208,7 @@ class Graspd2022:
             left = motion_left(body, supplied, arms, velocities, self.time_step)
             difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
         frames = (placed.link_rotations, placed.link_translations)
-        spheres = place_in_base(problem.sphere_matrix, *frames)
+        spheres = place_points(problem.sphere_matrix, *frames)
         inter = losses.self_collision(spheres, problem.sphere_radii, problem.sphere_weight)
         if problem.obstacles is not None:
             gaps = obstacle_gaps(problem.obstacles, placed.rotation, poses.translation, *frames)
@@ -232,7 +232,7 @@ def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
     return torch.where(finite.view(-1, *[1] * (gradient.dim() - 1)), gradient, torch.zeros_like(gradient))
 
 
-def search_graspd2022(task: Task) -> Found:
+def plan_graspd2022(task: PlannerInput) -> PlannerOutput:
     """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
     settings, thing = task.config.graspd2022, task.scene.object
     problem = problem_of(task)
@@ -245,4 +245,4 @@ def search_graspd2022(task: Task) -> Found:
     solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]
     inside = replace(poses, joints=poses.joints.clamp(problem.lower, problem.upper))
-    return Found(problem, inside, solution.interrupted)
+    return PlannerOutput(problem, inside, solution.interrupted)

@@ -11,7 +11,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.initial_poses import aligning_rotation
 from graspd_core.methods.loop import Poses
-from graspd_core.methods.problem import Problem, place
+from graspd_core.methods.problem import Problem, hand_forward
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle
 
@@ -33,6 +33,6 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
     translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
     joints = torch.as_tensor(hand.open_posture).expand(len(points), -1)
     drawn = Poses(*(x.to(problem.lower) for x in (translation, quaternion_from_rotation(rotation), joints)))
-    placed = place(problem, problem.coarse, drawn.translation, drawn.quaternion, drawn.joints)
+    placed = hand_forward(problem, problem.coarse, drawn.translation, drawn.quaternion, drawn.joints)
     touching = sample_sdf(problem.sdf, placed.points)[0].amin(-1) <= 0
     return drawn[touching.int().argsort(stable=True)[:count]]

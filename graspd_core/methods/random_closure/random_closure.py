@@ -16,7 +16,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.methods.finger_closing import Closing, link_gaps, make_closing
 from graspd_core.methods.loop import Poses, minimise
 from graspd_core.methods.obstacle_distance import hand_reach, obstacle_gaps
-from graspd_core.methods.planner import Found, Task, problem_of
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of
 from graspd_core.methods.problem import Problem
 from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
 
@@ -24,7 +24,7 @@ from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation
 _TOUCHING, _ADVANCES = 0.0003, 60
 
 
-def search_random_closure(task: Task) -> Found:
+def plan_random_closure(task: PlannerInput) -> PlannerOutput:
     """Closed hands from random sides, `count` tries a round until as many touch; a round cut short gives none."""
     settings, hand, count = task.config.random_closure, task.hand, task.count
     problem = problem_of(task)
@@ -41,7 +41,7 @@ def search_random_closure(task: Task) -> Found:
             groups = touching_groups(problem, closing, hand, solution.poses, task.config.postures.touch_reach)
             good = (groups >= least) & clear_of_obstacles(problem, solution.poses)
             kept = join(kept, solution.poses[good])
-    return Found(problem, kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
+    return PlannerOutput(problem, kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
 
 
 def join(a: Poses, b: Poses) -> Poses:

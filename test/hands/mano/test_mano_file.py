@@ -18,7 +18,7 @@ from graspd_core.hands.mano.mano_file import read_mano
 from graspd_core.hands.mano.mano_numbers import numbers
 from graspd_core.hands.mano.mano_pickle import ADMITTED, read_pickle
 
-SYNTHETIC = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "mano_synthetic.py"))
+SYNTHETIC = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "mano_synthetic.py"))
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ from graspd_core.scene.load_scene import load_scene
 from graspd_core.trials.world import PROTOCOLS, build_world
 from graspd_core.types import Posture, Verdict
 
-SYNTHETIC = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "mano_synthetic.py"))
+SYNTHETIC = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "mano_synthetic.py"))
 DOUBLE = torch.float64
 
 

@@ -27,7 +27,7 @@ from graspd_core.transforms import TransformBuffer
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Plane, Posture, Timing
 from graspd_ros.inputs import frames
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DOMAIN = 1 + os.getpid() % 100
 SECOND = 1_000_000_000
 

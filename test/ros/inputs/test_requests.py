@@ -18,9 +18,9 @@ from std_msgs.msg import Header
 from graspd_core.config import preset_names
 from graspd_core.errors import CloudError, GraspdError, NoObjectError, ResourceError, TransformError
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_ros.inputs.request_builder import Intake
+from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES, check_request, pose_matrix, settings_of
-from graspd_ros.inputs.sensor_frames import MOST_VIEWS, Sighting, Views, cloud_sighting, trimmed
+from graspd_ros.inputs.sensor_frames import MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError, code_of, sentence_of
 from graspd_ros.parameters import MOST_GRASPS, Settings
 
@@ -28,12 +28,12 @@ NOW = Time(sec=1000)
 HAND = "allegro_right"
 
 
-def intake(lookup=lambda target, source, stamp: np.eye(4)) -> Intake:
-    return Intake(HAND, lambda: NOW, lookup)
+def intake(lookup=lambda target, source, stamp: np.eye(4)) -> RequestBuilder:
+    return RequestBuilder(HAND, lambda: NOW, lookup)
 
 
-def sighting(points: np.ndarray, frame: str = "camera", stamp: Time = NOW) -> Sighting:
-    return Sighting("cloud", frame, stamp, 1000 * 10**9, lambda: PointCloud(points, np.zeros(3)))
+def sighting(points: np.ndarray, frame: str = "camera", stamp: Time = NOW) -> SensorFrame:
+    return SensorFrame("cloud", frame, stamp, 1000 * 10**9, lambda: PointCloud(points, np.zeros(3)))
 
 
 @pytest.mark.parametrize(("given", "told", "timeless"), [(Time(), NOW, True), (Time(sec=7), Time(sec=7), False)])
@@ -225,7 +225,7 @@ def test_trimming_keeps_points_of_the_workspace_at_most_one_a_voxel(rows, voxel)
 def test_a_cloud_too_large_to_keep_is_refused_wherever_it_comes_from():
     huge = PointCloud2(data=array.array("B", bytes(MOST_CLOUD_BYTES + 1)))
     with pytest.raises(RequestError, match=f"{MOST_CLOUD_BYTES + 1} bytes; at most"):
-        cloud_sighting(huge, 0)
+        cloud_frame(huge, 0)
 
 
 def test_names_that_the_node_makes_up_differ_from_those_before_a_restart(monkeypatch):

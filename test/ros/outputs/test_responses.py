@@ -21,7 +21,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Timing, Verdict
 from graspd_ros.inputs.requests import Request
-from graspd_ros.outputs.responses import Answers
+from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, overdue
 from graspd_ros.worker import Ending, Report
@@ -40,7 +40,7 @@ def load_scene(resolution: int) -> Scene:
     raise MeshError("it ended before it began")
 
 
-class Outlets:
+class Publishers:
     """Keeps what is published."""
 
     def __init__(self) -> None:
@@ -74,8 +74,8 @@ def node() -> Iterator[rclpy.node.Node]:
 
 
 def published(node, report: Report[Planned], listener=None) -> tuple[list, list[str]]:
-    answers: Any = Answers(node, HAND)
-    outlets = answers.outlets = Outlets()
+    answers: Any = Responses(node, HAND)
+    outlets = answers.outlets = Publishers()
     answers.finished(Request("r", "mesh", "object", Time(), Settings(), load_scene, listener=listener), report)
     return outlets.published, outlets.events
 
