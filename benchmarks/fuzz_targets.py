@@ -126,7 +126,7 @@ def _description(path: Path) -> Any:
 
 
 def _preset(path: Path) -> Any:
-    from graspd_core.config import load_preset
+    from graspd_core.methods.plan_config import load_preset
 
     return load_preset(str(path))
 

@@ -32,11 +32,11 @@ def case(model: Path, source: str, betas: list[float], preset: str, seed: int) -
 
     from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
     from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
-    from graspd_core.config import load_preset
     from graspd_core.hands.mano.mano_hand import load_mano
     from graspd_core.mesh.mesh_distance import make_distance_query
     from graspd_core.methods.candidates import find_candidates
     from graspd_core.methods.loop import Hooks
+    from graspd_core.methods.plan_config import load_preset
     from graspd_core.metrics.skin_metrics import measure_skin
     from graspd_core.scene.load_scene import load_scene
     from graspd_core.scene.scene import object_parts
@@ -45,7 +45,7 @@ def case(model: Path, source: str, betas: list[float], preset: str, seed: int) -
 
     torch.set_num_threads(1)
     config = load_preset(preset)
-    mano = load_mano(model, betas, candidates=config.closed_form.fine_candidates)
+    mano = load_mano(model, betas, candidates=config.problem.fine_candidates)
     scene = load_scene(source, resolution=config.resolution)
     began = time.process_time()
     found = find_candidates(scene, mano.model, count=COUNT, seed=seed, config=config, hooks=Hooks())

@@ -69,12 +69,12 @@ def warm_hand(preset: str) -> Any:
     """The hand, after the process has done its first-use work."""
     import torch
 
-    from graspd_core.config import load_preset
     from graspd_core.hands.library import load_hand
+    from graspd_core.methods.plan_config import load_preset
     from graspd_core.planning.plan_grasps import warm_up
 
     torch.set_num_threads(1)
-    hand = load_hand("allegro_right", candidates=load_preset(preset).closed_form.fine_candidates)
+    hand = load_hand("allegro_right", candidates=load_preset(preset).problem.fine_candidates)
     warm_up(hand)
     return hand
 

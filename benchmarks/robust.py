@@ -26,8 +26,8 @@ def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
     """One plan with ranking, split into its costs; what each grasp was ranked by, and what it really holds."""
     import torch
 
-    from graspd_core.config import load_preset
     from graspd_core.hands.library import load_hand
+    from graspd_core.methods.plan_config import load_preset
     from graspd_core.planning.plan_grasps import plan_grasps
     from graspd_core.scene.load_scene import load_scene
     from graspd_core.scene.scene import object_parts
@@ -38,7 +38,7 @@ def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
     torch.set_num_threads(1)
     config = load_preset(PRESET)
     ranked = replace(config, robust=replace(config.robust, rank=True))
-    hand = load_hand("allegro_right", candidates=config.closed_form.fine_candidates)
+    hand = load_hand("allegro_right", candidates=config.problem.fine_candidates)
     scene = load_scene(f"shape:{shape}", resolution=config.resolution, friction=friction)
     # First-use work of libraries belongs to neither run.
     parts = object_parts(scene.object)

@@ -25,10 +25,10 @@ def shape_trials(shape: str, grasps: int, hold_time: float, preset: str = "balan
     from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
     from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
     from graspd_core.bench.bullet.bullet_world import build_bullet_world
-    from graspd_core.config import load_preset
     from graspd_core.hands.library import load_hand
     from graspd_core.methods.candidates import find_candidates
     from graspd_core.methods.loop import Hooks
+    from graspd_core.methods.plan_config import load_preset
     from graspd_core.scene.load_scene import load_scene
     from graspd_core.scene.scene import object_parts
     from graspd_core.trials.displacement_trial import build_frozen_world, displacement_trial
@@ -38,7 +38,7 @@ def shape_trials(shape: str, grasps: int, hold_time: float, preset: str = "balan
 
     torch.set_num_threads(1)
     config = load_preset(preset)
-    hand = load_hand("allegro_right", candidates=config.closed_form.fine_candidates)
+    hand = load_hand("allegro_right", candidates=config.problem.fine_candidates)
     scene = load_scene(f"shape:{shape}", resolution=config.resolution)
     found = find_candidates(scene, hand, count=grasps, seed=SEED, config=config, hooks=Hooks()).grasps[:grasps]
     parts = object_parts(scene.object)

@@ -16,9 +16,9 @@ from pathlib import Path
 from graspd_core.bench.benchmark_workers import run_cells
 from graspd_core.bench.measurements.measurement import Cell, code_version
 from graspd_core.bench.result_store import read_cells
-from graspd_core.bench.suites import find_objects, hand_hash, override
+from graspd_core.bench.suites import find_objects, hand_hash
 from graspd_core.bench.tables import markdown_table
-from graspd_core.config import load_preset
+from graspd_core.methods.plan_config import load_preset, override
 
 HAND, COUNT = "allegro_right", 8
 OBJECTS = ("shape:box", "shape:mug")
@@ -27,7 +27,7 @@ SWEEPS = (
     ("Grasp'D, stiffness [N/m]", "graspd2022_short", "graspd2022.stiffness", (30, 100, 300, 1e3, 3e3, 1e4, 3e4)),
     ("Grasp'D, friction", "graspd2022_short", "graspd2022.friction", (0.02, 0.06, 0.2, 0.8, 2.0, 6.0, 20.0)),
     ("closed form, width [mm]", "balanced", "closed_form.delta_end", (1e-4, 4e-4, 1e-3, 4e-3, 1e-2, 4e-2, 1e-1)),
-    ("closed form, friction", "balanced", "closed_form.friction", (0.02, 0.06, 0.2, 0.4, 2.0, 6.0, 20.0)),
+    ("closed form, friction", "balanced", "problem.friction", (0.02, 0.06, 0.2, 0.4, 2.0, 6.0, 20.0)),
 )
 
 

@@ -14,7 +14,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from graspd_core.config import PlanConfig, load_preset, preset_names
     from graspd_core.formats.grasps_json import grasps_of, load_document, save_result
     from graspd_core.hands.hand_mesh import hand_mesh
     from graspd_core.hands.kinematics import link_poses
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from graspd_core.hands.model import HandModel, Mount, all_joint_names, all_joint_positions
     from graspd_core.mesh.mesh_files import load_mesh, save_mesh
     from graspd_core.mesh.shapes import make_shape
+    from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
     from graspd_core.planning.plan_grasps import check_request, plan_grasps, warm_up
     from graspd_core.pointcloud.camera import PinholeCamera
     from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_in_metres
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from graspd_core.types import Grasp, GraspResult, Outcome, Posture, TriangleMesh, Verdict
 
 _MODULES = {
-    "config": ("PlanConfig", "load_preset", "preset_names"),
+    "methods.plan_config": ("PlanConfig", "load_preset", "preset_names"),
     "formats.grasps_json": ("grasps_of", "load_document", "save_result"),
     "hands.hand_mesh": ("hand_mesh",),
     "hands.kinematics": ("link_poses",),

@@ -12,7 +12,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from graspd_core.config import VERIFICATIONS, load_preset
+from graspd_core import load_preset
+from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_ros.worker import BusyPolicy
 

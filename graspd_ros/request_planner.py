@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
-from graspd_core import HandModel, plan_grasps, save_result
-from graspd_core.config import load_preset
+from graspd_core import HandModel, load_preset, plan_grasps, save_result
 from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
 from graspd_ros.inputs.frames import moved_result
 from graspd_ros.inputs.requests import Request

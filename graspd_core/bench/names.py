@@ -6,12 +6,6 @@ from pathlib import Path
 
 # The first that fits a name tells its parent; a parent has none.
 _ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
-METHOD_NAMES = {
-    "closed_form": "closed form",
-    "graspd2022": "Grasp'D (2022)",
-    "annealing": "annealing",
-    "random_closure": "random closure",
-}
 
 
 def parent_of(name: str) -> str | None:

@@ -10,20 +10,19 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from graspd_core.bench.measurements.benchmark_trials import TRIALS, USUAL
 from graspd_core.bench.measurements.measurement import Cell, Kind
 from graspd_core.bench.names import hand_row
-from graspd_core.config import PlanConfig, load_preset, preset_names
 from graspd_core.errors import ConfigError, MeshError
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
 from graspd_core.mesh.shapes import SHAPES, make_shape
+from graspd_core.methods.plan_config import PlanConfig, load_preset, override, preset_names
+from graspd_core.methods.registry import METHODS
 from graspd_core.paths import config_dir
 
 # Grasps of a raw cell by method: the slow ones are asked for fewer.
-COUNTS: Mapping[str, int] = {"closed_form": 16, "graspd2022": 8, "annealing": 8, "random_closure": 16}
 # Verified grasps that a planned cell asks for, and the batch that pace is taken at.
 VERIFIED, BATCH = 8, 32
 # Grasps of a raw cell by which hands are compared.
@@ -44,8 +43,8 @@ _QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
 # Rungs of the ladder: what is changed, and to what; all else stays at `balanced`.
 LADDER: Mapping[str, Sequence[Mapping[str, int]]] = {
-    "candidates": [{"closed_form.candidates": n} for n in (32, 64, 128, 256, 512)],
-    "directions": [{"closed_form.directions": n} for n in (6, 12, 24, 48, 96)],
+    "candidates": [{"problem.candidates": n} for n in (32, 64, 128, 256, 512)],
+    "directions": [{"problem.directions": n} for n in (6, 12, 24, 48, 96)],
     "resolution": [{"resolution": n} for n in (16, 24, 32, 48, 64)],
     "steps": [
         {f"closed_form.{stage}_steps": round(n * share) for stage, n in _STEPS.items()}
@@ -136,7 +135,7 @@ def ladder_suite(request: Request) -> tuple[Cell, ...]:
     make = _Maker(request)
     base = load_preset(_LADDER_PRESET)
     objects = find_objects(request.objects or (_LADDER_OBJECTS[:2] if request.quick else _LADDER_OBJECTS))
-    count = request.count or (_QUICK_COUNT if request.quick else COUNTS[base.method])
+    count = request.count or (_QUICK_COUNT if request.quick else METHODS[base.method].benchmark_count)
     cells: list[Cell] = []
     for thing in objects:
         for ladder, rungs in LADDER.items():
@@ -168,18 +167,6 @@ SUITES: dict[str, Callable[[Request], tuple[Cell, ...]]] = {
 def rung_name(ladder: str, changes: Mapping[str, int]) -> str:
     """Name of a rung's cells: the ladder and its value (steps: all of them together)."""
     return f"{ladder}={sum(changes.values()):g}"
-
-
-def override(settings: Any, changes: Mapping[str, Any]) -> Any:
-    """Settings with some fields changed, each by its dotted name. Raises ConfigError: there is no such field."""
-    for name, value in changes.items():
-        head, _, rest = name.partition(".")
-        fields = [f.name for f in dataclasses.fields(settings)]
-        if head not in fields:
-            raise ConfigError(f"settings: unknown key {head!r}; valid keys: {', '.join(sorted(fields))}")
-        inner = override(getattr(settings, head), {rest: value}) if rest else value
-        settings = dataclasses.replace(settings, **{head: inner})
-    return settings
 
 
 def all_shapes() -> tuple[str, ...]:
@@ -216,7 +203,7 @@ def _file(path: Path) -> Object:
 
 
 def _count(request: Request, config: PlanConfig) -> int:
-    return request.count or (_QUICK_COUNT if request.quick else COUNTS[config.method])
+    return request.count or (_QUICK_COUNT if request.quick else METHODS[config.method].benchmark_count)
 
 
 class _Maker:

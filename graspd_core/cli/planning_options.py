@@ -7,8 +7,10 @@ import dataclasses
 from typing import Any
 
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
-from graspd_core.config import METHODS, VERIFICATIONS, PlanConfig, load_preset, preset_names
+from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
+from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
+from graspd_core.methods.registry import METHODS
 from graspd_core.types import GraspResult, Outcome, Verdict
 
 
@@ -45,7 +47,7 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     torch.set_num_threads(options.threads)
     config = load_preset(options.preset)
     if options.method:
-        config = dataclasses.replace(config, method=options.method)
+        config = config.with_method(options.method)
     if options.robust:
         config = dataclasses.replace(config, robust=dataclasses.replace(config.robust, rank=True))
     return config, request

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError(f"{options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
     if options.out:
         check_writable(options.out if single else options.out / "probe")
-    hand = load_hand(options.hand, candidates=config.closed_form.fine_candidates)
+    hand = load_hand(options.hand, candidates=config.problem.fine_candidates)
     began, statuses, grasps, interrupted = time.perf_counter(), [], 0, False
     with Interrupt() as interrupt:
         for job in _jobs(options):

@@ -18,7 +18,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.bench.stress.stress_suite import Shelf, cases_of, run_cases
     from graspd_core.bench.stress.stress_table import stress_table, summary
     from graspd_core.bench.tables import fill
-    from graspd_core.config import load_preset
+    from graspd_core.methods.plan_config import load_preset
 
     if len(options.presets) > 1:
         raise ConfigError(f"presets: {', '.join(options.presets)}; the stress suite takes one at a time")

@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
         target=target_of(options),
         alone=options.alone,
     )
-    hand = load_hand(options.hand, candidates=config.closed_form.fine_candidates)
+    hand = load_hand(options.hand, candidates=config.problem.fine_candidates)
     for warning in scene.object.warnings:
         print(f"graspd: {warning}", file=sys.stderr)
     with Reporter() as reporter, Interrupt() as interrupt:

@@ -23,13 +23,17 @@ def from_mapping(cls: type[T], values: Any, where: str = "config") -> T:
     Raises:
         ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
     """
-    hints = typing.get_type_hints(cls)
+    return cls(**coerced(typing.get_type_hints(cls), values, where))
+
+
+def coerced(hints: Mapping[str, Any], values: Any, where: str) -> dict[str, Any]:
+    """The values of a mapping, each as the type that `hints` names for its key. Raises ConfigError: see above."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
     unknown = sorted(map(shown, set(values) - set(hints)))
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]}; valid keys: {', '.join(sorted(hints))}")
-    return cls(**{key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()})
+    return {key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()}
 
 
 def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:

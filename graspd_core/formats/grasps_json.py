@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from graspd_core.config import PlanConfig
 from graspd_core.errors import ConfigError, FormatError, shown
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
+from graspd_core.methods.plan_config import PlanConfig, to_mapping
 from graspd_core.scene.scene import ObjectModel
 from graspd_core.types import Contact, Grasp, GraspMetrics, GraspResult, HoldResult, LiftResult, Posture, Verdict
 
@@ -56,7 +56,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
             "support": result.support
             and {"normal": _list(result.support.normal), "offset": float(result.support.offset)},
         },
-        "config": dataclasses.asdict(config),
+        "config": to_mapping(config),
         "seed": result.seed,
         "method": result.method,
         "versions": _versions(),

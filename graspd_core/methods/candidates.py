@@ -10,11 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.config import PlanConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
-from graspd_core.methods.annealing.annealing import plan_annealing
-from graspd_core.methods.closed_form.closed_form import ClosedForm
 from graspd_core.methods.grasp_stages import (
     ContactSet,
     Squeeze,
@@ -24,17 +21,16 @@ from graspd_core.methods.grasp_stages import (
     self_overlap,
     squeeze,
 )
-from graspd_core.methods.graspd2022.graspd2022 import plan_graspd2022
-from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.loop import Hooks
 from graspd_core.methods.obstacle_distance import intrusion
-from graspd_core.methods.planner import Planner, PlannerInput, PlannerOutput, problem_of, starts_of
+from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.methods.planner import PlannerInput
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-from graspd_core.methods.random_closure.random_closure import plan_random_closure
+from graspd_core.methods.registry import METHODS
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 
-# However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
-_FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 # A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
 _DEEPEST = 0.0015
 # What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
@@ -49,25 +45,6 @@ class Candidates:
     interrupted: str
 
 
-def plan_closed_form(task: PlannerInput) -> PlannerOutput:
-    """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
-    settings = task.config.closed_form
-    problem = problem_of(task)
-    count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
-    starts = starts_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
-    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
-    solution = minimise(solver, problem, starts, task.hooks)
-    return PlannerOutput(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
-
-
-SEARCHES: dict[str, Planner] = {
-    "closed_form": plan_closed_form,
-    "graspd2022": plan_graspd2022,
-    "annealing": plan_annealing,
-    "random_closure": plan_random_closure,
-}
-
-
 def find_candidates(
     scene: Scene,
     hand: HandModel,
@@ -80,7 +57,7 @@ def find_candidates(
     dtype: torch.dtype = torch.float32,
 ) -> Candidates:
     """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless."""
-    found = SEARCHES[config.method](PlannerInput(scene, hand, count, seed, config, hooks, device, dtype))
+    found = METHODS[config.method].plan(PlannerInput(scene, hand, count, seed, config, hooks, device, dtype))
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
     return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)
@@ -95,10 +72,10 @@ def assemble(
     How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
     to its pregrasp is refused by a trial before its first step.
     """
-    contact_set = find_contacts(problem, poses, config.postures.touch_reach)
+    contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.lower)
-    pressed = squeeze(problem, poses, contact_set, effort, config.postures)
-    opened, clearance = find_pregrasp(problem, poses, config.postures, stop)
+    pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
+    opened, clearance = find_pregrasp(problem, poses, config.grasp_stages, stop)
     adjacent = torch.as_tensor(hand.adjacent, device=problem.lower.device)
     overlap = self_overlap(problem, poses.joints, adjacent)
     if any(primitive.kind == "hull" for primitive in hand.primitives):

@@ -20,7 +20,7 @@ from graspd_core.hands.collision_tensors import solid_distance
 from graspd_core.hands.kinematics import place_points
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.loop import Poses
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
 
 # A finger whose step is halved to this share has arrived; steps are full travels of the closing over `close_steps`.

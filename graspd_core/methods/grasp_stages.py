@@ -19,8 +19,8 @@ from graspd_core.hands.collision_tensors import pair_distance, solid_distance
 from graspd_core.hands.kinematics import forward, place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods import losses
-from graspd_core.methods.loop import Poses
 from graspd_core.methods.obstacle_distance import RETREAT, RETREAT_SHARES, ObstacleTensors, obstacle_gaps
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import OBSTACLE_MARGIN, HandPlacement, Problem, hand_forward
 from graspd_core.se3 import rotation_from_quaternion, transform_points
 

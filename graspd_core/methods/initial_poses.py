@@ -12,8 +12,8 @@ from torch import Tensor
 from graspd_core.hands.kinematics import forward, link_poses, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.methods.loop import Poses
 from graspd_core.methods.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import fingertip_groups
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle

@@ -11,26 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-
-
-@dataclass(frozen=True)
-class Poses:
-    """A batch of hand poses on the problem's device.
-
-    Attributes:
-        translation: base origin in the object frame [m].
-        quaternion: base orientation, wxyz, any non-zero length.
-        joints: [rad].
-    """
-
-    translation: Float[Tensor, "batch 3"]
-    quaternion: Float[Tensor, "batch 4"]
-    joints: Float[Tensor, "batch joints"]
-
-    def __getitem__(self, rows: Tensor) -> Poses:
-        return Poses(self.translation[rows], self.quaternion[rows], self.joints[rows])
-
 
 S = TypeVar("S")
 

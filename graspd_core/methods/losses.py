@@ -31,7 +31,9 @@ def hard_contact(
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
-def task(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Float[Tensor, "batch"]:
+def wrench_resistance(
+    support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0
+) -> Float[Tensor, "batch"]:
     """Soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst disturbance is resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()
     count = support.shape[-1]

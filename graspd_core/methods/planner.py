@@ -1,27 +1,27 @@
-"""What every search for poses shares: its task, its result, the starts, and the problem that results are ranked in."""
+"""What every method shares: its input and output, the initial poses, and the problem that results are ranked in."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 
-from graspd_core.config import PlanConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, Poses
+from graspd_core.methods.loop import Hooks
+from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem, build_problem
 from graspd_core.scene.scene import Scene
 
 
 @dataclass(frozen=True)
 class PlannerOutput:
-    """What a search ended with.
+    """What a method ended with.
 
     Attributes:
         problem: scene and hand as tensors, in whose terms the poses are made into grasps.
-        poses: hand poses that the search believes in, at most a few times as many as asked for, in any order.
+        poses: hand poses that the method found, at most a few times as many as asked for, in any order.
         interrupted: why it ended early: "", "cancelled" or "deadline".
     """
 
@@ -32,13 +32,13 @@ class PlannerOutput:
 
 @dataclass(frozen=True)
 class PlannerInput:
-    """What is searched for, and with what means.
+    """What a method is asked for.
 
     Attributes:
         scene, hand: what is to be grasped by what.
         count: grasps asked for.
         seed: of everything that is drawn.
-        config: settings of all methods.
+        config: settings of the run.
         hooks: how the run is followed and ended.
         device, dtype: of the tensors.
     """
@@ -53,13 +53,9 @@ class PlannerInput:
     dtype: torch.dtype = torch.float32
 
 
-# How poses are found; one for every `config.Method`. Numerical trouble is a pose that is not there, never an exception.
-Planner = Callable[[PlannerInput], PlannerOutput]
-
-
 def problem_of(task: PlannerInput) -> Problem:
-    """The problem by the closed form's settings, in which every method's poses are made into grasps and ranked."""
-    settings = task.config.closed_form
+    """The problem in which every method's poses are made into grasps and ranked."""
+    settings = task.config.problem
     return build_problem(
         task.scene,
         task.hand,
@@ -74,6 +70,6 @@ def problem_of(task: PlannerInput) -> Problem:
     )
 
 
-def starts_of(task: PlannerInput, count: int) -> Poses:
-    """`count` seeded starts on the object's hull."""
+def initial_poses_of(task: PlannerInput, count: int) -> Poses:
+    """`count` seeded poses on the object's hull."""
     return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype)

@@ -108,12 +108,12 @@ class Problem:
 
 
 class Terms(NamedTuple):
-    """Loss terms of a batch of starts, unweighted; the fields are those of `config.LossWeights`.
+    """Loss terms of a batch of starts, unweighted; the fields are those of `LossWeights`.
 
     `obstacle` is None where the scene has none.
     """
 
-    task: Float[Tensor, "batch"]
+    wrench_resistance: Float[Tensor, "batch"]
     distance: Float[Tensor, "batch"]
     penetration: Float[Tensor, "batch"]
     self_collision: Float[Tensor, "batch"]
@@ -312,10 +312,21 @@ def evaluate(
         gaps = obstacle_gaps(problem.obstacles, placed.rotation, translation, *frames)
         obstacle = losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
     return Terms(
-        task=losses.task(support, problem.friction),
+        wrench_resistance=losses.wrench_resistance(support, problem.friction),
         distance=losses.touch(gap, torch.full_like(problem.reach, _REACH_WHEN_FINE) if fine else problem.reach),
         penetration=sunk,
         self_collision=losses.self_collision(spheres, problem.sphere_radii, problem.sphere_weight),
         posture=losses.posture(joints, problem.lower, problem.upper),
         obstacle=obstacle,
     )
+
+
+def least_distance(
+    problem: Problem,
+    translation: Float[Tensor, "batch 3"],
+    quaternion: Float[Tensor, "batch 4"],
+    joints: Float[Tensor, "batch joints"],
+) -> Float[Tensor, "batch"]:
+    """Least distance of any coarse contact candidate to the object [m]."""
+    placed = hand_forward(problem, problem.coarse, translation, quaternion, joints)
+    return sample_sdf(problem.sdf, placed.points)[0].amin(-1)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from graspd_core.config import VERIFICATIONS, PlanConfig, load_preset
+from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
@@ -16,6 +16,7 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.feasibility import out_of_reach
 from graspd_core.methods.loop import Hooks
+from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.planning.memory_errors import enough_memory

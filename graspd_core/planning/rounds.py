@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from graspd_core.config import PlanConfig
-from graspd_core.methods.budget import at_budget
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.scene.scene import Scene
 
 
@@ -18,4 +17,4 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     first = rounds.first_budget if cheap else 1.0
     most = rounds.first_budget * rounds.growth ** (rounds.most - 1)
     efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
-    return [at_budget(config, effort) for effort in efforts]
+    return [config.at_budget(effort) for effort in efforts]

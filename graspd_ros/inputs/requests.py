@@ -14,8 +14,7 @@ from geometry_msgs.msg import Pose
 from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
 from jaxtyping import Float
 
-from graspd_core import Scene
-from graspd_core.config import preset_names
+from graspd_core import Scene, preset_names
 from graspd_ros.inputs.frames import matrix_of_pose
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings

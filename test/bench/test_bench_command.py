@@ -18,7 +18,7 @@ from graspd_core.bench.measurements.measurement import Cell
 from graspd_core.bench.result_store import read_results
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
-from graspd_core.config import PlanConfig
+from graspd_core.methods.plan_config import PlanConfig
 
 GRASPD = [sys.executable, "-m", "graspd_core.cli", "bench"]
 # Two cells of a few seconds, whose method does next to nothing.

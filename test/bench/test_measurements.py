@@ -11,12 +11,13 @@ import pytest
 
 from graspd_core.bench import result_store as store
 from graspd_core.bench.measurements import run_measurement as run
-from graspd_core.bench.measurements.measurement import Cell, cell_file, cell_key, code_version, settings_of
-from graspd_core.bench.suites import SUITES, Request, cells_of, find_objects, override
-from graspd_core.config import PlanConfig, load_preset
+from graspd_core.bench.measurements.measurement import Cell, cell_file, cell_key, code_version
+from graspd_core.bench.suites import SUITES, Request, cells_of, find_objects
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
+from graspd_core.methods.plan_config import PlanConfig, load_preset, override
+from graspd_core.methods.registry import METHODS
 from graspd_core.types import TriangleMesh
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "f00", "allegro_right", "f11", 0, 4, ("standard", "hard"))
@@ -33,7 +34,7 @@ CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "f00", "allegro_right"
         {"count": 5},
         {"trials": ("standard",)},
         {"settings": PlanConfig(resolution=32)},
-        {"settings": override(PlanConfig(), {"closed_form.weights.task": 2.0})},
+        {"settings": override(PlanConfig(), {"closed_form.weights.wrench_resistance": 2.0})},
     ],
     ids=lambda changes: ", ".join(changes),
 )
@@ -44,11 +45,9 @@ def test_the_key_tells_cells_apart_that_ask_for_different_things(changes: dict[s
 
 
 def test_the_key_does_not_depend_on_what_is_not_looked_at():
-    other_method = override(PlanConfig(), {"graspd2022.steps": 3})
-    assert cell_key(replace(CELL, settings=other_method)) == cell_key(CELL)
     assert cell_key(replace(CELL, trials=("hard", "standard"))) == cell_key(CELL)
     assert cell_key(replace(CELL, source="elsewhere/box.obj")) == cell_key(CELL)
-    assert "graspd2022" in settings_of(override(PlanConfig(), {"method": "graspd2022"}))
+    assert set(to_mapping(override(PlanConfig(), {"method": "graspd2022"}))) & set(METHODS) == {"graspd2022"}
 
 
 def test_a_file_name_is_for_the_eye_and_safe():
@@ -156,6 +155,6 @@ def test_objects_are_shapes_files_and_folders(tmp_path: Path):
 
 
 def test_an_override_names_what_it_does_not_know():
-    assert override(PlanConfig(), {"closed_form.candidates": 7, "resolution": 9}).closed_form.candidates == 7
-    with pytest.raises(ConfigError, match="unknown key 'speed'; valid keys: annealing"):
+    assert override(PlanConfig(), {"problem.candidates": 7, "resolution": 9}).problem.candidates == 7
+    with pytest.raises(ConfigError, match="unknown key 'speed'; valid keys: closed_form"):
         override(PlanConfig(), {"speed": 1})

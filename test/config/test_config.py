@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.config import LossWeights, PlanConfig, SegmentationConfig, from_mapping, load_preset, preset_names
+from graspd_core.config import SegmentationConfig, from_mapping
 from graspd_core.errors import ConfigError
+from graspd_core.methods.closed_form.closed_form_config import LossWeights
+from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -21,7 +23,7 @@ def test_the_balanced_preset_is_the_default():
 
 
 def test_presets_differ_in_effort():
-    fast, balanced, accurate = (load_preset(name).closed_form for name in ("fast", "balanced", "accurate"))
+    fast, balanced, accurate = (load_preset(name).settings for name in ("fast", "balanced", "accurate"))
     steps = [
         c.starts_per_grasp * (c.explore_steps + c.refine_steps + c.polish_steps) for c in (fast, balanced, accurate)
     ]
@@ -30,17 +32,17 @@ def test_presets_differ_in_effort():
 
 def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
     path = tmp_path / "mine.yaml"
-    path.write_text("resolution: 32\nclosed_form:\n  delta_end: 1\n  weights: {task: 2.5}\n")
+    path.write_text("resolution: 32\nclosed_form:\n  delta_end: 1\n  weights: {wrench_resistance: 2.5}\n")
     config = load_preset(str(path))
     assert config.resolution == 32
-    assert config.closed_form.weights == dataclasses.replace(PlanConfig().closed_form.weights, task=2.5)
-    assert isinstance(config.closed_form.delta_end, float)
-    assert config.postures == PlanConfig().postures
+    assert config.settings.weights == dataclasses.replace(PlanConfig().settings.weights, wrench_resistance=2.5)
+    assert isinstance(config.settings.delta_end, float)
+    assert config.grasp_stages == PlanConfig().grasp_stages
 
 
 def test_a_mapping_of_a_config_makes_that_config_again():
     config = dataclasses.replace(PlanConfig(), resolution=24)
-    assert from_mapping(PlanConfig, dataclasses.asdict(config)) == config
+    assert plan_config(to_mapping(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -48,14 +50,14 @@ def test_a_mapping_of_a_config_makes_that_config_again():
     [
         ("resolutoin: 32", ["'resolutoin'", "resolution", "closed_form"]),
         ("closed_form: {delta: 1.0}", ["closed_form", "'delta'", "delta_start"]),
-        ("closed_form: {weights: {tusk: 1.0}}", ["closed_form.weights", "'tusk'", "task"]),
+        ("closed_form: {weights: {tusk: 1.0}}", ["closed_form.weights", "'tusk'", "wrench_resistance"]),
         ("resolution: fine", ["resolution", "expected int", "'fine'"]),
         ("resolution: 32.5", ["resolution", "expected int", "32.5"]),
         ("resolution: true", ["resolution", "expected int", "True"]),
         ("closed_form: {delta_end: '0.01'}", ["closed_form.delta_end", "expected float"]),
         ("closed_form: {delta_end: .nan}", ["closed_form.delta_end", "nan", "finite"]),
-        ("postures: {grip_force: -.inf}", ["postures.grip_force", "inf", "finite"]),
-        ("postures: {open_steps: -1}", ["postures.open_steps", "-1", "zero or more"]),
+        ("grasp_stages: {grip_force: -.inf}", ["grasp_stages.grip_force", "inf", "finite"]),
+        ("grasp_stages: {open_steps: -1}", ["grasp_stages.open_steps", "-1", "zero or more"]),
         ("closed_form: 3", ["closed_form", "mapping", "3"]),
         ("[1, 2]", ["mapping", "[1, 2]"]),
         ("method: magic", ["method", "'magic'", "closed_form"]),
@@ -106,6 +108,6 @@ def test_a_place_that_is_none_is_named(value: object, complaint: str):
 
 
 def test_every_setting_is_explained():
-    for cls in (PlanConfig, LossWeights, type(PlanConfig().closed_form), type(PlanConfig().postures)):
+    for cls in (PlanConfig, LossWeights, type(PlanConfig().settings), type(PlanConfig().grasp_stages)):
         for setting in dataclasses.fields(cls):
             assert f"        {setting.name}: " in (cls.__doc__ or ""), f"{cls.__name__}.{setting.name}"

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.config import PlanConfig
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.formats.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mount
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import (
     Contact,

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.config import PlanConfig, from_mapping
 from graspd_core.errors import CloudError, ConfigError, FormatError
 from graspd_core.formats.grasps_json import grasps_of
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.pointcloud.cloud_files import load_views
 from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
 
@@ -50,7 +50,7 @@ def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     return value
 
 
-DEFAULTS = json.loads(json.dumps(dataclasses.asdict(PlanConfig())))
+DEFAULTS = json.loads(json.dumps(to_mapping(PlanConfig())))
 
 
 @settings(max_examples=60 * LONGER, derandomize=LONGER == 1)
@@ -59,7 +59,7 @@ def test_a_setting_is_taken_as_it_is_or_refused_by_its_name(fuzz: ModuleType, da
     place = data.draw(st.sampled_from(places(DEFAULTS)), label="place")
     value = data.draw(values, label="value")
     changed = replaced(DEFAULTS, place, value)
-    config, refusal = fuzz.outcome(lambda: from_mapping(PlanConfig, changed), ConfigError)
+    config, refusal = fuzz.outcome(lambda: plan_config(changed), ConfigError)
     if refusal is not None:
         assert refusal.startswith(".".join(["config", *map(str, place)])[:12])
     # A mapping may leave out what has a default.

@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from graspd_core.config import METHODS, ClosedFormConfig, LossWeights, load_preset
-from graspd_core.methods.candidates import SEARCHES
-from graspd_core.methods.closed_form.closed_form import ClosedForm, pack
+from graspd_core.methods.closed_form.closed_form import ClosedForm
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.losses import hard_contact, soft_contact
+from graspd_core.methods.plan_config import load_preset
+from graspd_core.methods.poses import pack
 
 DEFAULT = ClosedFormConfig()
 DOUBLE = torch.float64
@@ -34,14 +35,12 @@ DOUBLE = torch.float64
     ],
 )
 def test_an_ablation_changes_only_what_it_names(preset: str, expected: ClosedFormConfig):
-    assert load_preset(preset) == replace(load_preset("balanced"), closed_form=expected)
+    assert load_preset(preset) == replace(load_preset("balanced"), settings=expected)
 
 
 @pytest.mark.parametrize("method", ["annealing", "random_closure"])
-def test_rivals_have_a_preset_and_a_search(method: str):
-    assert load_preset(method) == replace(load_preset("balanced"), method=method)
-    assert method in METHODS
-    assert callable(SEARCHES[method])
+def test_baselines_have_a_preset(method: str):
+    assert load_preset(method) == load_preset("balanced").with_method(method)
 
 
 def test_a_hard_contact_is_one_within_its_width_and_zero_beyond_without_gradient():
@@ -57,7 +56,7 @@ def test_the_hard_solver_looks_no_farther_than_the_end_width(hand, scenes, probl
     problem = problem_of("box", DOUBLE)
     starts = draw_starts(scenes["box"], hand, 2, 0, "cpu", DOUBLE)
     # From the start, centimetres off and without padding, no candidate is within 4 mm: the task has no slope at all.
-    only_task = LossWeights(task=1.0, distance=0.0, penetration=0.0, self_collision=0.0, posture=0.0)
+    only_task = LossWeights(wrench_resistance=1.0, distance=0.0, penetration=0.0, self_collision=0.0, posture=0.0)
     config = replace(DEFAULT, activation="hard", weights=only_task)
     x = pack(replace(starts, translation=starts.translation + 0.2))
     radius = x.new_zeros(len(x))
@@ -72,7 +71,7 @@ def test_an_ablation_runs_and_ends_elsewhere(hand, scenes, problem_of, preset: s
     problem = problem_of("box", DOUBLE)
     starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
     short = {"explore_steps": 6, "refine_steps": 2, "polish_steps": 4}
-    ablated = minimise(ClosedForm(replace(load_preset(preset).closed_form, **short), 3), problem, starts, Hooks())
+    ablated = minimise(ClosedForm(replace(load_preset(preset).settings, **short), 3), problem, starts, Hooks())
     full = minimise(ClosedForm(replace(DEFAULT, **short), 3), problem, starts, Hooks())
     assert torch.isfinite(ablated.loss).all()
     assert not torch.allclose(pack(ablated.poses), pack(full.poses), atol=1e-4)

@@ -12,29 +12,31 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.config import AnnealingConfig, ClosedFormConfig, PlanConfig
 from graspd_core.contact.wrench_support import disturbance_directions
 from graspd_core.methods.annealing.annealing import (
     cooling,
     jump,
     make_annealing,
-    plan_annealing,
+    plan,
     quaternion_product,
     sampled_epsilon,
 )
+from graspd_core.methods.annealing.annealing_config import AnnealingConfig
 from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
 from graspd_core.methods.finger_closing import finger_of
 from graspd_core.methods.grasp_stages import ContactSet, hand_distance
 from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.loop import Hooks, minimise
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput, PlannerOutput
+from graspd_core.methods.poses import Poses
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
 
 DOUBLE = torch.float64
 SETTINGS = AnnealingConfig(steps=40, close_steps=20, chains_per_grasp=4.0, directions=64)
 CONFIG = PlanConfig(
-    method="annealing", annealing=SETTINGS, closed_form=ClosedFormConfig(candidates=60, features=24, directions=12)
+    method="annealing", settings=SETTINGS, problem=ProblemConfig(candidates=60, features=24, directions=12)
 )
 
 
@@ -152,7 +154,7 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
 
 def search(scene, hand, *, seed: int = 0, hooks: Hooks | None = None) -> PlannerOutput:
     hooks = Hooks() if hooks is None else hooks
-    return plan_annealing(PlannerInput(scene, hand, 4, seed, CONFIG, hooks, dtype=DOUBLE))
+    return plan(PlannerInput(scene, hand, 4, seed, CONFIG, hooks, dtype=DOUBLE))
 
 
 def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
@@ -172,8 +174,8 @@ def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
 def test_chains_that_never_leave_a_collision_give_nothing(scenes, hand):
     # The support ends a metre above the object: in two steps no hand gets out of it.
     buried = replace(scenes["sphere"], support=Plane(np.array([0.0, 0.0, 1.0]), 1.0))
-    short = replace(CONFIG, annealing=replace(SETTINGS, steps=2))
-    found = plan_annealing(PlannerInput(buried, hand, 2, 0, short, Hooks(), dtype=DOUBLE))
+    short = replace(CONFIG, settings=replace(SETTINGS, steps=2))
+    found = plan(PlannerInput(buried, hand, 2, 0, short, Hooks(), dtype=DOUBLE))
     assert (found.interrupted, len(found.poses.joints)) == ("", 0)
 
 

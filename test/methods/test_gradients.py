@@ -13,9 +13,8 @@ from torch import Tensor
 
 from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
 from graspd_core.methods import losses
-from graspd_core.methods.closed_form.closed_form import pack
 from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Poses
+from graspd_core.methods.poses import Poses, pack
 from graspd_core.methods.problem import Terms, evaluate
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +40,7 @@ def spheres() -> tuple[Tensor, Tensor]:
 
 # Per term: a function of (batch, n) and where to look. Lengths are drawn at least 0.1 mm from the kink of their term.
 LOSSES: dict[str, tuple[Callable[[Tensor], Tensor], Tensor]] = {
-    "task": (lambda x: losses.task(x, 0.5), draw(4, 12, low=0.01, high=2.0)),
+    "task": (lambda x: losses.wrench_resistance(x, 0.5), draw(4, 12, low=0.01, high=2.0)),
     "touch outside": (lambda x: losses.touch(x, draw(6, low=0.004, high=0.1)), draw(4, 6, low=1e-4, high=0.05)),
     "touch inside": (lambda x: losses.touch(x, draw(6, low=0.004, high=0.1)), draw(4, 6, low=-0.05, high=-1e-4)),
     "penetration": (lambda x: losses.penetration(x, x.new_full((4,), 2e-3)), draw(4, 9, low=-0.01, high=1.9e-3)),
@@ -142,7 +141,7 @@ def plain(function: Callable) -> Callable:
 @pytest.mark.parametrize(
     ("function", "arguments"),
     [
-        (losses.task, (draw(4, 12), 0.5)),
+        (losses.wrench_resistance, (draw(4, 12), 0.5)),
         (losses.touch, (draw(4, 6), draw(6))),
         (losses.penetration, (draw(4, 9), draw(4))),
         (losses.self_collision, (draw(4, 6, 3, high=0.03), *spheres())),

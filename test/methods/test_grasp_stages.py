@@ -21,7 +21,7 @@ from graspd_core.methods.grasp_stages import (
     squeeze,
 )
 from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Poses
+from graspd_core.methods.poses import Poses
 from graspd_core.se3 import rotation_from_quaternion
 
 FRICTION, LENGTH = 0.5, 0.035

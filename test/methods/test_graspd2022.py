@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.config import Graspd2022Config, PlanConfig, load_preset, preset_names
 from graspd_core.contact.free_body import make_body
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.candidates import SEARCHES
-from graspd_core.methods.closed_form.closed_form import pack
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
-from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, plan_graspd2022
+from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, plan
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
 from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
-from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.loop import Hooks, minimise
+from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.methods.planner import PlannerInput
+from graspd_core.methods.poses import Poses, pack
 from graspd_core.methods.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
@@ -267,25 +267,24 @@ def test_a_start_that_is_not_a_number_never_wins_and_harms_none(problem, starts,
 
 
 def test_the_search_obeys_limits_and_stop(hand, scenes):
-    config = replace(PlanConfig(), graspd2022=SHORT)
+    config = PlanConfig(method="graspd2022", settings=SHORT)
     task = PlannerInput(scenes["sphere"], hand, 2, 1, config, Hooks())
-    found = plan_graspd2022(task)
+    found = plan(task)
     assert len(found.poses.translation) == 2
     assert (found.poses.joints >= found.problem.lower).all()
     assert (found.poses.joints <= found.problem.upper).all()
     polls = iter([False, True])
-    stopped = plan_graspd2022(replace(task, hooks=Hooks(stop=polls.__next__)))
+    stopped = plan(replace(task, hooks=Hooks(stop=polls.__next__)))
     assert stopped.interrupted == "cancelled"
-    assert SEARCHES["graspd2022"] is plan_graspd2022
 
 
 def test_presets_name_this_method_and_change_what_they_say():
     mine = {name: load_preset(name) for name in preset_names() if name.startswith("graspd2022")}
     assert {p.method for p in mine.values()} == {"graspd2022"}
-    assert mine["graspd2022"].graspd2022 == Graspd2022Config()
-    assert mine["graspd2022_no_coarse_to_fine"].graspd2022.coarse_steps == 0
-    assert not mine["graspd2022_no_relaxation"].graspd2022.relaxation
-    assert mine["graspd2022_no_leak"].graspd2022.leak == 0.0
+    assert mine["graspd2022"].settings == Graspd2022Config()
+    assert mine["graspd2022_no_coarse_to_fine"].settings.coarse_steps == 0
+    assert not mine["graspd2022_no_relaxation"].settings.relaxation
+    assert mine["graspd2022_no_leak"].settings.leak == 0.0
 
 
 def test_every_setting_is_explained():

@@ -10,14 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.config import ClosedFormConfig, PlanConfig
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.kinematics import forward
 from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.closed_form.closed_form import pack
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.obstacle_distance import RETREAT, hand_reach, intrusion, make_obstacle_tensors, obstacle_gaps
+from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.methods.poses import pack
 from graspd_core.methods.problem import Problem, build_problem, evaluate
 from graspd_core.scene.obstacles import make_obstacles
 from graspd_core.scene.scene import Scene
@@ -119,10 +120,10 @@ def test_trust_scales_what_a_contact_counts(hand, scenes):
     seen = evaluate(problem(replace(scenes["box"], confidence=ones), hand, confidence_floor=0.4), *arguments)
     guessed = evaluate(problem(replace(scenes["box"], confidence=0 * ones), hand, confidence_floor=0.4), *arguments)
     # Interpolating ones leaves rounding.
-    assert seen.task.tolist() == pytest.approx(known.task.tolist(), rel=1e-12)
+    assert seen.wrench_resistance.tolist() == pytest.approx(known.wrench_resistance.tolist(), rel=1e-12)
     # The support falls to 0.4 of itself, and its logarithm by −log 0.4, but for the floor that keeps it finite.
-    assert (guessed.task > known.task).all()
-    assert (guessed.task - known.task <= -np.log(0.4) + 1e-9).all()
+    assert (guessed.wrench_resistance > known.wrench_resistance).all()
+    assert (guessed.wrench_resistance - known.wrench_resistance <= -np.log(0.4) + 1e-9).all()
     for name in known._fields[1:-1]:
         assert torch.equal(getattr(known, name), getattr(guessed, name))
 
@@ -152,8 +153,8 @@ def test_starts_lie_above_the_table_and_could_have_come_there(hand, scenes, name
 def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     scene = beside(on_table(scenes["box"]), 0.09)
     assert scene.support is not None
-    short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15, candidates=60, fine_candidates=120)
-    config = PlanConfig(closed_form=short)
+    short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15)
+    config = PlanConfig(settings=short, problem=ProblemConfig(candidates=60, fine_candidates=120))
     found = find_candidates(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE)
     assert found.grasps
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)

@@ -9,34 +9,35 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.config import ClosedFormConfig, PlanConfig, RandomClosureConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.finger_closing import link_gaps, make_closing
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.obstacle_distance import obstacle_gaps
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput, PlannerOutput
 from graspd_core.methods.random_closure.random_closure import (
     advance,
     draw_approaches,
-    plan_random_closure,
+    plan,
     touching_groups,
 )
+from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
 
 DOUBLE = torch.float64
 CONFIG = PlanConfig(
     method="random_closure",
-    random_closure=RandomClosureConfig(close_steps=30),
-    closed_form=ClosedFormConfig(candidates=60, features=24, directions=12),
+    settings=RandomClosureConfig(close_steps=30),
+    problem=ProblemConfig(candidates=60, features=24, directions=12),
 )
 
 
 def search(scene, hand, *, count: int = 4, seed: int = 0, hooks: Hooks | None = None, config=CONFIG) -> PlannerOutput:
     hooks = Hooks() if hooks is None else hooks
-    return plan_random_closure(PlannerInput(scene, hand, count, seed, config, hooks, dtype=DOUBLE))
+    return plan(PlannerInput(scene, hand, count, seed, config, hooks, dtype=DOUBLE))
 
 
 def test_what_it_finds_touches_with_enough_links_and_sinks_nowhere(scenes, hand):
@@ -44,7 +45,7 @@ def test_what_it_finds_touches_with_enough_links_and_sinks_nowhere(scenes, hand)
     closing = make_closing(found.problem, hand, 30)
     assert len(found.poses.joints) == 3
     assert link_gaps(found.problem, found.poses, closing.sphere_links)[:, 0].min() >= 0
-    reach = CONFIG.postures.touch_reach
+    reach = CONFIG.grasp_stages.touch_reach
     assert (touching_groups(found.problem, closing, hand, found.poses, reach) >= 3).all()
 
 
@@ -87,7 +88,7 @@ def test_it_stops_when_told_and_at_the_deadline(scenes, hand):
 
 
 def test_what_asks_for_more_links_than_touch_gives_nothing(scenes, hand):
-    strict = replace(CONFIG, random_closure=replace(CONFIG.random_closure, touching=12, rounds=1))
+    strict = replace(CONFIG, settings=replace(CONFIG.settings, touching=12, rounds=1))
     found = search(scenes["sphere"], hand, count=2, config=strict)
     assert (found.interrupted, len(found.poses.joints)) == ("", 0)
 

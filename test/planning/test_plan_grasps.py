@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
+from graspd_core.methods.plan_config import load_preset
 from graspd_core.planning import verification as trials
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
@@ -24,7 +24,7 @@ LATE = 0.5
 
 @pytest.fixture(scope="module")
 def hand():
-    return load_hand("allegro_right", candidates=load_preset("fast").closed_form.fine_candidates)
+    return load_hand("allegro_right", candidates=load_preset("fast").problem.fine_candidates)
 
 
 @pytest.fixture(scope="module")
@@ -197,9 +197,9 @@ def test_collision_parts_of_cancelled_runs_do_not_pile_up(scene, hand, result):
 def test_what_held_in_an_earlier_round_stays_told(scene, hand):
     config = load_preset("fast")
     # The least that a round keeps is eight, so that nine take two.
-    short = replace(config.closed_form, explore_steps=3, refine_steps=3, polish_steps=3, keep_per_grasp=0.5)
+    short = replace(config.settings, explore_steps=3, refine_steps=3, polish_steps=3, keep_per_grasp=0.5)
     told: list[Progress] = []
-    plan_grasps(scene, hand, count=9, preset=replace(config, closed_form=short), verify="none", progress=told.append)
+    plan_grasps(scene, hand, count=9, preset=replace(config, settings=short), verify="none", progress=told.append)
     assert [p.verified for p in told] == sorted(p.verified for p in told)
     assert 0 < told[-2].verified <= told[-1].verified
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from graspd_core.bench.robustness import correlation, orders
-from graspd_core.config import RobustConfig, load_preset
+from graspd_core.config import RobustConfig
 from graspd_core.formats.grasps_json import result_document
 from graspd_core.hands.library import load_hand
+from graspd_core.methods.plan_config import load_preset
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.verification import most_robust_first
 from graspd_core.scene.load_scene import load_scene

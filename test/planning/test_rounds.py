@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.config import PlanConfig, RoundsConfig, load_preset
-from graspd_core.methods.budget import at_budget
+from graspd_core.config import RoundsConfig
+from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import Plane
@@ -20,7 +20,7 @@ def scene():
 
 
 def efforts(*values: float) -> list[PlanConfig]:
-    return [at_budget(PlanConfig(), value) for value in values]
+    return [PlanConfig().at_budget(value) for value in values]
 
 
 def test_a_known_object_alone_begins_cheaply(scene):

@@ -10,15 +10,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspd_core.config import PlanConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.candidates import assemble
-from graspd_core.methods.closed_form.closed_form import ClosedForm, pack, unpack
+from graspd_core.methods.closed_form.closed_form import ClosedForm
 from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.loop import Hooks, minimise
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput, problem_of
+from graspd_core.methods.poses import Poses, pack, unpack
 from graspd_core.methods.problem import Problem, evaluate, hand_forward
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
@@ -26,13 +27,13 @@ from graspd_core.se3 import rotation_from_quaternion
 
 PLAN = PlanConfig()
 # The preset's method in a tenth of its steps.
-SHORT = replace(PLAN.closed_form, explore_steps=6, refine_steps=6, polish_steps=6)
+SHORT = replace(PLAN.settings, explore_steps=6, refine_steps=6, polish_steps=6)
 BATCH = 16
 
 
 @pytest.fixture(scope="module")
 def hand() -> HandModel:
-    return load_hand("allegro_right", candidates=PLAN.closed_form.fine_candidates)
+    return load_hand("allegro_right", candidates=PLAN.problem.fine_candidates)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,7 @@ def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     inside = replace(starts, translation=starts.translation + sound.center - palm)
     at = (rotation @ torch.as_tensor(hand.palm_center, dtype=torch.float32)) + inside.translation
     assert (sample_sdf(sound.sdf, at)[0] < -0.02).all()
-    solution = minimise(ClosedForm(PLAN.closed_form, BATCH), sound, inside, Hooks())
+    solution = minimise(ClosedForm(PLAN.settings, BATCH), sound, inside, Hooks())
     poses = solution.poses
     placed = hand_forward(sound, sound.fine, poses.translation, poses.quaternion, poses.joints)
     depth = -sample_sdf(sound.sdf, placed.points)[0].amin(-1)

@@ -11,13 +11,6 @@ from typing import Any
 import numpy as np
 
 # Colours of Okabe and Ito (2008), which the colour-blind can tell apart; a marker's shape says the same.
-COLOURS = {
-    "closed_form": "#0072B2",
-    "graspd2022": "#D55E00",
-    "annealing": "#009E73",
-    "random_closure": "#7F7F7F",
-}
-MARKERS = {"closed_form": "o", "graspd2022": "s", "annealing": "^", "random_closure": "D"}
 FRONT = "#222222"
 _STYLE: Any = {
     "font.size": 9,
@@ -90,7 +83,7 @@ def place_labels(
         half = np.array([box.width, box.height]) / 2 + scale
         others = [t for i, t in enumerate(taken) if i != index]
         places = [_place(at[index], half, d * scale, angle) for d, angle in product(_DISTANCES, _ANGLES)]
-        best = min(places, key=lambda place_points: _trouble(place_points, half, others, frame))
+        best = min(places, key=lambda place: _trouble(place, half, others, frame))
         label.set_position(tuple((best - at[index]) / scale))
         taken.append((*(best - half), *(best + half)))
         if np.linalg.norm(best - at[index]) < half[0] + 10 * scale:
@@ -103,9 +96,9 @@ def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -
     return point + way * distance + np.sign(np.round(way, 6)) * half * np.abs(way) ** 0.5
 
 
-def _trouble(place_points: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
+def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
     """Area that a label would share with what is there, or have outside the frame; ties go to the first place."""
-    low, high = place_points - half, place_points + half
+    low, high = place - half, place + half
     shared = 0.0
     for x0, y0, x1, y1 in taken:
         shared += max(0.0, min(high[0], x1) - max(low[0], x0)) * max(0.0, min(high[1], y1) - max(low[1], y0))

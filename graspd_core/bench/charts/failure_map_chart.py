@@ -41,9 +41,9 @@ def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
 
 
 def _known(drawn: Map, methods: Mapping[str, Shares]) -> Map:
-    places = [place_points for shares in methods.values() for place_points in shares]
-    across = tuple(x for x in drawn.across.places if any(x == place_points[0] for place_points in places))
-    up = tuple(y for y in drawn.up.places if any(y == place_points[1] for place_points in places))
+    places = [place for shares in methods.values() for place in shares]
+    across = tuple(x for x in drawn.across.places if any(x == place[0] for place in places))
+    up = tuple(y for y in drawn.up.places if any(y == place[1] for place in places))
     if not places:
         return drawn
     return replace(drawn, across=replace(drawn.across, places=across), up=replace(drawn.up, places=up))
@@ -60,8 +60,8 @@ def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
         colour = "white" if value < 50 else "black"
         axis.text(column, row, f"{value:.0f}", ha="center", va="center", color=colour, fontsize=8)
     _border(axis, grid)
-    axis.set_xticks(range(len(across)), [_written(place_points) for place_points in across])
-    axis.set_yticks(range(len(up)), [_written(place_points) for place_points in up])
+    axis.set_xticks(range(len(across)), [_written(place) for place in across])
+    axis.set_yticks(range(len(up)), [_written(place) for place in up])
     for ticks, places in ((axis.set_xticks, across), (axis.set_yticks, up)):
         ticks(np.arange(1, len(places)) - 0.5, minor=True)
     axis.tick_params(which="both", length=0)
@@ -86,5 +86,5 @@ def _border(axis: Any, grid: Any) -> None:
         axis.plot([column - 0.5, column + 0.5], [row + 0.5] * 2, **line)
 
 
-def _written(place_points: Place) -> str:
-    return place_points if isinstance(place_points, str) else f"{place_points:g}"
+def _written(place: Place) -> str:
+    return place if isinstance(place, str) else f"{place:g}"

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd_core.bench.charts.chart_style import COLOURS, figure, save
+from graspd_core.bench.charts.chart_style import figure, save
 from graspd_core.bench.robustness import Row, orders
+from graspd_core.methods.registry import METHODS
 
-_SCORE, _NOISE, _BEST = COLOURS["graspd2022"], COLOURS["closed_form"], COLOURS["random_closure"]
+_SCORE, _NOISE, _BEST = (METHODS[name].colour for name in ("graspd2022", "closed_form", "random_closure"))
 
 
 def draw_robust(rows: Sequence[Row], path: Path) -> Path:

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.bench.charts.chart_style import COLOURS, FRONT, MARKERS, figure, place_labels, save
+from graspd_core.bench.charts.chart_style import FRONT, figure, place_labels, save
 from graspd_core.bench.charts.sweep_chart import draw_ladder
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import METHOD_NAMES, is_preset, is_rung, parent_of, short_name
+from graspd_core.bench.names import is_preset, is_rung, parent_of, short_name
 from graspd_core.bench.pareto import pareto_front
 from graspd_core.bench.result_store import Record
+from graspd_core.methods.registry import METHODS
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
         axis.set_xlabel("CPU seconds to the first verified grasp")
         axis.set_xlim(left=0.0)
         names = [p.name for p in points]
-        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [COLOURS[p.method] for p in points])
+        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [METHODS[p.method].colour for p in points])
         return save(made, path)
 
 
@@ -108,7 +109,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, time: str, label: str)
         made.supxlabel(label, fontsize=9)
         _legend(made, list(dict.fromkeys(row.method for group in presets.values() for row in group)))
         for axis, (_, points) in zip(axes[0], panels, strict=True):
-            names, colours = [short_name(p.name) for p in points], [COLOURS[p.method] for p in points]
+            names, colours = [short_name(p.name) for p in points], [METHODS[p.method].colour for p in points]
             place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, colours)
         return save(made, path)
 
@@ -128,19 +129,17 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
 
 
 def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
-    place_points = {p.name: (p.x[1], p.y[1]) for p in points}
+    place = {p.name: (p.x[1], p.y[1]) for p in points}
     for p in points:
-        (x, y), colour, parent = place_points[p.name], COLOURS[p.method], parent_of(p.name)
-        if parent in place_points:
-            axis.plot(
-                *zip(place_points[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2
-            )
+        (x, y), colour, parent = place[p.name], METHODS[p.method].colour, parent_of(p.name)
+        if parent in place:
+            axis.plot(*zip(place[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2)
         bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
         axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
         filling = "white" if parent else colour
-        axis.plot(x, y, MARKERS[p.method], color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
+        axis.plot(x, y, METHODS[p.method].marker, color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
     # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
-    spots = np.array([place_points[p.name] for p in points if p.held] or list(place_points.values()))
+    spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
     axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
     axis.set_xscale("log")
@@ -163,7 +162,10 @@ def _legend(made: Any, methods: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
 
     plain = {"ls": "none", "ms": 7, "mew": 1.3}
-    handles = [Line2D([], [], marker=MARKERS[m], color=COLOURS[m], label=METHOD_NAMES[m], **plain) for m in methods]
+    handles = [
+        Line2D([], [], marker=METHODS[m].marker, color=METHODS[m].colour, label=METHODS[m].label, **plain)
+        for m in methods
+    ]
     handles.append(Line2D([], [], marker="o", color="#666666", mfc="white", label="ablation", **plain))
     handles.append(Line2D([], [], color=FRONT, lw=1.2, alpha=0.6, label="Pareto front"))
     made.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=8.5)

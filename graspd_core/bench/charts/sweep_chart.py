@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from graspd_core.bench.charts.chart_style import COLOURS, figure, save
+from graspd_core.bench.charts.chart_style import figure, save
 from graspd_core.bench.figures import Row, by_name, spread
 from graspd_core.bench.suites import LADDER
+from graspd_core.methods.registry import METHODS
 
 _LABELS = {
     "candidates": "contact candidates",
@@ -15,7 +16,7 @@ _LABELS = {
     "resolution": "grid nodes a side",
     "steps": "steps",
 }
-_SUCCESS, _TIME = COLOURS["closed_form"], COLOURS["graspd2022"]
+_SUCCESS, _TIME = METHODS["closed_form"].colour, METHODS["graspd2022"].colour
 
 
 def draw_ladder(found: Sequence[Row], path: Path) -> Path:

@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
 
-from graspd_core.config import PlanConfig, load_preset
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
+from graspd_core.methods.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import Protocol, build_world
@@ -85,8 +85,8 @@ def job_key(job: Job) -> str:
 
     Of the settings those count that raw grasps depend on: there are no rounds, and clouds are segmented as usual.
     """
-    config = asdict(settings(job.preset))
-    looked_at = {name: config[name] for name in ("resolution", "closed_form", config["method"], "postures")}
+    config = to_mapping(settings(job.preset))
+    looked_at = {name: config[name] for name in ("resolution", "problem", config["method"], "grasp_stages")}
     asked = {**asdict(job), "hand": HAND, "settings": looked_at}
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
@@ -115,7 +115,7 @@ def hand_for(candidates: int) -> HandModel:
 def plan(job: Job, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
     """The hand, and the first of the method's own ranking, none filtered by a trial."""
     config = settings(job.preset)
-    hand = hand_for(config.closed_form.fine_candidates)
+    hand = hand_for(config.problem.fine_candidates)
     found = find_candidates(scene, hand, count=job.count, seed=job.seed, config=config, hooks=Hooks())
     return hand, found.grasps[: job.count]
 

@@ -24,7 +24,7 @@ _POSTURES = 4096
 def run(job: Job) -> Done:
     """Plan and try on the shape scaled so that its least width is that share of the hand's span; 0.1 kg throughout."""
     config = settings(job.preset)
-    width = float(job.across) * _span(config.closed_form.fine_candidates)
+    width = float(job.across) * _span(config.problem.fine_candidates)
     scale = width / least_width(make_shape(job.thing))
     scene = load_scene(f"shape:{job.thing}", scale=scale, resolution=config.resolution)
     hand, grasps = plan(job, scene)

@@ -20,7 +20,7 @@ from graspd_core.formats.grasps_json import save_text
 
 def job_file(job: Job) -> str:
     """Name of the file that a job's record is kept in: for the eye, then for certain."""
-    where = "-".join(str(place_points) for place_points in (job.across, *job.up[:1]))
+    where = "-".join(str(place) for place in (job.across, *job.up[:1]))
     return f"{job.map}-{job.preset}-{job.thing}-{where}-{job_key(job)[:12]}.json"
 
 
@@ -61,7 +61,7 @@ def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
         for cell in record["cells"]:
             held[record["across"], cell["up"]] += cell["held"]
             asked[record["across"], cell["up"]] += record["count"]
-    return {place_points: held[place_points] / asked[place_points] for place_points in asked}
+    return {place: held[place] / asked[place] for place in asked}
 
 
 def reasons(records: Sequence[Record]) -> dict[tuple[Place, Place], Counter[str]]:

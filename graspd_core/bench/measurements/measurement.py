@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import re
@@ -10,9 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from graspd_core.config import METHODS, PlanConfig
+from graspd_core.methods.plan_config import PlanConfig, to_mapping
 
 Kind = Literal["raw", "verified", "pace", "start"]
 
@@ -55,20 +54,11 @@ class Cell:
         return self.source.removeprefix("shape:") if self.source.startswith("shape:") else Path(self.source).stem
 
 
-def settings_of(config: PlanConfig) -> dict[str, Any]:
-    """The settings that the method looks at; those of the other methods are left out.
-
-    The closed form's are always among them, because every method's poses are ranked and squeezed by them.
-    """
-    others = set(METHODS) - {config.method, "closed_form"}
-    return {name: value for name, value in dataclasses.asdict(config).items() if name not in others}
-
-
 def cell_key(cell: Cell) -> str:
     """Hash of everything that a cell is asked, hexadecimal. The code that answers is recorded beside it."""
     asked = {
         **{name: getattr(cell, name) for name in ("kind", "name", "object_hash", "hand_hash", "seed", "count")},
-        "settings": settings_of(cell.settings),
+        "settings": to_mapping(cell.settings),
         "trials": sorted(cell.trials),
     }
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()

@@ -10,11 +10,12 @@ import traceback
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from graspd_core.bench.measurements.measurement import Cell, Kind, cell_key, settings_of
+from graspd_core.bench.measurements.measurement import Cell, Kind, cell_key
 from graspd_core.bench.measurements.stopwatch import forget_peak, peak_mb
 from graspd_core.bench.measurements.throughput import run_pace, run_start
 from graspd_core.bench.measurements.unfiltered import run_raw
 from graspd_core.bench.measurements.verified import run_verified
+from graspd_core.methods.plan_config import to_mapping
 from graspd_core.runtime import disk_cache as cache
 
 FORMAT, VERSION = "graspd/bench-cell", 1
@@ -63,7 +64,7 @@ def asked(cell: Cell, code: str) -> dict[str, Any]:
         "hand": cell.hand,
         "seed": cell.seed,
         "asked": cell.count,
-        "settings": settings_of(cell.settings),
+        "settings": to_mapping(cell.settings),
         "error": "",
     }
 

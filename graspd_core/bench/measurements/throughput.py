@@ -12,6 +12,7 @@ from graspd_core.bench.measurements.measurement import Cell
 from graspd_core.bench.measurements.stopwatch import Stopwatch
 from graspd_core.hands.library import load_hand
 from graspd_core.methods.candidates import find_candidates
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.methods.loop import Hooks
 from graspd_core.scene.load_scene import load_scene
 
@@ -21,7 +22,7 @@ _RUNS = 3
 _FRESH = """
 import sys, time
 import torch; torch.set_num_threads(1)
-from graspd_core.config import load_preset
+from graspd_core.methods.plan_config import load_preset
 from graspd_core.hands.library import load_hand
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.scene.load_scene import load_scene
@@ -36,7 +37,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
     A grasp-step is one step of one start: what the optimiser does most of.
     """
-    hand = load_hand(cell.hand, candidates=cell.settings.closed_form.fine_candidates)
+    hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     scene = load_scene(cell.source, resolution=cell.settings.resolution)
     runs: list[Stopwatch] = []
     for run in range(_RUNS + 1):
@@ -50,8 +51,8 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
 def grasp_steps(cell: Cell) -> int | None:
     """Steps times starts of one batch of the closed form; None for other methods."""
-    s = cell.settings.closed_form
-    if cell.settings.method != "closed_form":
+    s = cell.settings.settings
+    if not isinstance(s, ClosedFormConfig):
         return None
     kept = s.keep_per_grasp * cell.count
     return round(s.starts_per_grasp * cell.count * s.explore_steps + kept * (s.refine_steps + s.polish_steps))

@@ -20,7 +20,7 @@ from graspd_core.scene.scene import object_parts
 def run_raw(cell: Cell) -> dict[str, Any]:
     """Figures of one raw cell. Grasps that a method does not find are missing from the list, and count as failed."""
     laps = Stopwatch()
-    hand = load_hand(cell.hand, candidates=cell.settings.closed_form.fine_candidates)
+    hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with laps("scene"):
         scene = load_scene(cell.source, resolution=cell.settings.resolution)
     with laps("optimise"):

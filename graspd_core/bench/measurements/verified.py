@@ -28,7 +28,7 @@ class _First:
 
 def run_verified(cell: Cell) -> dict[str, Any]:
     """Figures of one planned run: how many of `count` were verified, and what all of it cost."""
-    hand = load_hand(cell.hand, candidates=cell.settings.closed_form.fine_candidates)
+    hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     began = _now()
     told = _First(began)
     scene = load_scene(cell.source, resolution=cell.settings.resolution)

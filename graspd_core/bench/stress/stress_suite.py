@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import IO
 
 from graspd_core.bench.benchmark_workers import ENVIRONMENT
-from graspd_core.bench.measurements.measurement import settings_of
 from graspd_core.bench.result_store import kept_record
 from graspd_core.bench.stress.run_stress_case import Ending
 from graspd_core.bench.stress.stress_case import Case
 from graspd_core.bench.stress.stress_cases import CASES
-from graspd_core.config import load_preset
 from graspd_core.errors import ConfigError
 from graspd_core.formats.grasps_json import save_text
+from graspd_core.methods.plan_config import load_preset, to_mapping
 
 # Beyond loading and planning, before a process is called hung, and how often processes are looked at [s].
 _PATIENCE, _POLL = 60.0, 0.05
@@ -57,7 +56,7 @@ class Shelf:
     @cached_property
     def _key(self) -> str:
         """Hash of what the preset says."""
-        said = json.dumps(settings_of(load_preset(self.preset)), sort_keys=True)
+        said = json.dumps(to_mapping(load_preset(self.preset)), sort_keys=True)
         return hashlib.sha256(said.encode()).hexdigest()
 
     def path(self, case: Case) -> Path:

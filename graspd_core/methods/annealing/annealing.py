@@ -21,18 +21,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from graspd_core.config import AnnealingConfig
 from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
 from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.kinematics import place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods.annealing.annealing_config import AnnealingConfig
 from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
 from graspd_core.methods.finger_closing import link_gaps, make_closing, sphere_overlap
 from graspd_core.methods.grasp_stages import ContactSet, find_contacts
-from graspd_core.methods.loop import Hooks, Poses, minimise
+from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of, starts_of
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
 from graspd_core.se3 import transform_points
 
@@ -236,12 +237,12 @@ def sampled_epsilon(
     return support.reshape(batch, slots, -1).amax(1).amin(-1)
 
 
-def plan_annealing(task: PlannerInput) -> PlannerOutput:
+def plan(task: PlannerInput) -> PlannerOutput:
     """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
-    settings, hooks = task.config.annealing, task.hooks
+    settings, hooks = task.config.settings, task.hooks
     problem = problem_of(task)
     annealing = make_annealing(problem, task.hand, settings, task.seed)
-    starts = starts_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
+    starts = initial_poses_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
     annealed = minimise(annealing, problem, starts, hooks)
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
     if annealed.interrupted == "cancelled" or len(legal) == 0:
@@ -249,7 +250,7 @@ def plan_annealing(task: PlannerInput) -> PlannerOutput:
     # What the deadline cut short is closed all the same: open fingers would be no grasps.
     closing = make_closing(problem, task.hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
-    contact_set = find_contacts(problem, closed.poses, task.config.postures.touch_reach)
+    contact_set = find_contacts(problem, closed.poses, task.config.grasp_stages.touch_reach)
     directions = disturbance_directions(settings.directions, task.seed).to(problem.lower)
     epsilon = sampled_epsilon(problem, contact_set, directions)
     kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))

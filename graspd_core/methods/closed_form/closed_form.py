@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.config import ClosedFormConfig, LossWeights
-from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.loop import Poses
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.methods.loop import minimise
 from graspd_core.methods.losses import hard_contact, soft_contact
-from graspd_core.methods.problem import Problem, Terms, evaluate, hand_forward
-from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.methods.poses import Poses, moved_along, pack, unpack
+from graspd_core.methods.problem import Problem, Terms, evaluate, least_distance
 
 _BETA1, _BETA2, _ADAM_EPSILON = 0.9, 0.98, 1e-8
 # Share of the step size that is left at the end of the run.
@@ -25,6 +25,9 @@ _FINAL_RATE = 0.05
 # Fewer rows than this are evaluated among copies of the first: products of one to three rows are summed in another
 # order than those of more, and from the last bit of a float32 a start would go another way alone than among others.
 _FEWEST_ROWS = 8
+
+# However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
+_FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 
 
 @dataclass(frozen=True)
@@ -54,22 +57,6 @@ def weighted(terms: Terms, weights: LossWeights) -> Float[Tensor, "batch"]:
     return sum((getattr(weights, name) * value for name, value in present.items()), torch.zeros(()))
 
 
-def pack(poses: Poses) -> Float[Tensor, "batch variables"]:
-    """Rows of translation, quaternion, joints."""
-    return torch.cat([poses.translation, poses.quaternion, poses.joints], -1)
-
-
-def unpack(x: Float[Tensor, "batch variables"]) -> Poses:
-    """Inverse of `pack`."""
-    return Poses(x[:, :3], x[:, 3:7], x[:, 7:])
-
-
-def moved_along(poses: Poses, point: Float[Tensor, "*batch 3"]) -> Poses:
-    """The poses with their translation moved along a vector of the base frame [m]."""
-    turned = (rotation_from_quaternion(poses.quaternion) @ point[..., None]).squeeze(-1)
-    return Poses(poses.translation + turned, poses.quaternion, poses.joints)
-
-
 @dataclass(frozen=True)
 class ClosedForm:
     """The solver of docs/method.md, §2.
@@ -89,7 +76,7 @@ class ClosedForm:
     def init(self, problem: Problem, starts: Poses) -> AdamState:
         x = pack(moved_along(starts, problem.pivot))
         with torch.no_grad():
-            nearest = evaluate_distance(problem, starts)
+            nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
         zeros = torch.zeros_like(x)
         worst = x.new_full((len(x),), torch.inf)
         pivot = problem.pivot.expand(len(x), 3)
@@ -145,12 +132,6 @@ class ClosedForm:
         return loss[:rows], torch.where(finite[:, None], gradient, torch.zeros_like(gradient))[:rows]
 
 
-def evaluate_distance(problem: Problem, poses: Poses) -> Float[Tensor, "batch"]:
-    """Least distance of any contact candidate to the object [m]."""
-    placed = hand_forward(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
-    return sample_sdf(problem.sdf, placed.points)[0].amin(-1)
-
-
 def adam_step(
     problem: Problem, state: AdamState, gradient: Tensor, rate: float, count: int, config: ClosedFormConfig
 ) -> AdamState:
@@ -166,3 +147,14 @@ def adam_step(
     quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
     joints = x[:, 7:].clamp(problem.lower, problem.upper)
     return replace(state, x=torch.cat([x[:, :3], quaternion, joints], -1), mean=mean, square=square)
+
+
+def plan(task: PlannerInput) -> PlannerOutput:
+    """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
+    settings = task.config.settings
+    problem = problem_of(task)
+    count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
+    starts = initial_poses_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
+    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
+    solution = minimise(solver, problem, starts, task.hooks)
+    return PlannerOutput(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)

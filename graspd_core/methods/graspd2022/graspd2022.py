@@ -17,20 +17,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.config import Graspd2022Config
 from graspd_core.contact.free_body import FreeBody, make_body
 from graspd_core.contact.penalty_forces import contact_forces
 from graspd_core.hands.kinematics import place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods import losses
-from graspd_core.methods.closed_form.closed_form import evaluate_distance, pack, unpack
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
 from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
-from graspd_core.methods.loop import Poses, minimise
+from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of, starts_of
-from graspd_core.methods.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.methods.poses import Poses, pack, unpack
+from graspd_core.methods.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward, least_distance
 
 # L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
 _ALL_MOTION = 60.0
@@ -113,7 +113,8 @@ class Graspd2022:
         radius = x.new_full((len(x),), config.radius_start)
         if config.radius == "code":
             with torch.no_grad():
-                radius = (evaluate_distance(problem, starts) - 0.01).clamp_min(0.0)
+                nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
+                radius = (nearest - 0.01).clamp_min(0.0)
         worst = x.new_full((len(x),), torch.inf)
         return RelaxedState(
             adamax(x),
@@ -232,15 +233,15 @@ def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
     return torch.where(finite.view(-1, *[1] * (gradient.dim() - 1)), gradient, torch.zeros_like(gradient))
 
 
-def plan_graspd2022(task: PlannerInput) -> PlannerOutput:
+def plan(task: PlannerInput) -> PlannerOutput:
     """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
-    settings, thing = task.config.graspd2022, task.scene.object
+    settings, thing = task.config.settings, task.scene.object
     problem = problem_of(task)
     drawn = max(1, round(task.count * settings.starts_per_grasp))
     if settings.starts == "published":
         starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.standoff)
     else:
-        starts = starts_of(task, drawn)
+        starts = initial_poses_of(task, drawn)
     body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
     solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]

@@ -10,7 +10,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.initial_poses import aligning_rotation
-from graspd_core.methods.loop import Poses
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem, hand_forward
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle

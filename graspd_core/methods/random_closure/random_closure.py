@@ -14,9 +14,10 @@ from torch import Tensor
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.finger_closing import Closing, link_gaps, make_closing
-from graspd_core.methods.loop import Poses, minimise
+from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
 from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
 
@@ -24,9 +25,9 @@ from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation
 _TOUCHING, _ADVANCES = 0.0003, 60
 
 
-def plan_random_closure(task: PlannerInput) -> PlannerOutput:
+def plan(task: PlannerInput) -> PlannerOutput:
     """Closed hands from random sides, `count` tries a round until as many touch; a round cut short gives none."""
-    settings, hand, count = task.config.random_closure, task.hand, task.count
+    settings, hand, count = task.config.settings, task.hand, task.count
     problem = problem_of(task)
     closing = make_closing(problem, hand, settings.close_steps)
     least = min(settings.touching, int(hand.link_group.max()) + 1)
@@ -38,7 +39,7 @@ def plan_random_closure(task: PlannerInput) -> PlannerOutput:
         solution = minimise(closing, problem, advance(problem, closing, hand, tries[rows]), task.hooks)
         interrupted = solution.interrupted
         if not interrupted:
-            groups = touching_groups(problem, closing, hand, solution.poses, task.config.postures.touch_reach)
+            groups = touching_groups(problem, closing, hand, solution.poses, task.config.grasp_stages.touch_reach)
             good = (groups >= least) & clear_of_obstacles(problem, solution.poses)
             kept = join(kept, solution.poses[good])
     return PlannerOutput(problem, kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)

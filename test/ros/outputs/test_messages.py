@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from graspd_core.config import preset_names
+from graspd_core.methods.plan_config import preset_names
 
 RESULT_TIMEOUT = 60.0
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 40.0}

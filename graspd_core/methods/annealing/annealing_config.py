@@ -1,4 +1,4 @@
-"""Settings of the rivals that the chart compares with."""
+"""Settings of simulated annealing."""
 
 from __future__ import annotations
 
@@ -34,18 +34,3 @@ class AnnealingConfig:
     posture_jump: float = 0.25
     close_steps: int = 60
     directions: int = 256
-
-
-@dataclass(frozen=True)
-class RandomClosureConfig:
-    """The floor: approach at random, close until contact.
-
-    Attributes:
-        rounds: of as many approaches as grasps are asked for, until as many touch well enough.
-        touching: rigid groups of links that must touch.
-        close_steps: of the closing, from open to closed.
-    """
-
-    rounds: int = 4
-    touching: int = 3
-    close_steps: int = 60

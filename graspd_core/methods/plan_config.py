@@ -1,0 +1,130 @@
+"""Everything that a run of `plan_grasps` is set by, and the presets that hold it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from graspd_core.config import GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
+from graspd_core.config.mapping import coerced
+from graspd_core.errors import ConfigError, shown
+from graspd_core.methods.registry import METHODS
+from graspd_core.paths import config_dir
+
+_DEFAULT_METHOD = "closed_form"
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """Settings of a run, apart from the scene, the hand and the seed.
+
+    Attributes:
+        resolution: the signed distance grid has at most the cube of it in nodes; a cube has as many along each side.
+        method: how poses are searched for, a name of `METHODS`.
+        settings: of that method, of the type that its row names; None takes the defaults.
+        problem: how scene and hand are laid out.
+        grasp_stages: pregrasp and squeeze.
+        rounds: of optimiser and trial.
+        robust: the order of the verified grasps.
+
+    Raises:
+        ConfigError: the method is unknown, or the settings are another method's.
+    """
+
+    resolution: int = 48
+    method: str = _DEFAULT_METHOD
+    settings: Any = None
+    problem: ProblemConfig = field(default_factory=ProblemConfig)
+    grasp_stages: GraspStagesConfig = field(default_factory=GraspStagesConfig)
+    rounds: RoundsConfig = field(default_factory=RoundsConfig)
+    robust: RobustConfig = field(default_factory=RobustConfig)
+
+    def __post_init__(self) -> None:
+        config = _row(self.method, "config").config
+        if self.settings is None:
+            object.__setattr__(self, "settings", config())
+        elif not isinstance(self.settings, config):
+            raise ConfigError(f"settings: {type(self.settings).__name__} is not {config.__name__} of {self.method}")
+
+    def at_budget(self, budget: float) -> PlanConfig:
+        """The same method with more or less effort; 1 is its settings as they are."""
+        return dataclasses.replace(self, settings=METHODS[self.method].at_budget(self.settings, budget))
+
+    def with_method(self, method: str) -> PlanConfig:
+        """The settings with another method at its defaults; unchanged where it is the same method."""
+        return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
+
+
+def _row(method: Any, where: str) -> Any:
+    if not isinstance(method, str) or method not in METHODS:
+        raise ConfigError(f"{where}.method: {shown(method)} is not one of {', '.join(METHODS)}")
+    return METHODS[method]
+
+
+def to_mapping(config: PlanConfig) -> dict[str, Any]:
+    """The settings as a preset file has them: the method's own are in the section of its name."""
+    values = dataclasses.asdict(config)
+    return {config.method if key == "settings" else key: value for key, value in values.items()}
+
+
+def plan_config(values: Any, where: str = "config") -> PlanConfig:
+    """Build the settings of a run from a preset's nested mappings.
+
+    Raises:
+        ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
+    """
+    named = values.get("method", _DEFAULT_METHOD) if isinstance(values, Mapping) else _DEFAULT_METHOD
+    row = _row(named, where)
+    others = sorted((set(values) & set(METHODS)) - {named}) if isinstance(values, Mapping) else []
+    if others:
+        raise ConfigError(f"{where}.{others[0]}: settings of another method; this one has method: {named}")
+    hints = {f.name: f.default_factory for f in dataclasses.fields(PlanConfig) if f.name not in ("settings", "method")}
+    hints |= {"resolution": int, "method": str, named: row.config}
+    found = coerced(hints, values, where)
+    return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
+
+
+def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
+    """The settings with some of a preset's values changed, each by its dotted name.
+
+    Raises:
+        ConfigError: there is no such value, or it is of another type.
+    """
+    if "method" in changes:
+        config = config.with_method(changes["method"])
+    values = to_mapping(config)
+    for name, value in changes.items():
+        *sections, last = name.split(".")
+        section = values
+        for key in sections:
+            section = section.setdefault(key, {})
+        section[last] = value
+    return plan_config(values, "settings")
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the boxed presets."""
+    return tuple(sorted(path.stem for path in (config_dir() / "presets").glob("*.yaml")))
+
+
+def load_preset(name: str) -> PlanConfig:
+    """A boxed preset by name, or a preset file by path.
+
+    Raises:
+        ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
+    """
+    from graspd_core.config.yaml_text import YamlError, parse_yaml
+
+    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
+    try:
+        _, values = parse_yaml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except (YamlError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
+    return plan_config({} if values is None else values, where=path.name)
