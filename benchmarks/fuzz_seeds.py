@@ -61,7 +61,7 @@ DESCRIPTIONS = [
     b"urdf: gripper.urdf\neffort: 1\n",
 ]
 PRESETS = [
-    b"resolution: 48\nmethod: closed_form\nclosed_form: {starts_per_grasp: 4, explore_steps: 10}\nproblem: {friction: 0.4}",
+    b"resolution: 48\nmethod: closed_form\nclosed_form: {explore_steps: 10}\nproblem: {friction: 0.4}",
     b"graspd2022: {steps: 10, starts: hull}\ngrasp_stages: {open_steps: 3}\nmethod: graspd2022\n",
 ]
 _GRASP: dict[str, Any] = {

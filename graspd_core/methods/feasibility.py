@@ -18,7 +18,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.problem import fingertip_groups
 from graspd_core.scene.scene import Scene
 
-# The roughest surface that a trial believes in; see `verify.world.at_friction`.
+# The roughest surface that a trial believes in; see `trials.world.at_friction`.
 _MOST_FRICTION = 0.6
 # Points of the surface; beside them go the middles of all faces, so that no small handle is missed.
 _SAMPLES = 4000

@@ -16,7 +16,7 @@ from graspd_core.bench.suites import SUITES, Request, cells_of, find_objects
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.plan_config import PlanConfig, load_preset, override
+from graspd_core.methods.plan_config import PlanConfig, load_preset, override, to_mapping
 from graspd_core.methods.registry import METHODS
 from graspd_core.types import TriangleMesh
 

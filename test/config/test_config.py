@@ -10,7 +10,7 @@ import pytest
 from graspd_core.config import SegmentationConfig, from_mapping
 from graspd_core.errors import ConfigError
 from graspd_core.methods.closed_form.closed_form_config import LossWeights
-from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
+from graspd_core.methods.plan_config import PlanConfig, load_preset, plan_config, preset_names, to_mapping
 
 
 @pytest.mark.parametrize("name", preset_names())

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from graspd_core.errors import CloudError, ConfigError, FormatError
 from graspd_core.formats.grasps_json import grasps_of
-from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.methods.plan_config import PlanConfig, plan_config, to_mapping
 from graspd_core.pointcloud.cloud_files import load_views
 from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
 

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_core.config import ProblemConfig
 from graspd_core.contact.wrench_support import disturbance_directions
 from graspd_core.methods.annealing.annealing import (
     cooling,

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_core.config import ProblemConfig
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.kinematics import forward
 from graspd_core.methods.candidates import find_candidates

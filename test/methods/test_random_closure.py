@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.methods.candidates import find_candidates
