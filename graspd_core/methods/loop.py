@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.methods.problem import Problem
+from graspd_core.se3 import SE3, rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class Poses:
     translation: Float[Tensor, "batch 3"]
     quaternion: Float[Tensor, "batch 4"]
     joints: Float[Tensor, "batch joints"]
+
+    @property
+    def base(self) -> SE3:
+        """`T_object_base`."""
+        return SE3(rotation_from_quaternion(self.quaternion), self.translation)
 
     def __getitem__(self, rows: Tensor) -> Poses:
         return Poses(self.translation[rows], self.quaternion[rows], self.joints[rows])
