@@ -5,6 +5,9 @@ Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -74,11 +77,34 @@ def rotation_from_axis_angle(
     return rotation_from_quaternion(torch.cat([half.cos(), half.sin() * axis], -1))
 
 
-def transform_points(
-    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"], points: Float[Tensor, "*batch n 3"]
-) -> Float[Tensor, "*batch n 3"]:
-    """Map points of frame b to frame a by `T_a_b = (rotation, translation)`."""
-    return points @ rotation.transpose(-1, -2) + translation[..., None, :]
+@dataclass(frozen=True, eq=False)
+class SE3:
+    """Rigid transforms `T_a_b`, one for each entry of the batch.
+
+    Attributes:
+        rotation: `R_a_b`.
+        translation: origin of frame b in frame a [m].
+    """
+
+    rotation: Float[Tensor, "*batch 3 3"]
+    translation: Float[Tensor, "*batch 3"]
+
+    def __getitem__(self, index: Any) -> SE3:
+        """The transforms at an index of the batch: `poses[:, links]`."""
+        return SE3(self.rotation[index], self.translation[index])
+
+    def apply(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 3"]:
+        """Map points of frame b to frame a."""
+        return points @ self.rotation.transpose(-1, -2) + self.translation[..., None, :]
+
+    def apply_inverse(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 3"]:
+        """Map points of frame a to frame b."""
+        return (points - self.translation[..., None, :]) @ self.rotation
+
+    def compose(self, other: SE3) -> SE3:
+        """`T_a_c` of this `T_a_b` and `T_b_c`, whose batch may be larger."""
+        turned = (self.rotation @ other.translation[..., None]).squeeze(-1)
+        return SE3(self.rotation @ other.rotation, turned + self.translation)
 
 
 def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "count 3 3"]:

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
 from graspd_core.se3 import (
+    SE3,
     normalize,
     quaternion_from_rotation,
     random_rotations,
     rotation_from_axis_angle,
     rotation_from_quaternion,
     safe_norm,
-    transform_points,
 )
 
 IDENTITY = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
@@ -63,11 +63,11 @@ def test_rotations_are_orthonormal_whatever_the_quaternions_length(q, scale):
 def test_transforms_compose_and_keep_distances(a, b, x, t):
     first, second = (rotation_from_quaternion(torch.as_tensor(q)) for q in (a, b))
     point, shift = torch.as_tensor(x)[None], torch.as_tensor(t)
-    once = transform_points(first @ second, shift, point)
-    zero = torch.zeros(3, dtype=torch.float64)
-    twice = transform_points(first, shift, transform_points(second, zero, point))
+    outer, inner = SE3(first, shift), SE3(second, torch.ones(3, dtype=torch.float64))
+    once, twice = outer.compose(inner).apply(point), outer.apply(inner.apply(point))
     assert once.numpy() == pytest.approx(twice.numpy(), abs=1e-12)
-    assert float((once - shift).norm()) == pytest.approx(float(point.norm()), abs=1e-12)
+    assert outer.apply_inverse(outer.apply(point)).numpy() == pytest.approx(point.numpy(), abs=1e-12)
+    assert float((outer.apply(point) - shift).norm()) == pytest.approx(float(point.norm()), abs=1e-12)
 
 
 @given(axis=vectors.filter(lambda v: np.linalg.norm(v) > 1e-3), angle=st.floats(-3.0, 3.0))

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel
-from graspd_core.se3 import safe_norm
+from graspd_core.se3 import SE3, safe_norm
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,49 +66,41 @@ def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: t
 
 
 def solid_distance(
-    solids: CollisionTensors,
-    rotations: Float[Tensor, "batch links 3 3"],
-    translations: Float[Tensor, "batch links 3"],
-    points: Float[Tensor, "batch points 3"],
+    solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
     """Signed distance [m] of base-frame points to every solid, negative inside, for the link poses of `forward`."""
-    local = _to_solids(solids, rotations, translations, points)
+    local = _to_solids(solids, links, points)
     return _distance(local, solids.core, solids.radius, solids.is_round)
 
 
 def solid_bound(
-    solids: CollisionTensors,
-    rotations: Float[Tensor, "batch links 3 3"],
-    translations: Float[Tensor, "batch links 3"],
-    points: Float[Tensor, "batch points 3"],
+    solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
     """A cheap lower bound of `solid_distance` [m]: largest coordinate of the offset from the bounding box."""
-    local = _to_solids(solids, rotations, translations, points)
+    local = _to_solids(solids, links, points)
     return (local.abs() - (solids.core + solids.radius[:, None])).amax(-1)
 
 
 def _to_solids(
-    solids: CollisionTensors, rotations: Tensor, translations: Tensor, points: Float[Tensor, "batch points 3"]
+    solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids 3"]:
     """Base-frame points in the frame of every solid."""
-    rotation = rotations[:, solids.link] @ solids.rotation
-    origin = (rotations[:, solids.link] @ solids.translation[:, :, None]).squeeze(-1) + translations[:, solids.link]
-    columns = rotation.permute(0, 2, 1, 3).flatten(2)
-    return (points @ columns).unflatten(-1, (-1, 3)) - (origin[:, :, None, :] @ rotation).squeeze(-2)[:, None]
+    placed = links[:, solids.link].compose(SE3(solids.rotation, solids.translation))
+    columns = placed.rotation.permute(0, 2, 1, 3).flatten(2)
+    origin = (placed.translation[:, :, None, :] @ placed.rotation).squeeze(-2)
+    return (points @ columns).unflatten(-1, (-1, 3)) - origin[:, None]
 
 
 def pair_distance(
     solids: CollisionTensors,
-    rotations: Float[Tensor, "batch links 3 3"],
-    translations: Float[Tensor, "batch links 3"],
+    links: SE3,
     points: Float[Tensor, "batch pairs 3"],
     which: Int[Tensor, "batch pairs"],
 ) -> Float[Tensor, "batch pairs"]:
     """Signed distance [m] of base-frame points each to one solid."""
     rows = torch.arange(len(points), device=points.device)[:, None]
-    links = solids.link[which]
-    in_link = (points - translations[rows, links])[..., None, :] @ rotations[rows, links]
-    local = ((in_link - solids.translation[which][..., None, :]) @ solids.rotation[which]).squeeze(-2)
+    in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
+    local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 

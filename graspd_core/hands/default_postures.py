@@ -134,7 +134,7 @@ def _around_ball(
         return torch.where(still, wrist, lower + half * (share.clamp(-1.0, 1.0) + 1.0))
 
     def cost() -> Float[Tensor, "starts"]:
-        away = place_points(matrix, *forward(kinematics, posture())) - (origin + fingers.length * shift[:, None])
+        away = place_points(matrix, forward(kinematics, posture())) - (origin + fingers.length * shift[:, None])
         outside = (share.abs() - 1.0).clamp_min(0.0).square().sum(-1)
         bent = _REST * (share - home).square().mean(-1)
         if directions is not None:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel
+from graspd_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +77,8 @@ def make_kinematics(
     )
 
 
-def forward(
-    kinematics: Kinematics, q: Float[Tensor, "batch joints"]
-) -> tuple[Float[Tensor, "batch links 3 3"], Float[Tensor, "batch links 3"]]:
-    """Rotations and translations `T_base_link` of every link at joint values q [rad] or [m], base frame [m]."""
+def forward(kinematics: Kinematics, q: Float[Tensor, "batch joints"]) -> SE3:
+    """`T_base_link` of every link at joint values q [rad] or [m]: a batch of hands by links."""
     k = kinematics
     values = q[:, k.joint]
     if k.multiplier is not None and k.shift is not None:
@@ -94,7 +93,7 @@ def forward(
         turned = parent[..., :3] @ levels[depth]
         levels[depth] = torch.cat([turned[..., :3], turned[..., 3:] + parent[..., 3:]], dim=-1)
     world = torch.cat(levels, dim=1)[:, k.order]
-    return world[..., :3], world[..., 3]
+    return SE3(world[..., :3], world[..., 3])
 
 
 def placement(
@@ -112,14 +111,10 @@ def placement(
     return matrix.flatten(1)
 
 
-def place_points(
-    matrix: Float[Tensor, "points columns"],
-    rotations: Float[Tensor, "batch links 3 3"],
-    translations: Float[Tensor, "batch links 3"],
-) -> Float[Tensor, "batch points 3"]:
+def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[Tensor, "batch points 3"]:
     """Points of a `placement` in the base frame [m], for the link poses that `forward` gives."""
-    batch = rotations.shape[0]
-    poses = torch.cat([rotations, translations[..., None]], dim=-1)
+    batch = links.rotation.shape[0]
+    poses = torch.cat([links.rotation, links.translation[..., None]], dim=-1)
     columns = poses.permute(1, 3, 0, 2).reshape(-1, 3 * batch)
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
 
@@ -131,8 +126,8 @@ def points_in_base(
     links: Int[Tensor, "points"],
 ) -> Float[Tensor, "batch points 3"]:
     """Link-frame points at joint values q, base frame [m]. For a fixed set of points keep its `placement` instead."""
-    rotations, translations = forward(kinematics, q)
-    return place_points(placement(translations.shape[1], points, links), rotations, translations)
+    poses = forward(kinematics, q)
+    return place_points(placement(poses.translation.shape[1], points, links), poses)
 
 
 def point_jacobian(
@@ -162,8 +157,8 @@ def link_poses(
     hand: HandModel, q: Float[np.ndarray, "joints"]
 ) -> tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]]:
     """`T_base_link` of every link at one posture in float64 numpy [m]."""
-    rotations, translations = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q)[None].double())
-    return rotations[0].numpy(), translations[0].numpy()
+    links = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q)[None].double())[0]
+    return links.rotation.numpy(), links.translation.numpy()
 
 
 def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:

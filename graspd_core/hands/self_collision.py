@@ -28,14 +28,14 @@ def link_overlaps(
 
     Adjacent pairs are reported like any other: mask with `hand.adjacent`.
     """
-    rotations, translations = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q).double())
+    poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q).double())
     owner = torch.as_tensor(links)
-    base = place_points(placement(hand.num_links, torch.as_tensor(points).double(), owner), rotations, translations)
+    base = place_points(placement(hand.num_links, torch.as_tensor(points).double(), owner), poses)
     depth = np.zeros((len(q), hand.num_links, hand.num_links))
     for link in range(hand.num_links):
         if not hand.primitives_of[link]:
             continue
-        local = (base - translations[:, link, None]) @ rotations[:, link]
+        local = poses[:, link].apply_inverse(base)
         inside = (-hand_sdf(hand, link, local)).clamp_min(0.0).numpy()
         np.maximum.at(depth[:, link].T, links, inside.T)
     depth[:, range(hand.num_links), range(hand.num_links)] = 0.0

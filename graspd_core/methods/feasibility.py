@@ -47,10 +47,9 @@ def out_of_reach(scene: Scene, hand: HandModel) -> str:
 
 def reach_of(hand: HandModel) -> tuple[float, float]:
     """Of the open hand: the greatest distance of two points of it, and the widest gap between two fingertips [m]."""
-    frames = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
-    links = torch.as_tensor(hand.candidate_link)
-    rotations, translations = (frame[0, links] for frame in frames)
-    points = (rotations @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + translations
+    poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
+    links = poses[0, torch.as_tensor(hand.candidate_link)]
+    points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
     groups = hand.link_group[hand.candidate_link]
     tips = [points[torch.as_tensor(groups == group)] for group in fingertip_groups(hand)]
     gaps = [float(torch.cdist(a, b).min()) for k, a in enumerate(tips) for b in tips[:k] if len(a) and len(b)]

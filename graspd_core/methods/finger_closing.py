@@ -164,11 +164,10 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
     Adjacent links are never near each other; a link without candidates and solids is infinitely far from all.
     """
     placed = hand_forward(problem, problem.fine, poses.translation, poses.quaternion, poses.joints)
-    count = placed.link_translations.shape[1]
+    count = placed.links.translation.shape[1]
     gaps = [_least(sample_sdf(problem.sdf, placed.points)[0], problem.fine.links, count)]
     if len(problem.features) and len(problem.solids.link):
-        in_base = (problem.features - poses.translation[:, None]) @ placed.rotation
-        sharp = solid_distance(problem.solids, placed.link_rotations, placed.link_translations, in_base).amin(1)
+        sharp = solid_distance(problem.solids, placed.links, placed.base.apply_inverse(problem.features)).amin(1)
         gaps.append(_least(sharp, problem.solids.link, count))
     overlap = _least(-sphere_overlap(problem, placed), sphere_links, count)
     return torch.stack([torch.stack(gaps).amin(0), overlap], 1)
@@ -176,7 +175,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
 def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
     """Greatest depth of each proxy sphere in one of a link that is not adjacent, zero where clear [m]."""
-    centers = place_points(problem.sphere_matrix, placed.link_rotations, placed.link_translations)
+    centers = place_points(problem.sphere_matrix, placed.links)
     reach = problem.sphere_radii[:, None] + problem.sphere_radii[None, :]
     depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.sphere_weight > 0)
     return torch.maximum(depth.amax(-1), depth.amax(-2))

@@ -22,7 +22,7 @@ from graspd_core.methods import losses
 from graspd_core.methods.obstacle_distance import RETREAT, RETREAT_SHARES, ObstacleTensors, obstacle_gaps
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import OBSTACLE_MARGIN, HandPlacement, Problem, hand_forward
-from graspd_core.se3 import rotation_from_quaternion, transform_points
+from graspd_core.se3 import SE3, rotation_from_quaternion
 
 _CONE_EDGES = 8
 # Weight of an even spread of the load against balance.
@@ -85,22 +85,19 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
         gap,
         (gap.abs() <= reach) & own_link & apart,
     )
-    return _with_features(problem, poses, placed, found, reach) if len(problem.features) else found
+    return _with_features(problem, placed, found, reach) if len(problem.features) else found
 
 
-def _with_features(
-    problem: Problem, poses: Poses, placed: HandPlacement, found: ContactSet, reach: float
-) -> ContactSet:
+def _with_features(problem: Problem, placed: HandPlacement, found: ContactSet, reach: float) -> ContactSet:
     """Add one slot per solid: the object's sharp point nearest to it, with the solid's own normal turned round."""
-    in_base = (problem.features - poses.translation[:, None]) @ placed.rotation
-    frames = (placed.link_rotations, placed.link_translations)
-    nearest, pick = solid_distance(problem.solids, *frames, in_base).min(1)
+    in_base = placed.base.apply_inverse(problem.features)
+    nearest, pick = solid_distance(problem.solids, placed.links, in_base).min(1)
     rows = torch.arange(len(pick), device=pick.device)[:, None]
     solids = torch.arange(len(problem.solids.link), device=pick.device).expand_as(pick)
     with torch.enable_grad():
         points = in_base[rows, pick].requires_grad_(True)
-        (directions,) = torch.autograd.grad(pair_distance(problem.solids, *frames, points, solids).sum(), points)
-    outward = directions @ placed.rotation.transpose(-1, -2)
+        (directions,) = torch.autograd.grad(pair_distance(problem.solids, placed.links, points, solids).sum(), points)
+    outward = directions @ placed.base.rotation.transpose(-1, -2)
     return ContactSet(
         torch.cat([found.link, problem.solids.link]),
         torch.cat([found.position, problem.features[pick]], 1),
@@ -117,9 +114,9 @@ def self_overlap(
     """Greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
     if len(problem.solids.link) == 0:
         return joints.new_zeros(len(joints))
-    frames = forward(problem.kinematics, joints)
-    points = place_points(problem.fine.matrix, *frames)
-    depth = -solid_distance(problem.solids, *frames, points)
+    links = forward(problem.kinematics, joints)
+    points = place_points(problem.fine.matrix, links)
+    depth = -solid_distance(problem.solids, links, points)
     checked = ~adjacent[problem.fine.links][:, problem.solids.link]
     return torch.where(checked, depth, 0.0).amax((-1, -2)).clamp_min(0.0)
 
@@ -163,14 +160,14 @@ def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Float[Tensor, "batch joints"]:
     """τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
-    rotation = rotation_from_quaternion(poses.quaternion)
-    x = (contact_set.position - poses.translation[:, None]) @ rotation
+    base = poses.base
+    x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
-    rotations, translations = (t[:, contact_set.link] for t in forward(problem.kinematics, joints))
+    links = forward(problem.kinematics, joints)[:, contact_set.link]
     with torch.no_grad():
-        material = rotations.transpose(-1, -2) @ (x - translations)[..., None]
-    moved = (rotations @ material).squeeze(-1) + translations
-    (torque,) = torch.autograd.grad((moved * (forces @ rotation)).sum(), joints)
+        material = links.rotation.transpose(-1, -2) @ (x - links.translation)[..., None]
+    moved = (links.rotation @ material).squeeze(-1) + links.translation
+    (torque,) = torch.autograd.grad((moved * (forces @ base.rotation)).sum(), joints)
     return torque
 
 
@@ -241,7 +238,7 @@ def find_pregrasp(
     cost[3:] /= problem.joint_scale**2
     cost[:3] = 2e3
     with torch.no_grad():
-        reached = hand_distance(problem, rotation_from_quaternion(poses.quaternion), start[:, :3], start[:, 3:])
+        reached = hand_distance(problem, poses.base, poses.joints)
     remaining = torch.tensor([1.0 - a for a in _WAY], dtype=start.dtype, device=start.device)[:, None, None]
     # Where the grasp itself sinks in, the way out starts from that depth.
     wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
@@ -251,7 +248,7 @@ def find_pregrasp(
 
     def distances(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch points"]:
         way = way_to(x)
-        return hand_distance(problem, rotation, way[:, :3], way[:, 3:])
+        return hand_distance(problem, SE3(rotation, way[:, :3]), way[:, 3:])
 
     x, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
     for count in range(1, config.open_steps + 1):
@@ -282,8 +279,7 @@ def _obstacle_cost(
     x: Float[Tensor, "batch variables"],
 ) -> Float[Tensor, "batch"]:
     """The loss term of obstacles for rows of translation and joints."""
-    frames = forward(problem.kinematics, x[:, 3:])
-    gaps = obstacle_gaps(obstacles, rotation, x[:, :3], *frames)
+    gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.kinematics, x[:, 3:]))
     return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
 
 
@@ -296,18 +292,13 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
     rotation = rotation_from_quaternion(pregrasp.quaternion)
     back = rotation @ obstacles.retreat
     nearest = [
-        hand_distance(problem, rotation, pregrasp.translation + RETREAT * share * back, pregrasp.joints).amin(-1)
+        hand_distance(problem, SE3(rotation, pregrasp.translation + RETREAT * share * back), pregrasp.joints).amin(-1)
         for share in RETREAT_SHARES
     ]
     return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
 
 
-def hand_distance(
-    problem: Problem,
-    rotation: Float[Tensor, "batch 3 3"],
-    translation: Float[Tensor, "batch 3"],
-    joints: Float[Tensor, "batch joints"],
-) -> Float[Tensor, "batch points"]:
+def hand_distance(problem: Problem, base: SE3, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch points"]:
     """Signed distance of every contact candidate to the object [m]."""
-    points = place_points(problem.coarse.matrix, *forward(problem.kinematics, joints))
-    return sample_sdf(problem.sdf, transform_points(rotation, translation, points))[0]
+    points = place_points(problem.coarse.matrix, forward(problem.kinematics, joints))
+    return sample_sdf(problem.sdf, base.apply(points))[0]

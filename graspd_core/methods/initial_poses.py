@@ -16,7 +16,7 @@ from graspd_core.methods.obstacle_distance import RETREAT, ObstacleTensors, make
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import fingertip_groups
 from graspd_core.scene.scene import Scene
-from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle
+from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
 
 # Distance of the palm from the hull [m], tilt of the palm against the hull's normal [rad], spread of the joints.
@@ -62,8 +62,8 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
 
     blocked = torch.zeros(pool, dtype=torch.float64)
     if obstacles is not None:
-        frames = forward(make_kinematics(hand, dtype=torch.float64), joints)
-        raised, blocked = raise_clear(obstacles, rotation, translation, frames)
+        links = forward(make_kinematics(hand, dtype=torch.float64), joints)
+        raised, blocked = raise_clear(obstacles, SE3(rotation, translation), links)
         palm, translation = palm + raised - translation, raised
 
     surface, _ = surface_samples(scene.object.mesh, _SPAN_POINTS, seed)
@@ -79,20 +79,18 @@ def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: st
 
 
 def raise_clear(
-    obstacles: ObstacleTensors,
-    rotation: Float[Tensor, "batch 3 3"],
-    translation: Float[Tensor, "batch 3"],
-    frames: tuple[Float[Tensor, "batch links 3 3"], Float[Tensor, "batch links 3"]],
+    obstacles: ObstacleTensors, base: SE3, links: SE3
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
-    """Hands moved off the support, within bounds; and how deep they, here or drawn back, reach into anything [m].
+    """Origins of hands moved off the support, within bounds; and how deep they reach into anything [m].
 
-    `frames` are the link poses in the base frame.
+    They are looked at where they are moved to and drawn back from there; `links` are the link poses in the base frame.
     """
+    translation = base.translation
     if obstacles.normal is not None:
-        depth = -obstacle_gaps(replace(obstacles, obstacles=()), rotation, translation, *frames).amin(-1)
+        depth = -obstacle_gaps(replace(obstacles, obstacles=()), base, links).amin(-1)
         translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
-    behind = translation + RETREAT * (rotation @ obstacles.retreat)
-    gaps = [obstacle_gaps(obstacles, rotation, at, *frames).amin(-1) for at in (translation, behind)]
+    behind = translation + RETREAT * (base.rotation @ obstacles.retreat)
+    gaps = [obstacle_gaps(obstacles, SE3(base.rotation, at), links).amin(-1) for at in (translation, behind)]
     return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
 
 

@@ -20,7 +20,7 @@ from graspd_core.hands.kinematics import Kinematics, forward, link_poses, place_
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.scene.scene import Obstacle, Scene
-from graspd_core.se3 import rotation_from_quaternion, transform_points
+from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # The hand comes to the pregrasp straight along its approach, from as far as this [m]; where it is looked at on the way.
 RETREAT = 0.1
@@ -132,21 +132,14 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
     return corners, 0.0
 
 
-def obstacle_gaps(
-    obstacles: ObstacleTensors,
-    rotation: Float[Tensor, "batch 3 3"],
-    translation: Float[Tensor, "batch 3"],
-    link_rotations: Float[Tensor, "batch links 3 3"],
-    link_translations: Float[Tensor, "batch links 3"],
-) -> Float[Tensor, "batch gaps"]:
+def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Tensor, "batch gaps"]:
     """Signed distances [m] of the hand's points to every obstacle, negative inside; link poses in the base frame."""
-    frames = (link_rotations, link_translations)
-    corners = transform_points(rotation, translation, place_points(obstacles.corner_matrix, *frames))
+    corners = base.apply(place_points(obstacles.corner_matrix, links))
     gaps = []
     if obstacles.normal is not None:
         gaps.append(corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii)
     if obstacles.obstacles:
-        spheres = transform_points(rotation, translation, place_points(obstacles.sphere_matrix, *frames))
+        spheres = base.apply(place_points(obstacles.sphere_matrix, links))
         points = torch.cat([corners, spheres], 1)
         radii = torch.cat([obstacles.corner_radii, obstacles.sphere_radii])
         gaps.extend(sample_sdf(sdf, points)[0] - radii for sdf in obstacles.obstacles)
@@ -169,5 +162,5 @@ def intrusion(
     back = rotation @ obstacles.retreat
     way = [(pregrasp[0] + RETREAT * share * back, pregrasp[1]) for share in RETREAT_SHARES]
     way += [(a * pregrasp[0] + (1 - a) * grasp[0], a * pregrasp[1] + (1 - a) * grasp[1]) for a in _WAY_SHARES]
-    gaps = [obstacle_gaps(obstacles, rotation, at, *forward(kinematics, joints)).amin(-1) for at, joints in way]
+    gaps = [obstacle_gaps(obstacles, SE3(rotation, at), forward(kinematics, joints)).amin(-1) for at, joints in way]
     return (-torch.stack(gaps).amin(0)).clamp_min(0.0)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.se3 import SE3, rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,11 @@ class Poses:
     translation: Float[Tensor, "batch 3"]
     quaternion: Float[Tensor, "batch 4"]
     joints: Float[Tensor, "batch joints"]
+
+    @property
+    def base(self) -> SE3:
+        """`T_object_base`."""
+        return SE3(rotation_from_quaternion(self.quaternion), self.translation)
 
     def __getitem__(self, rows: Tensor) -> Poses:
         return Poses(self.translation[rows], self.quaternion[rows], self.joints[rows])

@@ -22,7 +22,7 @@ from graspd_core.methods import losses
 from graspd_core.methods.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.scene.confidence import sample_confidence
 from graspd_core.scene.scene import Scene
-from graspd_core.se3 import rotation_from_quaternion, transform_points
+from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
 _REACH_OF_TIPS = 0.1
@@ -216,11 +216,10 @@ def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"])
 
 
 class HandPlacement(NamedTuple):
-    """A batch of hands: base rotations `R_object_base`, link poses in the base frame, candidates in the object's."""
+    """A batch of hands: `T_object_base`, `T_base_link` of every link, contact candidates in the object frame [m]."""
 
-    rotation: Float[Tensor, "batch 3 3"]
-    link_rotations: Float[Tensor, "batch links 3 3"]
-    link_translations: Float[Tensor, "batch links 3"]
+    base: SE3
+    links: SE3
     points: Float[Tensor, "batch points 3"]
 
 
@@ -232,28 +231,23 @@ def hand_forward(
     joints: Float[Tensor, "batch joints"],
 ) -> HandPlacement:
     """Where links and contact candidates are, for a batch of poses."""
-    rotation = rotation_from_quaternion(quaternion)
-    frames = forward(problem.kinematics, joints)
-    in_base = place_points(points.matrix, *frames)
-    return HandPlacement(rotation, *frames, transform_points(rotation, translation, in_base))
+    base = SE3(rotation_from_quaternion(quaternion), translation)
+    links = forward(problem.kinematics, joints)
+    return HandPlacement(base, links, base.apply(place_points(points.matrix, links)))
 
 
 def feature_distance(
-    problem: Problem,
-    features: Float[Tensor, "features 3"],
-    placed: HandPlacement,
-    translation: Float[Tensor, "batch 3"],
+    problem: Problem, features: Float[Tensor, "features 3"], placed: HandPlacement
 ) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
     """Signed distance of the object's sharp points to the hand's solids [m], of the nearest pairs; their solids."""
-    in_base = (features - translation[:, None]) @ placed.rotation
-    frames = (placed.link_rotations, placed.link_translations)
+    in_base = placed.base.apply_inverse(features)
     with torch.no_grad():
-        every = solid_bound(problem.solids, *frames, in_base)
+        every = solid_bound(problem.solids, placed.links, in_base)
     count = len(problem.solids.link)
     pairs = every.flatten(1).topk(min(_FEATURE_PAIRS, every[0].numel()), largest=False).indices
     solids = pairs % count
     rows = torch.arange(len(pairs), device=pairs.device)[:, None]
-    return pair_distance(problem.solids, *frames, in_base[rows, pairs // count], solids), solids
+    return pair_distance(problem.solids, placed.links, in_base[rows, pairs // count], solids), solids
 
 
 def _nearest_of_group(
@@ -287,7 +281,7 @@ def evaluate(
     sunk = losses.penetration(distance, radius)
     features = problem.features if fine else problem.features[: problem.coarse_features]
     if len(features):
-        sharp, solids = feature_distance(problem, features, placed, translation)
+        sharp, solids = feature_distance(problem, features, placed)
         sunk = sunk + losses.penetration(sharp, torch.zeros_like(radius))
         gap = torch.minimum(gap, _nearest_of_group(sharp, problem.group_of_solid[solids], gap.shape[-1]))
     # Only what is near the padded surface can push; the rest costs time and adds nothing.
@@ -305,11 +299,10 @@ def evaluate(
         problem.directions,
         problem.friction,
     )
-    frames = (placed.link_rotations, placed.link_translations)
-    spheres = place_points(problem.sphere_matrix, *frames)
+    spheres = place_points(problem.sphere_matrix, placed.links)
     obstacle = None
     if problem.obstacles is not None:
-        gaps = obstacle_gaps(problem.obstacles, placed.rotation, translation, *frames)
+        gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
         obstacle = losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
     return Terms(
         wrench_resistance=losses.wrench_resistance(support, problem.friction),

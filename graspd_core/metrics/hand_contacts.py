@@ -45,10 +45,10 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
     """Put the hand's samples where a posture puts them, and measure every sample's distance to the object."""
     surface = context.surface
     joints = torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None]
-    in_base = forward(surface.kinematics, joints)
+    links = forward(surface.kinematics, joints)[0]
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
-    rotations = base @ in_base[0][0].numpy()
-    translations = in_base[1][0].numpy() @ base.T + posture.position
+    rotations = base @ links.rotation.numpy()
+    translations = links.translation.numpy() @ base.T + posture.position
     placed = np.einsum("nij,nj->ni", rotations[surface.links], surface.points) + translations[surface.links]
     distance = signed_distance(context.query, placed, reach=_REACH)
     return PlacedHand(placed, surface.links, surface.areas, distance, rotations, translations)

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.scene import ObjectModel
-from graspd_core.se3 import quaternion_from_rotation, rotation_from_quaternion
+from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_quaternion
 from graspd_core.trials.bodies import OBJECT, add_object, add_primitive
 from graspd_core.trials.hold_trial import DIRECTIONS
 from graspd_core.types import Posture, TriangleMesh
@@ -87,8 +87,11 @@ def displacement_trial(
 
 
 def _place_links(world: FrozenWorld, data: Any, posture: Posture) -> None:
-    kinematics = make_kinematics(world.hand, "cpu", torch.float64)
-    rotations, translations = forward(kinematics, torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None])
-    base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64))
-    data.mocap_pos[:] = (translations[0] @ base.T).numpy() + posture.position
-    data.mocap_quat[:] = quaternion_from_rotation(base @ rotations[0]).numpy()
+    place, quaternion, joints = (
+        torch.as_tensor(part, dtype=torch.float64)
+        for part in (posture.position, posture.quaternion_wxyz, posture.joint_positions)
+    )
+    links = forward(make_kinematics(world.hand, "cpu", torch.float64), joints[None])[0]
+    base = SE3(rotation_from_quaternion(quaternion), place)
+    data.mocap_pos[:] = base.apply(links.translation).numpy()
+    data.mocap_quat[:] = quaternion_from_rotation(base.rotation @ links.rotation).numpy()

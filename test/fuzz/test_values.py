@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 import os
 from pathlib import Path
@@ -64,7 +63,7 @@ def test_a_setting_is_taken_as_it_is_or_refused_by_its_name(fuzz: ModuleType, da
         assert refusal.startswith(".".join(["config", *map(str, place)])[:12])
     # A mapping may leave out what has a default.
     elif not isinstance(value, dict):
-        assert json.loads(json.dumps(dataclasses.asdict(config), allow_nan=False)) == changed
+        assert json.loads(json.dumps(to_mapping(config), allow_nan=False)) == changed
 
 
 @settings(max_examples=60 * LONGER, derandomize=LONGER == 1)

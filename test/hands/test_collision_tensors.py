@@ -17,6 +17,7 @@ from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import hand_sdf, primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.se3 import SE3
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +48,11 @@ def drawn(hand: HandModel, seed: int, postures: int = 2, points: int = 12) -> tu
 @settings(max_examples=8)
 def test_distances_are_those_of_the_primitives(hand, solids, kinematics, seed):
     q, points = drawn(hand, seed)
-    rotations, translations = forward(kinematics, q)
-    together = solid_distance(solids, rotations, translations, points)
+    links = forward(kinematics, q)
+    together = solid_distance(solids, links, points)
     assert together.shape == (2, 12, len(hand.primitives))
     for link in range(hand.num_links):
-        local = (points - translations[:, None, link]) @ rotations[:, link]
+        local = links[:, link].apply_inverse(points)
         # The same formulas in another order: rounding of 0.1 m.
         for number, primitive in enumerate(hand.primitives):
             if primitive.link == link:
@@ -67,10 +68,10 @@ def test_distances_are_those_of_the_primitives(hand, solids, kinematics, seed):
 @settings(max_examples=8)
 def test_pairs_are_entries_of_the_whole(hand, solids, kinematics, seed):
     q, points = drawn(hand, seed)
-    frames = forward(kinematics, q)
+    links = forward(kinematics, q)
     which = torch.randint(len(solids.link), points.shape[:2], generator=torch.Generator().manual_seed(seed))
-    pairs = pair_distance(solids, *frames, points, which)
-    whole = solid_distance(solids, *frames, points).gather(-1, which[..., None]).squeeze(-1)
+    pairs = pair_distance(solids, links, points, which)
+    whole = solid_distance(solids, links, points).gather(-1, which[..., None]).squeeze(-1)
     assert pairs.numpy() == pytest.approx(whole.numpy(), abs=1e-12)
 
 
@@ -82,9 +83,9 @@ def test_capsules_are_swept_segments_and_hulls_are_left_out(hand):
     found = make_collision_tensors(replace(hand, primitives=(hull, capsule)), "cpu", torch.float64)
     assert found.link.tolist() == [1]
     q, points = drawn(hand, 0)
-    rotations, translations = forward(make_kinematics(hand, dtype=torch.float64), q)
-    local = (points - translations[:, None, 1]) @ rotations[:, 1]
-    together = solid_distance(found, rotations, translations, points)[..., 0]
+    links = forward(make_kinematics(hand, dtype=torch.float64), q)
+    local = links[:, 1].apply_inverse(points)
+    together = solid_distance(found, links, points)[..., 0]
     assert together.numpy() == pytest.approx(primitive_sdf(capsule, local).numpy(), abs=1e-12)
 
 
@@ -93,10 +94,10 @@ def test_gradients_against_finite_differences(hand, solids, kinematics):
     which = torch.tensor([[0, 7, 13], [4, 19, 26]])
 
     def every(q: Tensor, points: Tensor) -> Tensor:
-        return solid_distance(solids, *forward(kinematics, q), points)
+        return solid_distance(solids, forward(kinematics, q), points)
 
     def pairs(q: Tensor, points: Tensor) -> Tensor:
-        return pair_distance(solids, *forward(kinematics, q), points, which)
+        return pair_distance(solids, forward(kinematics, q), points, which)
 
     # Points are drawn anywhere, so none is within the step of 1e-6 of a kink (an edge's or a middle plane's extension).
     inputs = (q.requires_grad_(True), points.requires_grad_(True))
@@ -108,7 +109,7 @@ def test_gradients_are_finite_on_an_axis(solids):
     at = solids.translation[None].clone().requires_grad_(True)
     links = int(solids.link.max()) + 1
     rotations = torch.eye(3, dtype=torch.float64).expand(1, links, 3, 3)
-    distance = solid_distance(solids, rotations, torch.zeros(1, links, 3, dtype=torch.float64), at)
+    distance = solid_distance(solids, SE3(rotations, torch.zeros(1, links, 3, dtype=torch.float64)), at)
     # Each point is the middle of its own solid, and of no other necessarily.
     assert (distance[0].diagonal() < 0).all()
     (gradient,) = torch.autograd.grad(distance.sum(), at)

@@ -63,7 +63,8 @@ def test_agrees_with_pytorch_kinematics(hand: HandModel) -> None:
 
     chain = pk.build_chain_from_urdf(Path(hand.urdf).read_bytes())
     q = torch.as_tensor(_random_q(hand, 20, 0), dtype=torch.float32)
-    rotations, translations = forward(make_kinematics(hand), q)
+    found = forward(make_kinematics(hand), q)
+    rotations, translations = found.rotation, found.translation
     theirs = chain.forward_kinematics(q)
     for link, name in enumerate(hand.link_names):
         matrix = theirs[name].get_matrix()
@@ -97,7 +98,7 @@ def test_agrees_with_mujoco(allegro: HandModel) -> None:
 def test_gradients_by_finite_differences(hand: HandModel) -> None:
     kinematics = make_kinematics(hand, dtype=torch.float64)
     q = torch.as_tensor(_random_q(hand, 2, 2)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: forward(kinematics, x), q)
+    assert torch.autograd.gradcheck(lambda x: tuple(vars(forward(kinematics, x)).values()), q)
 
 
 @settings(max_examples=20, deadline=None)
@@ -107,14 +108,14 @@ def test_link_poses_are_rigid_and_placing_agrees_with_them(allegro: HandModel, s
     q = _random_q(allegro, 3, seed)
     points, links = rng.normal(size=(30, 3)), rng.integers(0, allegro.num_links, 30)
     kinematics = make_kinematics(allegro, dtype=torch.float64)
-    rotations, translations = forward(kinematics, torch.as_tensor(q))
+    poses = forward(kinematics, torch.as_tensor(q))
+    rotations, translations = poses.rotation, poses.translation
     eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
     expected = (rotations[:, links] @ torch.as_tensor(points)[None, :, :, None]).squeeze(-1)
     turned = place_points(
         placement(allegro.num_links, torch.as_tensor(points), torch.as_tensor(links), directions=True),
-        rotations,
-        translations,
+        poses,
     )
     torch.testing.assert_close(turned, expected, atol=1e-12, rtol=0)
     moved = points_in_base(kinematics, torch.as_tensor(q), torch.as_tensor(points), torch.as_tensor(links))
@@ -136,6 +137,6 @@ def test_point_jacobian_is_the_derivative(hand: HandModel) -> None:
 
 def test_float32_agrees_with_float64(allegro: HandModel) -> None:
     q = torch.as_tensor(_random_q(allegro, 10, 4))
-    double = forward(make_kinematics(allegro, dtype=torch.float64), q)[1]
-    single = forward(make_kinematics(allegro), q.float())[1]
+    double = forward(make_kinematics(allegro, dtype=torch.float64), q).translation
+    single = forward(make_kinematics(allegro), q.float()).translation
     torch.testing.assert_close(single.double(), double, atol=1e-6, rtol=0)

@@ -119,8 +119,7 @@ def test_the_energy_is_distance_and_facing_and_refuses_collisions(hand, problem_
     poses = annealing.poses(far)
     # From metres away the sphere is a point, its direction the same for all contact locations within the hand's size.
     chosen = inner_contacts(hand, SETTINGS.contacts_per_link)
-    rotation = rotation_from_quaternion(poses.quaternion)
-    every = hand_distance(replace(problem, coarse=problem.fine), rotation, poses.translation, poses.joints)[0, chosen]
+    every = hand_distance(replace(problem, coarse=problem.fine), poses.base, poses.joints)[0, chosen]
     energy = annealing.energy(problem, far).item()
     assert every.mean().item() < energy < every.mean().item() + 2 * SETTINGS.normal_weight
     inside = far.clone()
@@ -146,8 +145,7 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
     assert (solution.loss <= begun.nan_to_num(posinf=1e9)).all()
     assert solution.loss[legal].median() < begun[torch.isfinite(begun)].median() - 0.002
     found = solution.poses[legal]
-    rotation = rotation_from_quaternion(found.quaternion)
-    distance = hand_distance(problem, rotation, found.translation, found.joints)
+    distance = hand_distance(problem, found.base, found.joints)
     assert distance.min() >= 0
     assert (found.joints >= problem.lower).all()
     assert (found.joints <= problem.upper).all()
@@ -166,8 +164,7 @@ def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
     assert (first.interrupted, len(first.poses.joints)) == ("", 8)
     for name in ("translation", "quaternion", "joints"):
         assert torch.equal(getattr(first.poses, name), getattr(again.poses, name))
-    rotation = rotation_from_quaternion(first.poses.quaternion)
-    nearest = hand_distance(first.problem, rotation, first.poses.translation, first.poses.joints).amin(-1)
+    nearest = hand_distance(first.problem, first.poses.base, first.poses.joints).amin(-1)
     # Even so short a run closes most hands onto the object; the hand's 60 points may miss the very spot.
     assert (nearest < 0.005).sum() >= 6
 

@@ -78,12 +78,11 @@ def closed_on(problem, hand, scene, count: int) -> Poses:
     """Starts with the fingers closed until something touches."""
     starts = draw_starts(scene, hand, count, 0, "cpu", torch.float64)
     closed = torch.as_tensor(hand.closed_posture)
-    rotation = rotation_from_quaternion(starts.quaternion)
     share = torch.zeros(count, 1, dtype=torch.float64)
     moving = torch.ones(count, dtype=torch.bool)
     for step in torch.linspace(0, 1, 41)[1:].tolist():
         joints = starts.joints + step * (closed - starts.joints)
-        moving &= hand_distance(problem, rotation, starts.translation, joints).amin(-1) > 0
+        moving &= hand_distance(problem, starts.base, joints).amin(-1) > 0
         share[moving] = step
     return replace(starts, joints=starts.joints + share * (closed - starts.joints))
 
@@ -91,12 +90,11 @@ def closed_on(problem, hand, scene, count: int) -> Poses:
 def test_open_clear_opens_around_a_cylinder(problem_of, hand, scenes):
     problem, config = problem_of("cylinder"), GraspStagesConfig()
     grasps = closed_on(problem, hand, scenes["cylinder"], 6)
-    rotation = rotation_from_quaternion(grasps.quaternion)
-    before = hand_distance(problem, rotation, grasps.translation, grasps.joints).amin(-1)
+    before = hand_distance(problem, grasps.base, grasps.joints).amin(-1)
     touching = before < 0.004
     assert touching.sum() >= 3
     opened, clearance = find_pregrasp(problem, grasps, config)
-    after = hand_distance(problem, rotation, opened.translation, opened.joints).amin(-1)
+    after = hand_distance(problem, opened.base, opened.joints).amin(-1)
     assert (clearance > 0.5).all()
     # The share is that of the worst place of the way, so the open end has at least this much.
     assert (after >= clearance * config.clearance - 1e-9).all()

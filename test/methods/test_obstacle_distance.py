@@ -23,7 +23,7 @@ from graspd_core.methods.poses import pack
 from graspd_core.methods.problem import Problem, build_problem, evaluate
 from graspd_core.scene.obstacles import make_obstacles
 from graspd_core.scene.scene import Scene
-from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Plane, Posture
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -66,9 +66,9 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
     posture = Posture(rng.normal(size=3) * 0.1, quaternion, joints)
     obstacles = make_obstacle_tensors(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
     assert obstacles is not None
-    rotation = rotation_from_quaternion(torch.as_tensor(quaternion))[None]
-    frames = forward(problem(scenes["box"], hand).kinematics, torch.as_tensor(joints)[None])
-    gaps = obstacle_gaps(obstacles, rotation, torch.as_tensor(posture.position)[None], *frames)
+    base = SE3(rotation_from_quaternion(torch.as_tensor(quaternion)), torch.as_tensor(posture.position))[None]
+    links = forward(problem(scenes["box"], hand).kinematics, torch.as_tensor(joints)[None])
+    gaps = obstacle_gaps(obstacles, base, links)
     # Meshes of round solids are inscribed: facets cut off up to half a millimetre of a fingertip.
     assert float(gaps.min()) == pytest.approx(lowest(hand, posture, plane), abs=5e-4)
 

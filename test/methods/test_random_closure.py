@@ -114,7 +114,6 @@ def test_obstacles_are_kept_clear_of(hand, scenes):
     found = search(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), low)), hand, count=3)
     obstacles = found.problem.obstacles
     assert obstacles is not None
-    frames = forward(found.problem.kinematics, found.poses.joints)
-    gaps = obstacle_gaps(obstacles, rotation_from_quaternion(found.poses.quaternion), found.poses.translation, *frames)
+    gaps = obstacle_gaps(obstacles, found.poses.base, forward(found.problem.kinematics, found.poses.joints))
     assert len(gaps) >= 1
     assert gaps.min() >= 0

@@ -139,12 +139,12 @@ def add_frozen_hand(client: int, hand: HandModel, posture: Posture) -> tuple[int
     import pybullet
 
     kinematics = make_kinematics(hand, "cpu", torch.float64)
-    rotations, translations = forward(kinematics, torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None])
+    links = forward(kinematics, torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None])[0]
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
     bodies = []
     for primitive in hand.primitives:
-        link = base @ rotations[0, primitive.link].numpy()
-        origin = base @ translations[0, primitive.link].numpy() + posture.position
+        link = base @ links.rotation[primitive.link].numpy()
+        origin = base @ links.translation[primitive.link].numpy() + posture.position
         bodies.append(
             pybullet.createMultiBody(
                 baseMass=0.0,

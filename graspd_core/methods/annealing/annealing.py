@@ -35,7 +35,6 @@ from graspd_core.methods.obstacle_distance import obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
-from graspd_core.se3 import transform_points
 
 # GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
 _T0, _COOLING, _DIMENSIONS, _FIRST, _LAST = 1e6, 7.0, 8, 30_000, 100_000
@@ -144,25 +143,21 @@ class Annealing:
         """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
         poses = self.poses(x)
         placed = hand_forward(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
-        frames = (placed.link_rotations, placed.link_translations)
-        points = transform_points(placed.rotation, poses.translation, place_points(self.contacts, *frames))
-        outward = place_points(self.normals, *frames) @ placed.rotation.transpose(-1, -2)
+        points = placed.base.apply(place_points(self.contacts, placed.links))
+        outward = place_points(self.normals, placed.links) @ placed.base.rotation.transpose(-1, -2)
         distance, normal = sample_sdf(problem.sdf, torch.cat([placed.points, points], 1))
         count = len(self.contacts)
         away = 1.0 + (outward * normal[:, -count:]).sum(-1)
         energy = (distance[:, -count:].abs() + self.config.normal_weight * away).mean(-1)
-        legal = (distance.amin(-1) >= 0.0) & self.clear(problem, placed, poses.translation)
+        legal = (distance.amin(-1) >= 0.0) & self.clear(problem, placed)
         return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
 
-    def clear(
-        self, problem: Problem, placed: HandPlacement, translation: Float[Tensor, "batch 3"]
-    ) -> Bool[Tensor, "batch"]:
+    def clear(self, problem: Problem, placed: HandPlacement) -> Bool[Tensor, "batch"]:
         """Whether the hand keeps clear of itself and of obstacles."""
         clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
         if problem.obstacles is None:
             return clear
-        frames = (placed.link_rotations, placed.link_translations)
-        return clear & (obstacle_gaps(problem.obstacles, placed.rotation, translation, *frames).amin(-1) >= 0.0)
+        return clear & (obstacle_gaps(problem.obstacles, placed.base, placed.links).amin(-1) >= 0.0)
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:

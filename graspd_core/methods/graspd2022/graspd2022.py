@@ -208,11 +208,10 @@ class Graspd2022:
         else:
             left = motion_left(body, supplied, arms, velocities, self.time_step)
             difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
-        frames = (placed.link_rotations, placed.link_translations)
-        spheres = place_points(problem.sphere_matrix, *frames)
+        spheres = place_points(problem.sphere_matrix, placed.links)
         inter = losses.self_collision(spheres, problem.sphere_radii, problem.sphere_weight)
         if problem.obstacles is not None:
-            gaps = obstacle_gaps(problem.obstacles, placed.rotation, poses.translation, *frames)
+            gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
             inter = inter + losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
         beyond = (poses.joints - problem.upper).clamp_min(0.0) + (problem.lower - poses.joints).clamp_min(0.0)
         return Evaluation(

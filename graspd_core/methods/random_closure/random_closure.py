@@ -19,7 +19,7 @@ from graspd_core.methods.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
+from graspd_core.se3 import quaternion_from_rotation, random_rotations
 
 # The advance ends this far from the object, or after so many steps of the nearest distance each [m].
 _TOUCHING, _ADVANCES = 0.0003, 60
@@ -98,6 +98,5 @@ def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
     """Which hands reach into no support and no neighbour."""
     if problem.obstacles is None:
         return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
-    frames = forward(problem.kinematics, poses.joints)
-    rotation = rotation_from_quaternion(poses.quaternion)
-    return obstacle_gaps(problem.obstacles, rotation, poses.translation, *frames).amin(-1) >= 0.0
+    links = forward(problem.kinematics, poses.joints)
+    return obstacle_gaps(problem.obstacles, poses.base, links).amin(-1) >= 0.0

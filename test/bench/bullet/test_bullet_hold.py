@@ -36,7 +36,7 @@ def world(gripper, cube) -> BulletWorld:
 def test_links_are_where_the_model_has_them():
     hand = load_hand("allegro_right")
     q = np.random.default_rng(0).uniform(hand.lower, hand.upper)
-    rotations, translations = forward(make_kinematics(hand, "cpu", torch.float64), torch.as_tensor(q)[None])
+    links = forward(make_kinematics(hand, "cpu", torch.float64), torch.as_tensor(q)[None])[0]
     with simulation(timestep=0.001, solver_iterations=10) as client:
         body, joints = load_hand_urdf(client, hand, armature=0.0)
         for joint, value in zip(joints, q, strict=True):
@@ -45,9 +45,9 @@ def test_links_are_where_the_model_has_them():
             link = int(pybullet.getJointInfo(body, index, physicsClientId=client)[12].decode().removeprefix("link"))
             state = pybullet.getLinkState(body, index, computeForwardKinematics=True, physicsClientId=client)
             # Bullet's floats pass through angles and text.
-            assert np.array(state[4]) == pytest.approx(translations[0, link].numpy(), abs=1e-6)
+            assert np.array(state[4]) == pytest.approx(links.translation[link].numpy(), abs=1e-6)
             there = rotation_from_quaternion(torch.tensor(np.roll(state[5], 1))).numpy()
-            assert there == pytest.approx(rotations[0, link].numpy(), abs=1e-5)
+            assert there == pytest.approx(links.rotation[link].numpy(), abs=1e-5)
 
 
 @given(seed=st.integers(0, 2**31))
