@@ -73,10 +73,10 @@ def assemble(
     to its pregrasp is refused by a trial before its first step.
     """
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
-    effort = torch.as_tensor(hand.effort).to(problem.lower)
+    effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
     opened, clearance = find_pregrasp(problem, poses, config.grasp_stages, stop)
-    adjacent = torch.as_tensor(hand.adjacent, device=problem.lower.device)
+    adjacent = torch.as_tensor(hand.adjacent, device=problem.hand.lower.device)
     overlap = self_overlap(problem, poses.joints, adjacent)
     if any(primitive.kind == "hull" for primitive in hand.primitives):
         depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
@@ -84,7 +84,7 @@ def assemble(
     scores = score(contact_set, pressed, clearance, overlap)
     if problem.obstacles is not None:
         ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
-        depth = intrusion(problem.obstacles, problem.kinematics, poses.quaternion, *ends)
+        depth = intrusion(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
         knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     order = scores.argsort(descending=True)

@@ -121,7 +121,7 @@ class Closing:
 
 def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing:
     """The closing of a hand in `close_steps` full steps from its open to its closed posture."""
-    device = problem.lower.device
+    device = problem.hand.lower.device
     travel = hand.closed_posture - hand.open_posture
     # Joints that hardly differ between the two postures shape the hand, they do not close it.
     travel = np.where(np.abs(travel) > 0.01 * (hand.upper - hand.lower), travel, 0.0)
@@ -129,8 +129,8 @@ def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing
     fingers = finger_of(hand)
     same = fingers[:, None] == fingers[None, :]
     return Closing(
-        rate=torch.as_tensor(travel / close_steps).to(problem.lower),
-        target=torch.as_tensor(np.where(travel > 0, hand.upper, hand.lower)).to(problem.lower),
+        rate=torch.as_tensor(travel / close_steps).to(problem.hand.lower),
+        target=torch.as_tensor(np.where(travel > 0, hand.upper, hand.lower)).to(problem.hand.lower),
         moves=torch.as_tensor(moves, device=device),
         finger_links=torch.as_tensor((same.astype(int) @ moves) > 0, device=device),
         sphere_links=torch.as_tensor(collision_spheres(hand)[2], device=device),
@@ -163,21 +163,23 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
     Adjacent links are never near each other; a link without candidates and solids is infinitely far from all.
     """
-    placed = hand_forward(problem, problem.fine, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(problem, problem.hand.fine, poses.translation, poses.quaternion, poses.joints)
     count = placed.links.translation.shape[1]
-    gaps = [_least(sample_sdf(problem.sdf, placed.points)[0], problem.fine.links, count)]
-    if len(problem.features) and len(problem.solids.link):
-        sharp = solid_distance(problem.solids, placed.links, placed.base.apply_inverse(problem.features)).amin(1)
-        gaps.append(_least(sharp, problem.solids.link, count))
+    gaps = [_least(sample_sdf(problem.object.sdf, placed.points)[0], problem.hand.fine.links, count)]
+    if len(problem.object.features) and len(problem.hand.solids.link):
+        sharp = solid_distance(
+            problem.hand.solids, placed.links, placed.base.apply_inverse(problem.object.features)
+        ).amin(1)
+        gaps.append(_least(sharp, problem.hand.solids.link, count))
     overlap = _least(-sphere_overlap(problem, placed), sphere_links, count)
     return torch.stack([torch.stack(gaps).amin(0), overlap], 1)
 
 
 def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
     """Greatest depth of each proxy sphere in one of a link that is not adjacent, zero where clear [m]."""
-    centers = place_points(problem.sphere_matrix, placed.links)
-    reach = problem.sphere_radii[:, None] + problem.sphere_radii[None, :]
-    depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.sphere_weight > 0)
+    centers = place_points(problem.hand.spheres.matrix, placed.links)
+    reach = problem.hand.spheres.radii[:, None] + problem.hand.spheres.radii[None, :]
+    depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.hand.spheres.weight > 0)
     return torch.maximum(depth.amax(-1), depth.amax(-2))
 
 

@@ -58,9 +58,9 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
 
     Slots within `reach` [m] of the surface are active.
     """
-    points = problem.fine
+    points = problem.hand.fine
     placed = hand_forward(problem, points, poses.translation, poses.quaternion, poses.joints)
-    distance, normal = sample_sdf(problem.sdf, placed.points)
+    distance, normal = sample_sdf(problem.object.sdf, placed.points)
     links = torch.unique(points.links)
     members = points.links[None, :] == links[:, None]
     near = members[None] & (distance.abs() <= reach)[:, None]
@@ -85,22 +85,24 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
         gap,
         (gap.abs() <= reach) & own_link & apart,
     )
-    return _with_features(problem, placed, found, reach) if len(problem.features) else found
+    return _with_features(problem, placed, found, reach) if len(problem.object.features) else found
 
 
 def _with_features(problem: Problem, placed: HandPlacement, found: ContactSet, reach: float) -> ContactSet:
     """Add one slot per solid: the object's sharp point nearest to it, with the solid's own normal turned round."""
-    in_base = placed.base.apply_inverse(problem.features)
-    nearest, pick = solid_distance(problem.solids, placed.links, in_base).min(1)
+    in_base = placed.base.apply_inverse(problem.object.features)
+    nearest, pick = solid_distance(problem.hand.solids, placed.links, in_base).min(1)
     rows = torch.arange(len(pick), device=pick.device)[:, None]
-    solids = torch.arange(len(problem.solids.link), device=pick.device).expand_as(pick)
+    solids = torch.arange(len(problem.hand.solids.link), device=pick.device).expand_as(pick)
     with torch.enable_grad():
         points = in_base[rows, pick].requires_grad_(True)
-        (directions,) = torch.autograd.grad(pair_distance(problem.solids, placed.links, points, solids).sum(), points)
+        (directions,) = torch.autograd.grad(
+            pair_distance(problem.hand.solids, placed.links, points, solids).sum(), points
+        )
     outward = directions @ placed.base.rotation.transpose(-1, -2)
     return ContactSet(
-        torch.cat([found.link, problem.solids.link]),
-        torch.cat([found.position, problem.features[pick]], 1),
+        torch.cat([found.link, problem.hand.solids.link]),
+        torch.cat([found.position, problem.object.features[pick]], 1),
         torch.cat([found.normal, -outward], 1),
         torch.cat([found.distance, nearest], 1),
         torch.cat([found.active, nearest.abs() <= reach], 1),
@@ -112,12 +114,12 @@ def self_overlap(
     problem: Problem, joints: Float[Tensor, "batch joints"], adjacent: Bool[Tensor, "links links"]
 ) -> Float[Tensor, "batch"]:
     """Greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
-    if len(problem.solids.link) == 0:
+    if len(problem.hand.solids.link) == 0:
         return joints.new_zeros(len(joints))
-    links = forward(problem.kinematics, joints)
-    points = place_points(problem.fine.matrix, links)
-    depth = -solid_distance(problem.solids, links, points)
-    checked = ~adjacent[problem.fine.links][:, problem.solids.link]
+    links = forward(problem.hand.kinematics, joints)
+    points = place_points(problem.hand.fine.matrix, links)
+    depth = -solid_distance(problem.hand.solids, links, points)
+    checked = ~adjacent[problem.hand.fine.links][:, problem.hand.solids.link]
     return torch.where(checked, depth, 0.0).amax((-1, -2)).clamp_min(0.0)
 
 
@@ -141,19 +143,19 @@ def squeeze(
 ) -> Squeeze:
     """Forces in the friction cones with zero net wrench (non-negative least squares), as joint offsets JᵀF / kp."""
     unit_forces, imbalance = balanced_forces(
-        (contact_set.position - problem.center).double().cpu().numpy(),
+        (contact_set.position - problem.object.center).double().cpu().numpy(),
         contact_set.normal.double().cpu().numpy(),
         contact_set.active.cpu().numpy(),
-        problem.length,
+        problem.object.length,
         problem.friction,
     )
-    forces = torch.as_tensor(unit_forces).to(problem.lower)
+    forces = torch.as_tensor(unit_forces).to(problem.hand.lower)
     torque = joint_torques(problem, poses, contact_set, forces)
     limit = (effort * config.effort_share / torque.abs().clamp_min(1e-9)).amin(-1)
     scale = limit.clamp(max=config.grip_force)[:, None]
-    stiffness = torch.where(problem.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
-    targets = (poses.joints + scale * torque / stiffness).clamp(problem.lower, problem.upper)
-    return Squeeze(targets, scale[..., None] * forces, torch.as_tensor(imbalance).to(problem.lower))
+    stiffness = torch.where(problem.hand.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
+    targets = (poses.joints + scale * torque / stiffness).clamp(problem.hand.lower, problem.hand.upper)
+    return Squeeze(targets, scale[..., None] * forces, torch.as_tensor(imbalance).to(problem.hand.lower))
 
 
 def joint_torques(
@@ -163,7 +165,7 @@ def joint_torques(
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
-    links = forward(problem.kinematics, joints)[:, contact_set.link]
+    links = forward(problem.hand.kinematics, joints)[:, contact_set.link]
     with torch.no_grad():
         material = links.rotation.transpose(-1, -2) @ (x - links.translation)[..., None]
     moved = (links.rotation @ material).squeeze(-1) + links.translation
@@ -232,10 +234,10 @@ def find_pregrasp(
     start = torch.cat([poses.translation, poses.joints], -1)
     rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
     rates = torch.full_like(start[0], config.open_joint_rate)
-    rates[3:] *= problem.joint_scale
+    rates[3:] *= problem.hand.joint_scale
     rates[:3] = config.open_base_rate
     cost = torch.full_like(start[0], 0.1)
-    cost[3:] /= problem.joint_scale**2
+    cost[3:] /= problem.hand.joint_scale**2
     cost[:3] = 2e3
     with torch.no_grad():
         reached = hand_distance(problem, poses.base, poses.joints)
@@ -266,7 +268,7 @@ def find_pregrasp(
         square = 0.98 * square + 0.02 * gradient * gradient
         fade = 1.0 - 0.9 * count / config.open_steps
         x = x.detach() - fade * rates * (mean / (1 - 0.9**count)) / ((square / (1 - 0.98**count)).sqrt() + 1e-8)
-        x = torch.cat([x[:, :3], x[:, 3:].clamp(problem.lower, problem.upper)], -1)
+        x = torch.cat([x[:, :3], x[:, 3:].clamp(problem.hand.lower, problem.hand.upper)], -1)
     with torch.no_grad():
         share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
     return Poses(x[:, :3], poses.quaternion, x[:, 3:]), share
@@ -279,7 +281,7 @@ def _obstacle_cost(
     x: Float[Tensor, "batch variables"],
 ) -> Float[Tensor, "batch"]:
     """The loss term of obstacles for rows of translation and joints."""
-    gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.kinematics, x[:, 3:]))
+    gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.hand.kinematics, x[:, 3:]))
     return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
 
 
@@ -300,5 +302,5 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
 
 def hand_distance(problem: Problem, base: SE3, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch points"]:
     """Signed distance of every contact candidate to the object [m]."""
-    points = place_points(problem.coarse.matrix, forward(problem.kinematics, joints))
-    return sample_sdf(problem.sdf, base.apply(points))[0]
+    points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
+    return sample_sdf(problem.object.sdf, base.apply(points))[0]

@@ -14,7 +14,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.methods.poses import Poses
-from graspd_core.methods.problem import fingertip_groups
+from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
@@ -87,7 +87,7 @@ def raise_clear(
     """
     translation = base.translation
     if obstacles.normal is not None:
-        depth = -obstacle_gaps(replace(obstacles, obstacles=()), base, links).amin(-1)
+        depth = -obstacle_gaps(replace(obstacles, sdfs=()), base, links).amin(-1)
         translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
     behind = translation + RETREAT * (base.rotation @ obstacles.retreat)
     gaps = [obstacle_gaps(obstacles, SE3(base.rotation, at), links).amin(-1) for at in (translation, behind)]

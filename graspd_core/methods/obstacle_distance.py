@@ -41,7 +41,7 @@ class ObstacleTensors:
         sphere_radii: of the proxy spheres [m].
         normal: of the support, into the free side; None without a support.
         offset: n·x of the support's points [m].
-        neighbours: signed distances of the things that this hand can reach.
+        sdfs: signed distances of the things that this hand can reach.
         retreat: unit direction in which the hand leaves its pregrasp backwards, base frame.
     """
 
@@ -51,7 +51,7 @@ class ObstacleTensors:
     sphere_radii: Float[Tensor, "spheres"]
     normal: Float[Tensor, "3"] | None
     offset: float
-    obstacles: tuple[GridSDF, ...]
+    sdfs: tuple[GridSDF, ...]
     retreat: Float[Tensor, "3"]
 
 
@@ -78,7 +78,7 @@ def make_obstacle_tensors(
         sphere_radii=tensor(sphere_radii),
         normal=None if scene.support is None else tensor(scene.support.normal),
         offset=0.0 if scene.support is None else scene.support.offset,
-        obstacles=tuple(n.sdf.to(device, dtype) for n in obstacles),
+        sdfs=tuple(n.sdf.to(device, dtype) for n in obstacles),
         retreat=tensor(-hand.approach),
     )
 
@@ -138,11 +138,11 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Te
     gaps = []
     if obstacles.normal is not None:
         gaps.append(corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii)
-    if obstacles.obstacles:
+    if obstacles.sdfs:
         spheres = base.apply(place_points(obstacles.sphere_matrix, links))
         points = torch.cat([corners, spheres], 1)
         radii = torch.cat([obstacles.corner_radii, obstacles.sphere_radii])
-        gaps.extend(sample_sdf(sdf, points)[0] - radii for sdf in obstacles.obstacles)
+        gaps.extend(sample_sdf(sdf, points)[0] - radii for sdf in obstacles.sdfs)
     return torch.cat(gaps, -1)
 
 

@@ -55,18 +55,8 @@ class PlannerInput:
 
 def problem_of(task: PlannerInput) -> Problem:
     """The problem in which every method's poses are made into grasps and ranked."""
-    settings = task.config.problem
     return build_problem(
-        task.scene,
-        task.hand,
-        candidates=settings.candidates,
-        features=settings.features,
-        directions=settings.directions,
-        friction=min(settings.friction, task.scene.object.friction),
-        seed=task.seed,
-        device=task.device,
-        dtype=task.dtype,
-        confidence_floor=settings.confidence_floor,
+        task.scene, task.hand, task.config.problem, seed=task.seed, device=task.device, dtype=task.dtype
     )
 
 

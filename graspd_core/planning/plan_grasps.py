@@ -14,11 +14,11 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.feasibility import out_of_reach
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import make_metrics_context
+from graspd_core.planning.feasibility import out_of_reach
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.planning.run_clock import Run

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from graspd_core.config import ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.problem import Problem, build_problem
@@ -33,9 +34,12 @@ def problem_of(hand: HandModel, scenes: dict[str, Scene]) -> Callable[[str, torc
     def problem_of(name: str, dtype: torch.dtype = torch.float64) -> Problem:
         if (name, dtype) not in built:
             built[name, dtype] = build_problem(
-                scenes[name], hand, candidates=60, features=24, directions=12, friction=0.5, seed=0,
-                device="cpu", dtype=dtype,
-            )  # fmt: skip
+                scenes[name],
+                hand,
+                ProblemConfig(candidates=60, features=24, directions=12, friction=0.5),
+                seed=0,
+                dtype=dtype,
+            )
         return built[name, dtype]
 
     return problem_of

@@ -98,7 +98,9 @@ def test_quaternions_multiply_as_rotations_do():
 def test_epsilon_of_contacts_worked_by_hand(problem_of):
     # Six contacts on the axes of a unit sphere about the centre of mass, friction μ: no contact resists a torque
     # about an axis by more than μ (its arm is one), and a force along an axis is resisted by the one contact behind it.
-    problem = replace(problem_of("sphere", DOUBLE), center=torch.zeros(3, dtype=DOUBLE), length=1.0, friction=0.5)
+    problem = problem_of("sphere", DOUBLE)
+    unit = replace(problem.object, center=torch.zeros(3, dtype=DOUBLE), length=1.0)
+    problem = replace(problem, object=unit, friction=0.5)
     axes = torch.cat([torch.eye(3, dtype=DOUBLE), -torch.eye(3, dtype=DOUBLE)])[None]
     contact_set = ContactSet(
         torch.arange(6), axes, axes, torch.zeros(1, 6, dtype=DOUBLE), torch.ones(1, 6, dtype=torch.bool)
@@ -119,11 +121,13 @@ def test_the_energy_is_distance_and_facing_and_refuses_collisions(hand, problem_
     poses = annealing.poses(far)
     # From metres away the sphere is a point, its direction the same for all contact locations within the hand's size.
     chosen = inner_contacts(hand, SETTINGS.contacts_per_link)
-    every = hand_distance(replace(problem, coarse=problem.fine), poses.base, poses.joints)[0, chosen]
+    every = hand_distance(
+        replace(problem, hand=replace(problem.hand, coarse=problem.hand.fine)), poses.base, poses.joints
+    )[0, chosen]
     energy = annealing.energy(problem, far).item()
     assert every.mean().item() < energy < every.mean().item() + 2 * SETTINGS.normal_weight
     inside = far.clone()
-    inside[0, :3] = problem.center
+    inside[0, :3] = problem.object.center
     assert annealing.energy(problem, inside).item() == math.inf
 
 
@@ -147,8 +151,8 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
     found = solution.poses[legal]
     distance = hand_distance(problem, found.base, found.joints)
     assert distance.min() >= 0
-    assert (found.joints >= problem.lower).all()
-    assert (found.joints <= problem.upper).all()
+    assert (found.joints >= problem.hand.lower).all()
+    assert (found.joints <= problem.hand.upper).all()
 
 
 def search(scene, hand, *, seed: int = 0, hooks: Hooks | None = None) -> PlannerOutput:

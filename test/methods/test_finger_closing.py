@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_core.config import ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
@@ -55,7 +56,7 @@ def cube_scene(half: float, shift: float = 0.0) -> Scene:
 
 def small_problem(scene: Scene, hand: HandModel) -> Problem:
     return build_problem(
-        scene, hand, candidates=60, features=24, directions=12, friction=0.5, seed=0, device="cpu", dtype=DOUBLE
+        scene, hand, ProblemConfig(candidates=60, features=24, directions=12, friction=0.5), seed=0, dtype=DOUBLE
     )
 
 
@@ -109,8 +110,8 @@ def test_no_link_of_a_real_hand_sinks_in_and_every_joint_stops_for_a_reason(alle
     joints = state.poses.joints
     gaps = link_gaps(problem, state.poses, closing.sphere_links)
     assert gaps[:, 0].min() >= 0
-    assert (joints >= problem.lower).all()
-    assert (joints <= problem.upper).all()
+    assert (joints >= problem.hand.lower).all()
+    assert (joints <= problem.hand.upper).all()
     # A joint that a contact stopped moves a link that touches: half a millimetre is many times the last, halved step.
     arrived = state.stopped & (closing.rate != 0.0) & (joints != closing.target)
     touching = (gaps[:, 0] < 5e-4) | (gaps[:, 1] < -5e-4)

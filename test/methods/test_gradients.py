@@ -89,7 +89,7 @@ def terms_at(problem, x: Tensor, fine: bool) -> Terms:
 @pytest.mark.parametrize(("name", "fine"), [("sphere", False), ("sphere", True), ("box", False), ("box", True)])
 def test_gradients_of_the_whole_evaluation(hand, scenes, problem_of, slope_errors, name, fine, variables):
     problem = problem_of(name)
-    assert not fine or name != "box" or len(problem.features)
+    assert not fine or name != "box" or len(problem.object.features)
     x = pack(random_poses(hand, scenes[name], 4))
     for number, term in enumerate(TERMS):
         if term in ("self_collision", "posture") and variables != slice(7, None):
@@ -161,12 +161,14 @@ import torch
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.hands.library import load_hand
 from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.config import ProblemConfig
 from graspd_core.methods.problem import build_problem, evaluate
 
 torch.set_num_threads(1)
 hand, scene = load_hand("allegro_right", candidates=80), load_scene("shape:box", resolution=24)
-settings = dict(candidates=60, features=24, directions=12, friction=0.5, seed=0, device="cpu", dtype=torch.float64)
-problem, p = build_problem(scene, hand, **settings), draw_starts(scene, hand, 2, 0, "cpu", torch.float64)
+settings = ProblemConfig(candidates=60, features=24, directions=12, friction=0.5)
+problem = build_problem(scene, hand, settings, seed=0, dtype=torch.float64)
+p = draw_starts(scene, hand, 2, 0, "cpu", torch.float64)
 arguments = (problem, p.translation, p.quaternion, p.joints, torch.zeros(2, dtype=torch.float64), 0.004)
 traced = torch.compile(evaluate, backend="eager", fullgraph=True)
 for fine in (False, True):

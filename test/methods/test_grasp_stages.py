@@ -100,7 +100,7 @@ def test_open_clear_opens_around_a_cylinder(problem_of, hand, scenes):
     assert (after >= clearance * config.clearance - 1e-9).all()
     assert (after > before)[touching].all()
     assert torch.equal(opened.quaternion, grasps.quaternion)
-    assert ((opened.joints >= problem.lower) & (opened.joints <= problem.upper)).all()
+    assert ((opened.joints >= problem.hand.lower) & (opened.joints <= problem.hand.upper)).all()
 
 
 def fingertip_on_sphere(problem, hand) -> tuple[Poses, int, torch.Tensor, torch.Tensor]:
@@ -168,7 +168,7 @@ def test_the_squeeze_presses_within_effort_and_limits(problem_of, hand, scenes):
     contact_set = find_contacts(problem, poses, reach=0.02)
     effort = torch.as_tensor(hand.effort)
     pressed = squeeze(problem, poses, contact_set, effort, config)
-    assert ((pressed.joints >= problem.lower) & (pressed.joints <= problem.upper)).all()
+    assert ((pressed.joints >= problem.hand.lower) & (pressed.joints <= problem.hand.upper)).all()
     assert not pressed.forces[~contact_set.active].any()
     pressing = -(pressed.forces * contact_set.normal).sum((-1, -2))
     assert (pressing > 0).any()

@@ -150,7 +150,7 @@ def test_gradients_of_the_whole_evaluation(name, problem, starts, solver_of, slo
     solver = solver_of(replace(VARIANTS[name], leak=0.0, scaling="object", stiffness=1e3))
     x = pack(starts)
     components = 6 if name == "wrench" else 3
-    desired = 0.1 * draw(0, len(x), len(problem.coarse.links), 3, components)
+    desired = 0.1 * draw(0, len(x), len(problem.hand.coarse.links), 3, components)
     radius = x.new_full((len(x),), 0.12)
 
     def lagrangian(y: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ def test_gradients_of_the_whole_evaluation(name, problem, starts, solver_of, slo
 def test_the_task_is_a_matter_of_the_forces_not_of_the_pose(problem, starts, solver_of):
     solver = solver_of(VARIANTS["cone"])
     x = pack(starts).requires_grad_(True)
-    desired = (0.1 * draw(0, len(x), len(problem.coarse.links), 3, 3)).requires_grad_(True)
+    desired = (0.1 * draw(0, len(x), len(problem.hand.coarse.links), 3, 3)).requires_grad_(True)
     task = solver.evaluate(problem, x, desired, x.detach().new_zeros(len(x))).task
     by_pose, by_force = torch.autograd.grad(task.sum(), (x, desired), allow_unused=True)
     assert by_pose is None
@@ -176,14 +176,14 @@ def test_published_starts_face_the_surface_from_ten_centimetres(problem, scenes,
     starts = published_starts(problem, scenes["box"], hand, 6, 3, 0.1)
     rotation = rotation_from_quaternion(starts.quaternion)
     palm = starts.translation + rotation @ torch.as_tensor(hand.palm_center)
-    distance, normal = sample_sdf(problem.sdf, palm)
+    distance, normal = sample_sdf(problem.object.sdf, palm)
     facing = rotation @ torch.as_tensor(hand.palm_normal)
     # The grid is 3 cm wider than the box; farther out its distance errs by little, its direction by a little more.
     assert distance.numpy() == pytest.approx(np.full(6, 0.1), abs=5e-3)
     assert ((facing * normal).sum(-1) < -0.95).all()
     assert torch.equal(starts.joints, torch.as_tensor(hand.open_posture).expand(6, -1))
-    placed = hand_forward(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
-    assert (sample_sdf(problem.sdf, placed.points)[0] > 0).all()
+    placed = hand_forward(problem, problem.hand.coarse, starts.translation, starts.quaternion, starts.joints)
+    assert (sample_sdf(problem.object.sdf, placed.points)[0] > 0).all()
 
 
 def test_published_starts_come_from_all_sides(problem_of, scenes, hand):
@@ -228,7 +228,9 @@ def test_desired_forces_of_the_cone_stay_in_it(problem, starts, solver_of):
         before = state
         state = solver.step(problem, state, index)
     p = before.pose.value
-    normals = sample_sdf(problem.sdf, hand_forward(problem, problem.coarse, p[:, :3], p[:, 3:7], p[:, 7:]).points)[1]
+    normals = sample_sdf(
+        problem.object.sdf, hand_forward(problem, problem.hand.coarse, p[:, :3], p[:, 3:7], p[:, 7:]).points
+    )[1]
     assert state.forces.value.abs().max() > 0
     kept = into_cone(state.forces.value, normals, 0.8)
     assert kept.numpy() == pytest.approx(state.forces.value.numpy(), abs=1e-9)
@@ -244,8 +246,8 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
     state = solver.step(problem, state, SHORT.coarse_steps)
     assert torch.isfinite(state.best_loss).all()
     by_code = solver_of(replace(SHORT, radius="code")).init(problem, starts).radius
-    placed = hand_forward(problem, problem.coarse, starts.translation, starts.quaternion, starts.joints)
-    nearest = sample_sdf(problem.sdf, placed.points)[0].amin(-1)
+    placed = hand_forward(problem, problem.hand.coarse, starts.translation, starts.quaternion, starts.joints)
+    nearest = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)
     assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
 
 
@@ -271,8 +273,8 @@ def test_the_search_obeys_limits_and_stop(hand, scenes):
     task = PlannerInput(scenes["sphere"], hand, 2, 1, config, Hooks())
     found = plan(task)
     assert len(found.poses.translation) == 2
-    assert (found.poses.joints >= found.problem.lower).all()
-    assert (found.poses.joints <= found.problem.upper).all()
+    assert (found.poses.joints >= found.problem.hand.lower).all()
+    assert (found.poses.joints <= found.problem.hand.upper).all()
     polls = iter([False, True])
     stopped = plan(replace(task, hooks=Hooks(stop=polls.__next__)))
     assert stopped.interrupted == "cancelled"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.config import GraspStagesConfig
+from graspd_core.config import GraspStagesConfig, ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
 from graspd_core.methods.closed_form.closed_form import ClosedForm, adam_step
@@ -32,7 +32,7 @@ def gripper() -> HandModel:
 
 def problem_with(hand: HandModel, scene: Scene) -> Problem:
     return build_problem(
-        scene, hand, candidates=80, features=24, directions=12, friction=0.5, seed=0, device="cpu", dtype=DOUBLE
+        scene, hand, ProblemConfig(candidates=80, features=24, directions=12, friction=0.5), seed=0, dtype=DOUBLE
     )
 
 
@@ -70,7 +70,7 @@ def test_the_solver_does_not_see_where_a_far_base_frame_is(gripper: HandModel, s
 
 
 def test_a_hand_whose_base_lies_in_its_palm_turns_about_that(problem_of) -> None:
-    assert problem_of("box").pivot.tolist() == [0.0, 0.0, 0.0]
+    assert problem_of("box").hand.pivot.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_first_step_of_a_sliding_joint_is_its_share_of_a_radian(gripper: HandModel, scenes: dict[str, Scene]) -> None:

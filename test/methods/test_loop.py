@@ -118,11 +118,11 @@ def test_it_improves_on_its_starts(problem, starts):
 
 def test_joint_limits_hold_exactly(problem, starts):
     wild = replace(CONFIG, joint_rate=1.0)
-    at_limit = replace(starts, joints=problem.upper.expand_as(starts.joints).clone())
+    at_limit = replace(starts, joints=problem.hand.upper.expand_as(starts.joints).clone())
     solution = minimise(ClosedForm(wild, STARTS), problem, at_limit, Hooks())
-    assert (solution.poses.joints >= problem.lower).all()
-    assert (solution.poses.joints <= problem.upper).all()
-    assert ((solution.poses.joints == problem.lower) | (solution.poses.joints == problem.upper)).any()
+    assert (solution.poses.joints >= problem.hand.lower).all()
+    assert (solution.poses.joints <= problem.hand.upper).all()
+    assert ((solution.poses.joints == problem.hand.lower) | (solution.poses.joints == problem.hand.upper)).any()
     assert solution.poses.quaternion.norm(dim=-1).tolist() == pytest.approx([1.0] * STARTS, abs=1e-12)
 
 

@@ -44,7 +44,11 @@ def beside(scene: Scene, x: float) -> Scene:
 
 def problem(scene: Scene, hand, **more) -> Problem:
     return build_problem(
-        scene, hand, candidates=60, features=24, directions=12, friction=0.5, seed=0, device="cpu", dtype=DOUBLE, **more
+        scene,
+        hand,
+        ProblemConfig(candidates=60, features=24, directions=12, friction=0.5, **more),
+        seed=0,
+        dtype=DOUBLE,
     )
 
 
@@ -67,7 +71,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
     obstacles = make_obstacle_tensors(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
     assert obstacles is not None
     base = SE3(rotation_from_quaternion(torch.as_tensor(quaternion)), torch.as_tensor(posture.position))[None]
-    links = forward(problem(scenes["box"], hand).kinematics, torch.as_tensor(joints)[None])
+    links = forward(problem(scenes["box"], hand).hand.kinematics, torch.as_tensor(joints)[None])
     gaps = obstacle_gaps(obstacles, base, links)
     # Meshes of round solids are inscribed: facets cut off up to half a millimetre of a fingertip.
     assert float(gaps.min()) == pytest.approx(lowest(hand, posture, plane), abs=5e-4)
@@ -75,7 +79,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
 
 def test_a_free_object_pays_nothing(hand, scenes):
     free = problem(scenes["box"], hand)
-    assert (free.obstacles, free.confidence) == (None, None)
+    assert (free.obstacles, free.object.confidence) == (None, None)
     starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
     terms = evaluate(free, starts.translation, starts.quaternion, starts.joints, torch.zeros(3, dtype=DOUBLE), 0.004)
     assert terms.obstacle is None
@@ -160,7 +164,7 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     assert found.grasps
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
     assert obstacles is not None
-    kinematics = problem(scene, hand).kinematics
+    kinematics = problem(scene, hand).hand.kinematics
     for grasp in found.grasps:
         for posture in (grasp.pregrasp, grasp.grasp):
             assert lowest(hand, posture, scene.support) > -0.0016

@@ -55,7 +55,7 @@ def test_approaches_come_from_all_sides_with_the_palm_facing_the_object(problem_
     tries = draw_approaches(problem, hand, 2000, 0)
     normal = rotation_from_quaternion(tries.quaternion) @ torch.as_tensor(hand.palm_normal)
     palm = tries.translation + rotation_from_quaternion(tries.quaternion) @ torch.as_tensor(hand.palm_center)
-    off = problem.center - palm
+    off = problem.object.center - palm
     assert ((off * normal).sum(-1) / off.norm(dim=-1)).min() == pytest.approx(1.0, abs=1e-9)
     # 2000 uniform directions: each mean is zero within four standard errors (1 / √(3 · 2000) = 0.013).
     assert normal.mean(0).abs().max() < 0.052
@@ -114,6 +114,6 @@ def test_obstacles_are_kept_clear_of(hand, scenes):
     found = search(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), low)), hand, count=3)
     obstacles = found.problem.obstacles
     assert obstacles is not None
-    gaps = obstacle_gaps(obstacles, found.poses.base, forward(found.problem.kinematics, found.poses.joints))
+    gaps = obstacle_gaps(obstacles, found.poses.base, forward(found.problem.hand.kinematics, found.poses.joints))
     assert len(gaps) >= 1
     assert gaps.min() >= 0

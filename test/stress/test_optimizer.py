@@ -63,10 +63,10 @@ def clean(sound, starts) -> Tensor:
 @pytest.mark.parametrize("channel", [0, 1], ids=["distance", "gradient"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 def test_starts_that_meet_a_poisoned_node_are_dropped_and_the_others_unharmed(sound, starts, clean, channel, value):
-    field = sound.sdf.field.clone()
+    field = sound.object.sdf.field.clone()
     # A node of the surface, where fingers are sure to look.
     field[channel].view(-1)[int(field[0].abs().argmin())] = value
-    poisoned = replace(sound, sdf=replace(sound.sdf, field=field))
+    poisoned = replace(sound, object=replace(sound.object, sdf=replace(sound.object.sdf, field=field)))
     solution = minimise(ClosedForm(SHORT, BATCH), poisoned, starts, Hooks())
     found = torch.isfinite(solution.loss)
     assert found.any()
@@ -112,13 +112,13 @@ def test_single_and_double_precision_agree_on_a_step(scene, hand, sound, starts)
 def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     rotation = rotation_from_quaternion(starts.quaternion)
     palm = starts.translation + rotation @ torch.as_tensor(hand.palm_center, dtype=torch.float32)
-    inside = replace(starts, translation=starts.translation + sound.center - palm)
+    inside = replace(starts, translation=starts.translation + sound.object.center - palm)
     at = (rotation @ torch.as_tensor(hand.palm_center, dtype=torch.float32)) + inside.translation
-    assert (sample_sdf(sound.sdf, at)[0] < -0.02).all()
+    assert (sample_sdf(sound.object.sdf, at)[0] < -0.02).all()
     solution = minimise(ClosedForm(PLAN.settings, BATCH), sound, inside, Hooks())
     poses = solution.poses
-    placed = hand_forward(sound, sound.fine, poses.translation, poses.quaternion, poses.joints)
-    depth = -sample_sdf(sound.sdf, placed.points)[0].amin(-1)
+    placed = hand_forward(sound, sound.hand.fine, poses.translation, poses.quaternion, poses.joints)
+    depth = -sample_sdf(sound.object.sdf, placed.points)[0].amin(-1)
     # As deep as starts outside end: a millimetre or two.
     assert (depth < 0.003).all()
     assert len(assemble(sound, hand, poses, PLAN)) > BATCH // 2
@@ -141,7 +141,8 @@ def test_contact_widths_over_six_decades_give_finite_gradients(sound, starts, de
 
 def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):
     """Distance zero and normal zero at every node: nothing to hold, and nothing to divide by."""
-    nothing = replace(sound, sdf=replace(sound.sdf, field=torch.zeros_like(sound.sdf.field)))
+    flat = replace(sound.object.sdf, field=torch.zeros_like(sound.object.sdf.field))
+    nothing = replace(sound, object=replace(sound.object, sdf=flat))
     loss, gradient = ClosedForm(SHORT, BATCH).value_and_gradient(nothing, pack(starts), torch.zeros(BATCH), 0.01, True)
     assert torch.isfinite(loss).all()
     assert torch.isfinite(gradient).all()
@@ -149,7 +150,7 @@ def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):
 
 def test_a_closed_hand_on_the_centre_of_mass_gives_no_nan(sound, starts):
     """Contacts at the centre of mass have no arm, and disturbances no speed there."""
-    at_centre = starts.translation * 0 + sound.center
+    at_centre = starts.translation * 0 + sound.object.center
     terms = evaluate(sound, at_centre, starts.quaternion, starts.joints, torch.zeros(BATCH), 0.004, fine=True)
     assert all(torch.isfinite(term).all() for term in terms if term is not None)
 

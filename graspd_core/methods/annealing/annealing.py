@@ -142,10 +142,10 @@ class Annealing:
     def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
         """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
         poses = self.poses(x)
-        placed = hand_forward(problem, problem.coarse, poses.translation, poses.quaternion, poses.joints)
+        placed = hand_forward(problem, problem.hand.coarse, poses.translation, poses.quaternion, poses.joints)
         points = placed.base.apply(place_points(self.contacts, placed.links))
         outward = place_points(self.normals, placed.links) @ placed.base.rotation.transpose(-1, -2)
-        distance, normal = sample_sdf(problem.sdf, torch.cat([placed.points, points], 1))
+        distance, normal = sample_sdf(problem.object.sdf, torch.cat([placed.points, points], 1))
         count = len(self.contacts)
         away = 1.0 + (outward * normal[:, -count:]).sum(-1)
         energy = (distance[:, -count:].abs() + self.config.normal_weight * away).mean(-1)
@@ -171,14 +171,16 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
     """The annealing of one hand about one object."""
 
     def tensor(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values).to(problem.lower)
+        return torch.as_tensor(values).to(problem.hand.lower)
 
     space = posture_space(hand, config.eigengrasps, seed)
     chosen = inner_contacts(hand, config.contacts_per_link)
-    links = torch.as_tensor(hand.candidate_link[chosen]).to(problem.coarse.links)
+    links = torch.as_tensor(hand.candidate_link[chosen]).to(problem.hand.coarse.links)
     points, normals = tensor(hand.candidate_points[chosen]), tensor(hand.candidate_normals[chosen])
-    stands = Poses(problem.center[None], torch.eye(4).to(problem.lower)[:1], tensor(hand.open_posture)[None])
-    opened = hand_forward(problem, problem.coarse, stands.translation, stands.quaternion, stands.joints)
+    stands = Poses(
+        problem.object.center[None], torch.eye(4).to(problem.hand.lower)[:1], tensor(hand.open_posture)[None]
+    )
+    opened = hand_forward(problem, problem.hand.coarse, stands.translation, stands.quaternion, stands.joints)
     return Annealing(
         config=config,
         seed=seed,
@@ -186,8 +188,8 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
         basis=tensor(space.basis),
         low=tensor(space.low),
         high=tensor(space.high),
-        lower=problem.lower,
-        upper=problem.upper,
+        lower=problem.hand.lower,
+        upper=problem.hand.upper,
         contacts=placement(hand.num_links, points, links),
         normals=placement(hand.num_links, normals, links, directions=True),
         sphere_links=torch.as_tensor(collision_spheres(hand)[2]).to(links),
@@ -223,9 +225,9 @@ def sampled_epsilon(
     """
     batch, slots = contact_set.active.shape
     support = wrench_support(
-        ((contact_set.position - problem.center) / problem.length).reshape(-1, 1, 3),
+        ((contact_set.position - problem.object.center) / problem.object.length).reshape(-1, 1, 3),
         contact_set.normal.reshape(-1, 1, 3),
-        contact_set.active.to(problem.lower).reshape(-1, 1),
+        contact_set.active.to(problem.hand.lower).reshape(-1, 1),
         directions,
         problem.friction,
     )
@@ -246,7 +248,7 @@ def plan(task: PlannerInput) -> PlannerOutput:
     closing = make_closing(problem, task.hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
     contact_set = find_contacts(problem, closed.poses, task.config.grasp_stages.touch_reach)
-    directions = disturbance_directions(settings.directions, task.seed).to(problem.lower)
+    directions = disturbance_directions(settings.directions, task.seed).to(problem.hand.lower)
     epsilon = sampled_epsilon(problem, contact_set, directions)
     kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
     return PlannerOutput(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)

@@ -74,12 +74,12 @@ class ClosedForm:
         return self.config.explore_steps + self.config.refine_steps + self.config.polish_steps
 
     def init(self, problem: Problem, starts: Poses) -> AdamState:
-        x = pack(moved_along(starts, problem.pivot))
+        x = pack(moved_along(starts, problem.hand.pivot))
         with torch.no_grad():
             nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
         zeros = torch.zeros_like(x)
         worst = x.new_full((len(x),), torch.inf)
-        pivot = problem.pivot.expand(len(x), 3)
+        pivot = problem.hand.pivot.expand(len(x), 3)
         return AdamState(pivot, x, zeros, zeros, nearest.clamp(0.0, self.config.radius_start), x, worst, worst)
 
     def step(self, problem: Problem, state: AdamState, index: int) -> AdamState:
@@ -122,7 +122,7 @@ class ClosedForm:
         short = max(0, _FEWEST_ROWS - rows)
         x = torch.cat([x, x[:1].expand(short, -1)]).detach().requires_grad_(True)
         radius = torch.cat([radius, radius[:1].expand(short)])
-        poses = moved_along(unpack(x), -problem.pivot)
+        poses = moved_along(unpack(x), -problem.hand.pivot)
         activate = soft_contact if self.config.activation == "soft" else hard_contact
         terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, polish, activate)
         loss = weighted(terms, self.config.polish_weights if polish else self.config.weights)
@@ -142,10 +142,10 @@ def adam_step(
     rates = torch.full_like(state.x[0], config.joint_rate)
     rates[:3] = config.translation_rate
     rates[3:7] = config.rotation_rate
-    rates[7:] *= problem.joint_scale
+    rates[7:] *= problem.hand.joint_scale
     x = state.x - rate * rates * direction
     quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
-    joints = x[:, 7:].clamp(problem.lower, problem.upper)
+    joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper)
     return replace(state, x=torch.cat([x[:, :3], quaternion, joints], -1), mean=mean, square=square)
 
 

@@ -30,7 +30,8 @@ from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
 from graspd_core.methods.poses import Poses, pack, unpack
-from graspd_core.methods.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward, least_distance
+from graspd_core.methods.problem import OBSTACLE_MARGIN, Problem, hand_forward, least_distance
+from graspd_core.methods.problem_tensors import PointSet
 
 # L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
 _ALL_MOTION = 60.0
@@ -103,7 +104,7 @@ class Graspd2022:
 
     def points(self, problem: Problem) -> PointSet:
         """The hand's points that may touch."""
-        return problem.fine if self.config.all_candidates else problem.coarse
+        return problem.hand.fine if self.config.all_candidates else problem.hand.coarse
 
     def init(self, problem: Problem, starts: Poses) -> RelaxedState:
         config = self.config
@@ -187,7 +188,7 @@ class Graspd2022:
         config, body = self.config, self.body
         poses = unpack(pose)
         placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
-        distance, normals = sample_sdf(problem.sdf, placed.points)
+        distance, normals = sample_sdf(problem.object.sdf, placed.points)
         arms = placed.points - body.center
         velocities = self.velocities
         supplied = contact_forces(
@@ -208,18 +209,18 @@ class Graspd2022:
         else:
             left = motion_left(body, supplied, arms, velocities, self.time_step)
             difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
-        spheres = place_points(problem.sphere_matrix, placed.links)
-        inter = losses.self_collision(spheres, problem.sphere_radii, problem.sphere_weight)
+        spheres = place_points(problem.hand.spheres.matrix, placed.links)
+        inter = losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight)
         if problem.obstacles is not None:
             gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
             inter = inter + losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
-        beyond = (poses.joints - problem.upper).clamp_min(0.0) + (problem.lower - poses.joints).clamp_min(0.0)
+        beyond = (poses.joints - problem.hand.upper).clamp_min(0.0) + (problem.hand.lower - poses.joints).clamp_min(0.0)
         return Evaluation(
             difference,
             task,
             motion,
             beyond.sum(-1),
-            losses.posture(poses.joints, problem.lower, problem.upper),
+            losses.posture(poses.joints, problem.hand.lower, problem.hand.upper),
             inter,
             normals,
         )
@@ -244,5 +245,5 @@ def plan(task: PlannerInput) -> PlannerOutput:
     body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
     solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]
-    inside = replace(poses, joints=poses.joints.clamp(problem.lower, problem.upper))
+    inside = replace(poses, joints=poses.joints.clamp(problem.hand.lower, problem.hand.upper))
     return PlannerOutput(problem, inside, solution.interrupted)

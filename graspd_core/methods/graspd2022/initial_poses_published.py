@@ -32,7 +32,7 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
     palm = points + standoff * normals
     translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
     joints = torch.as_tensor(hand.open_posture).expand(len(points), -1)
-    drawn = Poses(*(x.to(problem.lower) for x in (translation, quaternion_from_rotation(rotation), joints)))
-    placed = hand_forward(problem, problem.coarse, drawn.translation, drawn.quaternion, drawn.joints)
-    touching = sample_sdf(problem.sdf, placed.points)[0].amin(-1) <= 0
+    drawn = Poses(*(x.to(problem.hand.lower) for x in (translation, quaternion_from_rotation(rotation), joints)))
+    placed = hand_forward(problem, problem.hand.coarse, drawn.translation, drawn.quaternion, drawn.joints)
+    touching = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1) <= 0
     return drawn[touching.int().argsort(stable=True)[:count]]

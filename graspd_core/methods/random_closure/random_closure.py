@@ -19,7 +19,7 @@ from graspd_core.methods.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-from graspd_core.se3 import quaternion_from_rotation, random_rotations
+from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
 
 # The advance ends this far from the object, or after so many steps of the nearest distance each [m].
 _TOUCHING, _ADVANCES = 0.0003, 60
@@ -55,14 +55,14 @@ def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) ->
     """Open hands clear of the object whose palms face its centre of mass, from uniform directions, rolled uniformly."""
     generator = torch.Generator().manual_seed(seed)
     rotation = random_rotations(count, generator, torch.float64)
-    away = problem.length + hand_reach(hand)
+    away = problem.object.length + hand_reach(hand)
     palm = torch.as_tensor(hand.palm_center + away * hand.palm_normal)
-    translation = problem.center.double().cpu() - rotation @ palm
+    translation = problem.object.center.double().cpu() - rotation @ palm
     joints = torch.as_tensor(hand.open_posture).clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
     return Poses(
-        translation.to(problem.lower),
-        quaternion_from_rotation(rotation).to(problem.lower),
-        joints.expand(count, -1).to(problem.lower),
+        translation.to(problem.hand.lower),
+        quaternion_from_rotation(rotation).to(problem.hand.lower),
+        joints.expand(count, -1).to(problem.hand.lower),
     )
 
 
@@ -72,8 +72,8 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 
     Sphere tracing: the hand may always go as far as its least distance from the object.
     """
-    forwards = rotation_from_quaternion(poses.quaternion) @ torch.as_tensor(hand.palm_normal).to(problem.lower)
-    left = torch.full_like(poses.translation[:, 0], problem.length + hand_reach(hand))
+    forwards = rotation_from_quaternion(poses.quaternion) @ torch.as_tensor(hand.palm_normal).to(problem.hand.lower)
+    left = torch.full_like(poses.translation[:, 0], problem.object.length + hand_reach(hand))
     for _ in range(_ADVANCES):
         gap = link_gaps(problem, poses, closing.sphere_links)[:, 0].amin(-1) - _TOUCHING
         step = gap.clamp_min(0.0).minimum(left)
@@ -90,7 +90,7 @@ def touching_groups(
     """How many rigid groups of links are within `reach` [m] of the object."""
     near = link_gaps(problem, poses, closing.sphere_links)[:, 0] <= reach
     groups = torch.as_tensor(hand.link_group, device=near.device)
-    found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.lower.dtype)
+    found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.hand.lower.dtype)
     return found.scatter_reduce(1, groups.expand(len(near), -1), near.to(found), "amax").sum(-1)
 
 
@@ -98,5 +98,5 @@ def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
     """Which hands reach into no support and no neighbour."""
     if problem.obstacles is None:
         return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
-    links = forward(problem.kinematics, poses.joints)
+    links = forward(problem.hand.kinematics, poses.joints)
     return obstacle_gaps(problem.obstacles, poses.base, links).amin(-1) >= 0.0

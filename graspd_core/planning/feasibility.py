@@ -15,7 +15,7 @@ from jaxtyping import Float
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.methods.problem import fingertip_groups
+from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.scene.scene import Scene
 
 # The roughest surface that a trial believes in; see `trials.world.at_friction`.

@@ -11,7 +11,7 @@ import trimesh
 
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.shapes import SHAPES, make_shape
-from graspd_core.methods.feasibility import out_of_reach, reach_of
+from graspd_core.planning.feasibility import out_of_reach, reach_of
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
@@ -85,7 +85,7 @@ def test_a_crate_beyond_the_hand_is_refused_with_both_sizes(hand, friction: floa
 
 def test_the_corner_of_a_crate_is_refused_up_to_the_friction_that_would_hold_it(hand, monkeypatch: pytest.MonkeyPatch):
     """The normals of a corner lie arccos(1/√3) = 54.7° about its diagonal: friction of tan(35.3°) = 0.707 closes it."""
-    monkeypatch.setattr("graspd_core.methods.feasibility._MOST_FRICTION", 10.0)
+    monkeypatch.setattr("graspd_core.planning.feasibility._MOST_FRICTION", 10.0)
     assert out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=0.65), hand)
     assert not out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=0.75), hand)
 

@@ -1,0 +1,190 @@
+"""Hand and object laid out as tensors on one device and dtype: what every evaluation of a problem reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from graspd_core.config import ProblemConfig
+from graspd_core.hands.collision_spheres import collision_spheres
+from graspd_core.hands.collision_tensors import CollisionTensors, make_collision_tensors
+from graspd_core.hands.kinematics import Kinematics, make_kinematics, placement
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import GridSDF
+from graspd_core.mesh.sharp_features import sharp_points, thin_share
+from graspd_core.scene.scene import Scene
+
+# How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
+_REACH_OF_TIPS = 0.1
+_REACH_OF_OTHERS = 0.004
+# A base frame this near to the middle of the palm lies in the palm [m].
+_PALM_RADIUS = 0.05
+# Share of thin surface from which an object counts as thin-walled.
+_THIN_WALLED = 0.6
+
+
+@dataclass(frozen=True)
+class PointSet:
+    """Contact candidates of a hand.
+
+    Attributes:
+        matrix: places them by their links' poses, see `hands.kinematics.placement`.
+        links: link of each.
+        groups: candidates of each rigid group of links, padded by repetition.
+    """
+
+    matrix: Float[Tensor, "points columns"]
+    links: Int[Tensor, "points"]
+    groups: Int[Tensor, "groups members"]
+
+
+@dataclass(frozen=True)
+class SphereTensors:
+    """Spheres that fill the hand's links, for self-collision.
+
+    Attributes:
+        matrix: places their centres by their links' poses, see `hands.kinematics.placement`.
+        radii: [m].
+        weight: 1 / 2R of the checked pairs with R the sum of their radii, zero elsewhere [1/m].
+    """
+
+    matrix: Float[Tensor, "spheres columns"]
+    radii: Float[Tensor, "spheres"]
+    weight: Float[Tensor, "spheres spheres"]
+
+
+@dataclass(frozen=True)
+class HandTensors:
+    """A hand.
+
+    Attributes:
+        kinematics: forward kinematics.
+        coarse: the first, evenly spread contact candidates; what most steps look at.
+        fine: all contact candidates; what the last steps look at.
+        reach: attraction range of each rigid group of links [m].
+        solids: collision primitives.
+        group_of_solid: index of each solid's rigid group.
+        spheres: for self-collision.
+        lower: joint limits [rad] or [m].
+        upper: joint limits [rad] or [m].
+        pivot: the point that a solver turns the hand about, base frame [m].
+        joint_scale: travel of each joint that counts as much as one radian, one where it turns [rad] or [m].
+    """
+
+    kinematics: Kinematics
+    coarse: PointSet
+    fine: PointSet
+    reach: Float[Tensor, "groups"]
+    solids: CollisionTensors
+    group_of_solid: Int[Tensor, "solids"]
+    spheres: SphereTensors
+    lower: Float[Tensor, "joints"]
+    upper: Float[Tensor, "joints"]
+    pivot: Float[Tensor, "3"]
+    joint_scale: Float[Tensor, "joints"]
+
+
+@dataclass(frozen=True)
+class ObjectTensors:
+    """An object.
+
+    Attributes:
+        sdf: signed distance field.
+        features: sharp points of its surface, which candidates would not notice sinking in [m].
+        coarse_features: how many of them, from the first, the coarse steps look at too: none, but on thin walls, which
+            a finger could otherwise step through.
+        center: centre of mass [m].
+        length: characteristic length of torques [m].
+        confidence: in the surface near each node of `sdf`, raised to a floor; None: all of it is known.
+    """
+
+    sdf: GridSDF
+    features: Float[Tensor, "features 3"]
+    coarse_features: int
+    center: Float[Tensor, "3"]
+    length: float
+    confidence: Float[Tensor, "x y z"] | None
+
+
+def make_hand_tensors(hand: HandModel, candidates: int, device: str, dtype: torch.dtype) -> HandTensors:
+    """Lay a hand out; the coarse set is the first `candidates` of the contact candidates that it was loaded with."""
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, device=device, dtype=dtype)
+
+    def index(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, device=device, dtype=torch.long)
+
+    present = np.unique(hand.link_group[hand.candidate_link[:candidates]])
+
+    def point_set(count: int) -> PointSet:
+        links = hand.candidate_link[:count]
+        points = tensor(hand.candidate_points[:count])
+        groups = _members(hand.link_group[links], present)
+        return PointSet(placement(hand.num_links, points, index(links)), index(links), index(groups))
+
+    solids = make_collision_tensors(hand, device, dtype)
+    group_of_solid = hand.link_group[solids.link.cpu().numpy()]
+    return HandTensors(
+        kinematics=make_kinematics(hand, device, dtype),
+        coarse=point_set(candidates),
+        fine=point_set(len(hand.candidate_link)),
+        reach=tensor(np.where(np.isin(present, fingertip_groups(hand)), _REACH_OF_TIPS, _REACH_OF_OTHERS)),
+        solids=solids,
+        group_of_solid=index(np.searchsorted(present, group_of_solid)),
+        spheres=_sphere_tensors(hand, device, dtype),
+        lower=tensor(hand.lower),
+        upper=tensor(hand.upper),
+        pivot=tensor(_pivot(hand)),
+        joint_scale=tensor(hand.joint_scale),
+    )
+
+
+def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereTensors:
+    centers, radii, links = collision_spheres(hand)
+    checked = ~hand.adjacent[np.ix_(links, links)]
+    weight = np.triu(checked, 1) * 0.5 / (radii[:, None] + radii[None, :])
+    points, radius, pairs = (torch.as_tensor(x, device=device, dtype=dtype) for x in (centers, radii, weight))
+    at = torch.as_tensor(links, device=device, dtype=torch.long)
+    return SphereTensors(placement(hand.num_links, points, at), radius, pairs)
+
+
+def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
+    """Lay the scene's object out."""
+    thin = thin_share(scene.object.mesh) > _THIN_WALLED
+    sharp = sharp_points(scene.object.mesh, settings.features * 2 if thin else settings.features)
+    floor, confidence = settings.confidence_floor, None
+    if scene.confidence is not None:
+        confidence = floor + (1 - floor) * scene.confidence.to(device, dtype)
+    return ObjectTensors(
+        sdf=scene.sdf.to(device, dtype),
+        features=torch.as_tensor(sharp, device=device, dtype=dtype),
+        coarse_features=settings.features if thin else 0,
+        center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
+        length=scene.object.radius,
+        confidence=confidence,
+    )
+
+
+def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
+    """The middle of the palm, or the base frame's origin where that lies in the palm [m]."""
+    far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
+    return hand.palm_center if far else np.zeros(3)
+
+
+def fingertip_groups(hand: HandModel) -> Int[np.ndarray, "tips"]:
+    """Groups of rigidly joined links at the ends of the fingers: those that move no further group."""
+    groups, parents = hand.link_group, hand.link_parent
+    inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
+    return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
+
+
+def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"]) -> Int[np.ndarray, "groups width"]:
+    """Indices that belong to each group, rows padded by repetition; a group without any repeats the first index."""
+    members = [np.flatnonzero(group_of == group) for group in present]
+    width = max(map(len, members))
+    return np.stack([np.resize(m if len(m) else [0], width) for m in members])
