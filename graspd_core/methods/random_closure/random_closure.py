@@ -71,7 +71,7 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 
     Sphere tracing: the hand may always go as far as its least distance from the object.
     """
-    forwards = rotation_from_quaternion(poses.quaternion) @ torch.as_tensor(hand.palm_normal).to(problem.lower)
+    forwards = poses.base.rotation @ torch.as_tensor(hand.palm_normal).to(problem.lower)
     left = torch.full_like(poses.translation[:, 0], problem.length + hand_reach(hand))
     for _ in range(_ADVANCES):
         gap = link_gaps(problem, poses, closing.sphere_links)[:, 0].amin(-1) - _TOUCHING
