@@ -72,9 +72,24 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Ten
 def rotation_from_axis_angle(
     axis: Float[Tensor, "*#batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Rodrigues' formula for unit axes and angles [rad]."""
+    """Rotations about unit axes by angles [rad], through quaternions of half the angle."""
     half = 0.5 * angle[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), half.sin() * axis], -1))
+
+
+def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """The rotation about a unit axis by an angle [rad]."""
+    turn = torch.tensor(angle, dtype=torch.float64)
+    return rotation_from_axis_angle(torch.as_tensor(axis, dtype=torch.float64), turn).numpy()
+
+
+def quaternion_between(
+    source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, around: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4"]:
+    """The shortest turn of one unit vector onto another, wxyz; half a turn `around` an axis if they are opposite."""
+    quaternion = np.array([1.0 + source @ target, *np.cross(source, target)])
+    length = np.linalg.norm(quaternion)
+    return quaternion / length if length > EPSILON else np.array([0.0, *around])
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,12 +6,15 @@ and leave edges and corners bare. Judges use signed distances instead.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from graspd_core.hands.model import HandModel, Primitive
 
 
+@lru_cache(maxsize=8)
 def collision_spheres(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "spheres 3"], Float[np.ndarray, "spheres"], Int[np.ndarray, "spheres"]]:

@@ -7,6 +7,7 @@ to the contact candidates. Gradients are exact where the distance is smooth.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -38,7 +39,12 @@ class CollisionTensors:
 
 
 def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
-    """Lay the hand's boxes and round solids out as tensors."""
+    """The hand's boxes and round solids as tensors; kept like `make_kinematics`."""
+    return _make_collision_tensors(hand, torch.device(device), dtype)
+
+
+@lru_cache(maxsize=8)
+def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.dtype) -> CollisionTensors:
     solids = [p for p in hand.primitives if p.kind != "hull"]
     core, radius, is_round = [], [], []
     for p in solids:

@@ -8,6 +8,7 @@ transform is a sum of three constant matrices.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -47,7 +48,13 @@ class Kinematics:
 def make_kinematics(
     hand: HandModel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Kinematics:
-    """Precompute what `forward` needs."""
+    """What `forward` needs; made once for a hand, device and dtype, and kept for the last few of them."""
+    return _make_kinematics(hand, torch.device(device), dtype)
+
+
+# A hand is hashed by identity: copies made by `replace` are hands of their own. Few are kept, for a hand is large.
+@lru_cache(maxsize=8)
+def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) -> Kinematics:
     depth = _link_depths(hand.link_parent)
     order = np.argsort(depth, kind="stable")
     position = np.argsort(order, kind="stable")

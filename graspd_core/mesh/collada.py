@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from graspd_core.se3 import axis_rotation
 from graspd_core.types import TriangleMesh
 
 _MOST_NODES = 4000
@@ -114,10 +115,8 @@ def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
         elif element.tag == "scale":
             step[:3, :3] = np.diag(values.reshape(3))
         else:
-            x, y, z = values[:3] / max(float(np.linalg.norm(values[:3])), 1e-12)
-            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            angle = np.deg2rad(values[3])
-            step[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+            axis = values[:3] / max(float(np.linalg.norm(values[:3])), 1e-12)
+            step[:3, :3] = axis_rotation(axis, np.deg2rad(values[3]))
         pose = pose @ step
     return pose
 

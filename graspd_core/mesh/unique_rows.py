@@ -1,11 +1,11 @@
-"""Rows of integers as single numbers."""
+"""Rows of integers, and the voxels that points lie in, as single numbers."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 
 def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
@@ -21,3 +21,8 @@ def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
         return np.asarray(np.ravel_multi_index(tuple(rows.T), sides))
     # No room: the rows' ranks among each other.
     return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def voxel_keys(points: Float[np.ndarray, "n k"], size: float) -> Int[np.ndarray, "n"]:
+    """One number for the cell of side `size` that each point lies in, in the order of the cells' coordinates."""
+    return packed_rows(np.floor(points / size).astype(np.int64))

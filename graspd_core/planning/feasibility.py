@@ -15,6 +15,7 @@ from jaxtyping import Float
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.scene.scene import Scene
 
@@ -79,7 +80,7 @@ def _one_sided(
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
-    _, first = np.unique(np.round(points / (radius / 4)).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(packed_rows(np.round(points / (radius / 4)).astype(np.int64)), return_index=True)
     return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.unique_rows import voxel_keys
 
 FEWEST_POINTS = 50
 MOST_POINTS = 20_000
@@ -30,6 +31,10 @@ class PointCloud:
     points: Float[np.ndarray, "points 3"]
     viewpoint: Float[np.ndarray, "3"]
     forward: Float[np.ndarray, "3"] | None = None
+
+    def thinned(self, size: float) -> PointCloud:
+        """The first point in every voxel of side `size` [m]."""
+        return replace(self, points=self.points[np.unique(voxel_keys(self.points, size), return_index=True)[1]])
 
 
 def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> PointCloud:

@@ -5,7 +5,7 @@ All decisions about a scene are taken on the thinned points; the full points fol
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
+from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud, measured
 
 # Of more points than this, every second, or third, ... is taken.
@@ -138,20 +139,20 @@ def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
 def _voxels(points: Float[np.ndarray, "n 3"], size: float) -> tuple[Int[np.ndarray, "n"], float]:
     """Which voxel each point lies in, counted without gaps, and the side it came to."""
     low = points.min(0)
-    # The cells' numbers have 21 bits an axis.
+    # So many cells an axis have room in one number.
     size = max(size, float(np.ptp(points, axis=0).max()) / 2**20)
-    cell, voxel = _distinct(((points[:, axis] - low[axis]) / size).astype(np.int64) for axis in range(3))
+    cell, voxel = _distinct(((points - low) / size).astype(np.int64))
     while len(cell) > MOST_VOXELS:
         growth = max(1.2, (len(cell) / MOST_VOXELS) ** 0.5)
         size *= growth
-        cell, coarser = _distinct(((cell[:, axis] + 0.5) / growth).astype(np.int64) for axis in range(3))
+        cell, coarser = _distinct(((cell + 0.5) / growth).astype(np.int64))
         voxel = coarser[voxel]
     return voxel, size
 
 
-def _distinct(columns: Iterable[Int[np.ndarray, "n"]]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, "n"]]:
-    """The distinct rows of a matrix of small numbers, given by its columns, and which of them each row is."""
-    x, y, z = columns
-    keys, which = np.unique((x << 42) | (y << 21) | z, return_inverse=True)
-    low = 2**21 - 1
-    return np.column_stack([keys >> 42, (keys >> 21) & low, keys & low]), which
+def _distinct(cells: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, "n"]]:
+    """The distinct rows, and which of them each row is."""
+    keys, which = np.unique(packed_rows(cells), return_inverse=True)
+    example = np.empty(len(keys), dtype=np.int64)
+    example[which] = np.arange(len(cells))
+    return cells[example], which

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.unique_rows import packed_rows, voxel_keys
 from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
 from graspd_core.se3 import perpendicular
 
@@ -113,8 +114,7 @@ def thin(surfels: Surfels, step: float) -> Surfels:
     facing = np.abs(surfels.normals).argmax(1)
     side = 2 * facing + (np.take_along_axis(surfels.normals, facing[:, None], 1)[:, 0] > 0)
     cells = np.column_stack([np.floor(surfels.points / step).astype(int), side])
-    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    which = which.reshape(-1)
+    _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
     mean = lambda x: np.column_stack([np.bincount(which, x[:, k]) for k in range(3)]) / count[:, None]  # noqa: E731
     normals = mean(surfels.normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -129,8 +129,8 @@ def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
     axis = view_depth.mean(0) / np.linalg.norm(view_depth.mean(0))
     right = perpendicular(axis)
     depth = np.maximum(view_depth @ axis, 1e-6)
-    cells = np.floor(np.column_stack([view_depth @ right, view_depth @ np.cross(axis, right)]) / depth[:, None] / width)
-    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    order = np.lexsort([distance, which.reshape(-1)])
+    image = np.column_stack([view_depth @ right, view_depth @ np.cross(axis, right)]) / depth[:, None]
+    _, which, count = np.unique(voxel_keys(image, width), return_inverse=True, return_counts=True)
+    order = np.lexsort([distance, which])
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     return view.points[order[first + (count - 1) // 2]]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.pointcloud.free_space import FreeSpace, weigh
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.reconstruction.revolution_axis import (
@@ -146,8 +147,7 @@ def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "
     """Means over cells of height, radius and the side they face."""
     side = np.where(np.abs(rows[:, 2]) > np.abs(rows[:, 3]), 2 + (rows[:, 2] > 0), rows[:, 3] > 0)
     cells = np.column_stack([np.floor(rows[:, :2] / step).astype(int), side.astype(int)])
-    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    which = which.reshape(-1)
+    _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
     mean = np.column_stack([np.bincount(which, rows[:, k]) for k in range(4)]) / count[:, None]
     mean[:, 2:] /= np.maximum(np.linalg.norm(mean[:, 2:], axis=1, keepdims=True), 1e-9)
     # Single points are strays.

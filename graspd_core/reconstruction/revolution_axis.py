@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.se3 import perpendicular
 
@@ -126,7 +127,7 @@ def _thinner(
     wall = np.abs(across) > np.abs(along)
     place = np.floor(np.where(wall, height, radius) / (2 * step)).astype(int)
     cells = np.column_stack([place, 2 * wall + (np.where(wall, across, along) > 0)])
-    cell = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    cell = np.unique(packed_rows(cells), return_inverse=True)[1]
     moved = np.concatenate([rows[None, :, :2], rates])
     weight, moves = np.ones(len(rows)), moved[..., 0]
     for _ in range(3):

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.pointcloud.free_space import view_frame
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud
 from graspd_core.reconstruction.merge_views import Surfels
@@ -34,8 +35,7 @@ def is_unposed(view: PointCloud) -> bool:
     if distance > np.ptp(points, axis=0).max() and local[:, 2].min() > 0:
         local[:, :2] *= distance / local[:, 2:]
     cell = 1.5 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
-    _, line = np.unique(np.round(local[:, :2] / cell).astype(int), axis=0, return_inverse=True)
-    line = line.reshape(-1)
+    _, line = np.unique(packed_rows(np.round(local[:, :2] / cell).astype(int)), return_inverse=True)
     near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
     np.minimum.at(near, line, local[:, 2])
     np.maximum.at(far, line, local[:, 2])

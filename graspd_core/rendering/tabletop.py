@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from graspd_core.mesh.mesh_files import mass_properties
@@ -19,7 +20,7 @@ from graspd_core.pointcloud.depth_image import cloud_from_depth
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.rendering.depth_noise import NONE, DepthNoise, add_noise
 from graspd_core.rendering.render import look_at, render_scene
-from graspd_core.se3 import perpendicular
+from graspd_core.se3 import perpendicular, quaternion_between, rotation_from_quaternion
 from graspd_core.types import Plane, TriangleMesh
 
 # Half the table's side and its thickness [m].
@@ -91,7 +92,8 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
     facets = ConvexHull(mesh.vertices).equations
     down = facets[np.argmax(facets[:, :3] @ centre + facets[:, 3]), :3]
     pose = np.eye(4)
-    pose[:3, :3] = _turn(down, np.array([0.0, 0.0, -1.0]))
+    turn = quaternion_between(down, np.array([0.0, 0.0, -1.0]), around=perpendicular(down))
+    pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(turn)).numpy()
     return _set_down(mesh, pose, centre)
 
 
@@ -170,17 +172,6 @@ def _translation(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
-
-
-def _turn(source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes one unit vector to another."""
-    from scipy.spatial.transform import Rotation
-
-    axis = np.cross(source, target)
-    angle = np.arctan2(np.linalg.norm(axis), source @ target)
-    if np.linalg.norm(axis) < 1e-12:
-        axis = perpendicular(source)
-    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
 
 
 def _table() -> TriangleMesh:

@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
+from graspd_core.mesh.unique_rows import voxel_keys
 from graspd_core.scene.scene import Obstacle
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
@@ -78,8 +79,8 @@ def _cells(points: Float[np.ndarray, "n 3"], support: Plane | None) -> list[Floa
         right = perpendicular(support.normal)
         local = points @ np.column_stack([right, np.cross(support.normal, right)])
     side = max(PART, float(np.ptp(local, axis=0).max()) / MOST_PARTS)
-    _, which = np.unique(np.floor((local - local.min(0)) / side).astype(int), axis=0, return_inverse=True)
-    return [points[which.reshape(-1) == part] for part in range(which.max() + 1)]
+    _, which = np.unique(voxel_keys(local - local.min(0), side), return_inverse=True)
+    return [points[which == part] for part in range(which.max() + 1)]
 
 
 def padded_hull(points: Float[np.ndarray, "n 3"], support: Plane | None) -> TriangleMesh:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.types import Plane
 
 RANSAC_TRIALS = 400
@@ -184,7 +185,7 @@ def _measure(
     _, turn = np.linalg.eigh(np.cov(flat.T))
     sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
     area = float(hull.volume)
-    seen = len(np.unique(cell[largest], axis=0)) * width**2
+    seen = len(np.unique(packed_rows(cell[largest]))) * width**2
     return FlatPart(
         plane, axes, noise, least, kept, (float(sides.max()), float(sides.min())), hull.equations, area, seen / area
     )

@@ -16,7 +16,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.scene.scene import ObjectModel, Obstacle
-from graspd_core.se3 import quaternion_from_rotation
+from graspd_core.se3 import quaternion_between, quaternion_from_rotation
 from graspd_core.types import Plane, TriangleMesh
 
 OBJECT = "graspd_object"
@@ -85,7 +85,7 @@ def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], frict
             type=mujoco.mjtGeom.mjGEOM_PLANE,
             size=[0.0, 0.0, 1.0],
             pos=height * support.normal,
-            quat=_turn_z_to(support.normal),
+            quat=quaternion_between(np.eye(3)[2], support.normal, around=np.eye(3)[0]),
             condim=4,
             friction=friction,
         )
@@ -94,13 +94,6 @@ def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], frict
         # Real hands carry their own weight.
         spec.body(f"link:{link}").gravcomp = 1.0
         spec.add_exclude(bodyname1=_REST, bodyname2=f"link:{link}")
-
-
-def _turn_z_to(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
-    """The shortest rotation of z onto a unit vector, wxyz."""
-    quaternion = np.array([1.0 + normal[2], -normal[1], normal[0], 0.0])
-    length = np.linalg.norm(quaternion)
-    return quaternion / length if length > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def add_obstacle(spec: Any, name: str, neighbour: Obstacle, target: ObjectModel, friction: Friction) -> None:

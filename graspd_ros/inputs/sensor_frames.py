@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core import PointCloud, Scene, Target, cloud_from_depth, run_isolated, scene_from_views, transform_cloud
@@ -133,17 +132,8 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
             f"none of {len(cloud.points)} points lies in the workspace, roi_min={settings.roi_min} to "
             f"roi_max={settings.roi_max}",
         )
-    if settings.voxel_size > 0:
-        cells = np.floor(points / settings.voxel_size).astype(np.int64)
-        points = points[np.unique(_packed(cells), axis=0, return_index=True)[1]]
-    return PointCloud(points, cloud.viewpoint, cloud.forward)
-
-
-def _packed(cells: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n ..."]:
-    """Cells in the same order as one number each, which sort seven times as fast; as they are where it has no room."""
-    cells = cells - cells.min(0)
-    sides = tuple(map(int, cells.max(0) + 1))
-    return np.asarray(np.ravel_multi_index(tuple(cells.T), sides)) if math.prod(sides) < 2**62 else cells
+    inside = PointCloud(points, cloud.viewpoint, cloud.forward)
+    return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 
 def nanoseconds(stamp: Time) -> int:

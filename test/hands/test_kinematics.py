@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
+import weakref
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_core.hands.collision_tensors import make_collision_tensors
 from graspd_core.hands.kinematics import (
     forward,
     link_poses,
@@ -133,6 +137,19 @@ def test_point_jacobian_is_the_derivative(hand: HandModel) -> None:
 
     expected = torch.autograd.functional.jacobian(positions, torch.as_tensor(q))
     np.testing.assert_allclose(point_jacobian(hand, q, points, links), np.asarray(expected), atol=1e-12)
+
+
+def test_a_hand_is_laid_out_once_and_let_go_again(allegro: HandModel) -> None:
+    assert make_kinematics(allegro) is make_kinematics(allegro, torch.device("cpu"), torch.float32)
+    assert make_kinematics(allegro) is not make_kinematics(allegro, dtype=torch.float64)
+    solids = [make_collision_tensors(allegro, device, torch.float32) for device in ("cpu", torch.device("cpu"))]
+    assert solids[0] is solids[1]
+    first = weakref.ref(copy := replace(allegro))
+    assert make_kinematics(copy) is not make_kinematics(allegro)
+    for copy in (replace(allegro) for _ in range(20)):
+        make_kinematics(copy)
+    gc.collect()
+    assert first() is None
 
 
 def test_float32_agrees_with_float64(allegro: HandModel) -> None:

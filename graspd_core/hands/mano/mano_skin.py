@@ -75,7 +75,7 @@ def skin_vertices(
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rodrigues' formula for axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
+    """Rotations of axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
     half = 0.5 * safe_norm(vector)[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
 

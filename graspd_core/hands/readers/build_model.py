@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
 from graspd_core.hands.readers.mimic import Coupling, narrowed
+from graspd_core.se3 import axis_rotation
 
 # More than this is no hand, and would take minutes to check against itself.
 _MOST_LINKS, _MOST_SOLIDS, _LONGEST_CHAIN = 300, 2000, 100
@@ -288,10 +289,3 @@ def _with_still_joints_welded(hand: HandModel) -> HandModel:
         mimics=tuple(replace(m, joint=int(renumbered[m.link])) for m in hand.mimics if renumbered[m.link] >= 0),
         warnings=(*hand.warnings, *(f"joint {name!r} cannot move: its limits coincide; welded" for name in welded)),
     )
-
-
-def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation about a unit axis [rad], by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, JointKind, Primitive
-from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, axis_rotation, refuse_crowds
+from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
 from graspd_core.hands.readers.mimic import Coupling, resolved_couplings
 from graspd_core.hands.readers.mjcf_geoms import read_geom
 from graspd_core.hands.readers.mjcf_values import (
@@ -28,6 +28,7 @@ from graspd_core.hands.readers.mjcf_values import (
 )
 from graspd_core.hands.readers.xml_io import read_xml, wrong
 from graspd_core.hands.readers.xml_values import read_numbers, read_position
+from graspd_core.se3 import axis_rotation
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}
 _REFUSED = ("include", "frame", "replicate", "attach", "composite", "flexcomp", "plugin")

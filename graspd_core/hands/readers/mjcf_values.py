@@ -9,11 +9,12 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from graspd_core.hands.readers.build_model import axis_rotation
 from graspd_core.hands.readers.xml_io import Element, wrong
 from graspd_core.hands.readers.xml_values import read_numbers, read_position
+from graspd_core.se3 import axis_rotation, quaternion_between, rotation_from_quaternion
 
 _Attributes = Mapping[str, Mapping[str, str]]
 # Each class holds all that the classes above it say.
@@ -139,14 +140,7 @@ def read_rotation(settings: Settings, element: ET.Element) -> Float[np.ndarray, 
     if not given:
         return np.eye(3)
     if given[0] == "quat":
-        w, x, y, z = _direction(settings, element, "quat", 4)
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        return rotation_from_quaternion(torch.as_tensor(_direction(settings, element, "quat", 4))).numpy()
     if given[0] == "axisangle":
         values = read_numbers(path, element, "axisangle", 4, "")
         return axis_rotation(_unit(settings, element, "axisangle", values[:3]), values[3] * settings.angle)
@@ -178,11 +172,9 @@ def read_axis(settings: Settings, joint: ET.Element) -> Float[np.ndarray, "3"]:
 
 
 def turn_z_to(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The shortest rotation of z onto a unit vector."""
-    axis = np.cross([0.0, 0.0, 1.0], direction)
-    sine = float(np.linalg.norm(axis))
-    axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
-    return axis_rotation(axis, float(np.arctan2(sine, direction[2])))
+    """The shortest rotation of z onto a unit vector; like MuJoCo, about x where it is half a turn."""
+    x, _, z = np.eye(3)
+    return rotation_from_quaternion(torch.as_tensor(quaternion_between(z, direction, around=x))).numpy()
 
 
 def _direction(settings: Settings, element: ET.Element, key: str, count: int) -> Float[np.ndarray, "n"]:

@@ -19,7 +19,7 @@ from graspd_core.methods.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
+from graspd_core.se3 import quaternion_from_rotation, random_rotations
 
 # The advance ends this far from the object, or after so many steps of the nearest distance each [m].
 _TOUCHING, _ADVANCES = 0.0003, 60
@@ -72,7 +72,7 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 
     Sphere tracing: the hand may always go as far as its least distance from the object.
     """
-    forwards = rotation_from_quaternion(poses.quaternion) @ torch.as_tensor(hand.palm_normal).to(problem.hand.lower)
+    forwards = poses.base.rotation @ torch.as_tensor(hand.palm_normal).to(problem.hand.lower)
     left = torch.full_like(poses.translation[:, 0], problem.object.length + hand_reach(hand))
     for _ in range(_ADVANCES):
         gap = link_gaps(problem, poses, closing.sphere_links)[:, 0].amin(-1) - _TOUCHING
