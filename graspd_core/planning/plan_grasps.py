@@ -10,7 +10,10 @@ import torch
 
 from graspd_core.config import VERIFICATIONS, PlanConfig, load_preset
 from graspd_core.errors import ConfigError
-from graspd_core.hands.model import HandModel
+from graspd_core.scene.far_objects import moved_grasp
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.model import HandModel, Mount, all_joint_names, all_joint_positions
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.candidates import find_candidates
@@ -18,15 +21,47 @@ from graspd_core.methods.feasibility import out_of_reach
 from graspd_core.methods.loop import Hooks
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import make_metrics_context
+from graspd_core.planning.ground import ground
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import make_trial_context, parts_in_background, rank_by_robustness, run_trials
-from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.pointcloud.camera import PinholeCamera
+from graspd_core.pointcloud.depth_image import cloud_from_depth
+from graspd_core.pointcloud.point_cloud import PointCloud, transform_cloud
+from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
 from graspd_core.runtime.worker_process import run_isolated, start_worker_process
+from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
 from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.segmentation.target_selection import Target
+from graspd_core.trials.lift_trial import retreat_posture
 from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
+
+__all__ = [
+    "HandModel",
+    "Mount",
+    "PinholeCamera",
+    "PointCloud",
+    "Scene",
+    "Target",
+    "all_joint_names",
+    "all_joint_positions",
+    "check_request",
+    "cloud_from_depth",
+    "elsewhere",
+    "hand_names",
+    "limit_malloc_arenas",
+    "link_poses",
+    "load_hand",
+    "load_scene",
+    "plan_grasps",
+    "retreat_posture",
+    "scene_from_views",
+    "transform_cloud",
+    "trim_heap",
+    "warm_up",
+]
 
 # How far apart the seeds of two rounds are.
 _SEED_STEP = 1_000_003
@@ -70,9 +105,12 @@ def plan_grasps(
     config = load_preset(preset) if isinstance(preset, str) else preset
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = Run(time.perf_counter(), deadline, progress, stop)
+    support, message, far = scene.support, "", np.zeros(3)
     # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing; and no search
     # finds what cannot be.
-    message = "" if run.over() else out_of_reach(scene, hand)
+    if not run.over():
+        scene, far = ground(scene, config.resolution)
+        message = out_of_reach(scene, hand)
     rounds = [] if run.over() or message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
     hooks = Hooks(
@@ -82,7 +120,7 @@ def plan_grasps(
     )
     grasps: tuple[Grasp, ...] = ()
     trial_context = first = None
-    good, optimising = 0, 0.0
+    good, optimising = 0, time.perf_counter() - run.began
     # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
     for attempt, settings in enumerate(rounds):
         began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
@@ -116,7 +154,8 @@ def plan_grasps(
     )
     outcome = run.outcome(bool(grasps), good, count)
     run.report(Stage.DONE, 1, 1, 0.0, good)
-    return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, scene.support)
+    grasps = tuple(moved_grasp(grasp, far) for grasp in grasps)
+    return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, support)
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
@@ -138,7 +177,7 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     """Do the first-use work of all libraries on a small sphere, so that the first request is as fast as others.
 
-    For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
+    For a process that serves: from then on what goes through `elsewhere`, and cutting objects into convex parts, is
     done in a child process, since threads beside would stand still meanwhile.
     """
     start_worker_process()
