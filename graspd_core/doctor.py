@@ -22,7 +22,6 @@ _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy",
     "trimesh": "trimesh",
-    "pytorch-kinematics": "pytorch_kinematics",
     "open3d": "open3d",
     "libigl": "igl",
     "fast-simplification": "fast_simplification",

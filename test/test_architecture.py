@@ -58,7 +58,7 @@ CONFINED = {
     ),
     "matplotlib": ("graspd_core/bench/charts/",),
 }
-HEAVY = {"open3d", "trimesh", "igl", "vhacdx", "pytorch_kinematics", "mujoco", "matplotlib", "fast_simplification"}
+HEAVY = {"open3d", "trimesh", "igl", "vhacdx", "mujoco", "matplotlib", "fast_simplification"}
 HEAVY |= {"pybullet"}
 ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
 

@@ -11,6 +11,7 @@ import torch
 from graspd_core.formats.grasps_json import save_text
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.model import HandModel
+from graspd_core.scene.far_objects import far_centre, moved_grasp, moved_mesh
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
 
@@ -28,7 +29,10 @@ def save_view(path: str | Path, object_mesh: TriangleMesh, hand: HandModel, gras
     """
     from trimesh.viewer.notebook import scene_to_html
 
-    scene = view_scene(object_mesh, hand, next((g for g in grasps if g.verdict is not Verdict.FAILED), None))
+    best = next((grasp for grasp in grasps if grasp.verdict is not Verdict.FAILED), None)
+    # The page keeps places as float32.
+    far = far_centre(object_mesh.vertices)
+    scene = view_scene(moved_mesh(object_mesh, -far), hand, best and moved_grasp(best, -far))
     save_text(Path(path), scene_to_html(scene))
 
 

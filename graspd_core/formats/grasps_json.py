@@ -31,7 +31,7 @@ _METRIC_KEYS = (
     "sd_cm",
     "robustness",
 )
-_LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy", "pytorch-kinematics")
+_LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
 
 
 def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig) -> dict[str, Any]:

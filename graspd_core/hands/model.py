@@ -87,7 +87,7 @@ class HandModel:
         name: the hand's name.
         urdf: path of the description, as loaded.
         link_names: every link, those behind fixed joints included.
-        joint_names: actuated joints, in pytorch-kinematics' order.
+        joint_names: actuated joints, depth-first.
         lower, upper: joint limits [rad] or [m].
         effort: greatest joint torque [N·m] or force [N].
         velocity: greatest joint speed, infinite where unset [rad/s] or [m/s].

@@ -11,11 +11,13 @@ from jaxtyping import Float
 from torch.quasirandom import SobolEngine
 
 from graspd_core.errors import MeshError
+from graspd_core.mesh.broken_files import refuse_broken
 from graspd_core.mesh.collada import read_dae
 from graspd_core.mesh.small_components import drop_small_components
 from graspd_core.mesh.topology import (
     drop_degenerate,
     drop_repeated,
+    drop_strays,
     is_closed,
     is_oriented,
     merge_vertices,
@@ -23,6 +25,7 @@ from graspd_core.mesh.topology import (
 )
 from graspd_core.mesh.units import LARGE, LARGEST, SMALL, SMALLEST, unit_advice
 from graspd_core.mesh.winding_number import winding_inside
+from graspd_core.scene.far_objects import far_centre, moved_mesh
 from graspd_core.types import TriangleMesh
 
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
@@ -36,16 +39,29 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """Read a mesh file; the parts of a scene are joined in place, and coordinates multiplied by `scale`.
 
     Raises:
-        MeshError: the file is missing, a directory, of an unknown ending, unreadable, or holds no finite surface.
+        MeshError: the file is missing, a directory, of an unknown ending, something else than a mesh, cut off,
+            unreadable, or holds no finite surface.
     """
+    return read_mesh(path, scale=scale)[0]
+
+
+def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """As `load_mesh`, and what was found wrong with the file, one sentence each."""
     path = Path(path)
     _refuse_path(path)
     if not (np.isfinite(scale) and scale > 0):
         raise MeshError(f"scale {scale!r} for {path}: must be a positive number")
     vertices, faces = _read(path)
-    mesh = TriangleMesh(vertices * scale, faces)
-    _refuse_unusable(mesh, str(path))
-    return mesh
+    text = b"\n" + path.read_bytes() if path.suffix.lower() == ".obj" else b""
+    named = text.count(b"\nv ")
+    if named and not len(faces):
+        raise MeshError(f"{path}: {named} vertices and no face: cut off before them, or no mesh")
+    mesh, warnings = _without_strays(TriangleMesh(vertices, faces), str(path))
+    # Those of an OBJ its reader has left out without a word.
+    warnings += _strays_told(str(path), named - len(vertices))
+    if text and not text.endswith((b"\n", b"\r")) and _is_open(mesh):
+        warnings += (f"{path}: the last line has no end and the surface is not closed: the file may be cut off",)
+    return TriangleMesh(mesh.vertices * scale, mesh.faces), warnings
 
 
 def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
@@ -65,8 +81,8 @@ def check_mesh(
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
     """A cleaned mesh and what was found wrong with it, one sentence each.
 
-    Merges coincident vertices, drops degenerate and repeated faces, and makes neighbouring faces wind alike.
-    Position and scale are left alone.
+    Drops vertices that no face uses, merges coincident ones, drops degenerate and repeated faces, and makes
+    neighbouring faces wind alike. Position and scale are left alone.
 
     Args:
         most_faces: a mesh of more is simplified to about this many.
@@ -74,11 +90,11 @@ def check_mesh(
         dusty: tiny pieces that float clear of the rest are dropped.
 
     Raises:
-        MeshError: no usable faces, vertices that are not finite, or an extent outside 2 mm to 2 m.
+        MeshError: no usable faces, vertices of faces that are not finite, or an extent outside 2 mm to 2 m.
     """
-    _refuse_unusable(mesh, source)
+    mesh, strays = _without_strays(mesh, source)
     _doubted_size(mesh, source, scale)
-    warnings: list[str] = []
+    warnings = list(strays)
     mesh, dropped, repeated = _distinct(mesh, source)
     if dropped:
         warnings.append(f"{source}: dropped {dropped} faces without area")
@@ -133,6 +149,11 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
     """
     import trimesh
 
+    far = far_centre(mesh.vertices)
+    if far.any():
+        # Moments about the origin would lose all digits.
+        volume, centre, inertia = mass_properties(moved_mesh(mesh, -far))
+        return volume, centre + far, inertia
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     if is_closed(mesh) and is_oriented(mesh.faces) and body.body_count == 1:
         if body.volume < 0:
@@ -168,6 +189,7 @@ def surface_samples(
 def _read(path: Path):
     import trimesh
 
+    refuse_broken(path)
     try:
         collada = path.suffix.lower() == ".dae"
         mesh = read_dae(path) if collada else trimesh.load_scene(path, process=False).to_mesh()
@@ -178,6 +200,8 @@ def _read(path: Path):
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         if isinstance(error, IndexError) and "out of bounds" in reason:
             reason = f"a face names a vertex that the file does not hold: {reason}"
+        if "expected length" in reason:
+            reason = f"cut off: {reason}"
         raise MeshError(f"{path}: not a readable {path.suffix.lstrip('.')} mesh ({reason})") from error
     return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
 
@@ -192,21 +216,31 @@ def _refuse_path(path: Path) -> None:
         raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {endings}")
 
 
-def _refuse_unusable(mesh: TriangleMesh, source: str) -> None:
+def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """The mesh without vertices that no face uses, and a warning of them; MeshError where what is left is no mesh."""
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise MeshError(f"{source}: empty mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces)")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise MeshError(f"{source}: faces name vertices outside 0 to {len(mesh.vertices) - 1}")
+    mesh, strays = drop_strays(mesh)
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices).all(1)).sum())
         raise MeshError(f"{source}: {bad} of {len(mesh.vertices)} vertices are NaN or infinite")
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise MeshError(f"{source}: faces name vertices outside 0 to {len(mesh.vertices) - 1}")
+    return mesh, _strays_told(source, strays)
+
+
+def _strays_told(source: str, strays: int) -> tuple[str, ...]:
+    return (f"{source}: dropped {strays} stray vertices that no face uses",) if strays > 0 else ()
+
+
+def _is_open(mesh: TriangleMesh) -> bool:
+    """Whether a mesh as read has a border; one of absurd size, which is refused later, is not looked at."""
+    return bool(np.ptp(mesh.vertices, axis=0).max() < 1e6) and not is_closed(TriangleMesh(*merge_vertices(mesh)))
 
 
 def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
     """A warning where a size is odd, none where it is usual, and MeshError where it is absurd."""
-    used = np.zeros(len(mesh.vertices), dtype=bool)
-    used[mesh.faces] = True
-    size = float(np.ptp(mesh.vertices[used], axis=0).max())
+    size = float(np.ptp(mesh.vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
         advice = unit_advice(size, scale) if size > 0 else "its vertices all lie in one point"
         raise MeshError(f"{source}: {size:.4g} m across, outside {SMALLEST} to {LARGEST} m; {advice}")

@@ -23,6 +23,20 @@ def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
     return np.asarray(mesh.vertices, dtype=float)[first], inverse[np.asarray(mesh.faces, dtype=np.int64)]
 
 
+def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
+    """The mesh without the vertices that no face uses, and how many those were.
+
+    A face that names a vertex twice uses none; it comes to name one vertex three times.
+    """
+    a, b, c = mesh.faces.T
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces[(a != b) & (b != c) & (c != a)]] = True
+    if used.all() or not used.any():
+        return mesh, 0
+    number = np.where(used, np.cumsum(used) - 1, 0)
+    return TriangleMesh(mesh.vertices[used], number[mesh.faces]), int((~used).sum())
+
+
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
     """The faces with an area (height above 1e-9 of the longest side)."""
     a, b, c = vertices[faces].transpose(1, 0, 2)

@@ -20,11 +20,13 @@ from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.planning.feasibility import out_of_reach
 from graspd_core.planning.memory_errors import enough_memory
+from graspd_core.planning.planning_scene import planning_scene
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import make_trial_context, parts_in_background, rank_by_robustness, run_trials
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated, start_worker_process
+from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
 from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
@@ -71,9 +73,12 @@ def plan_grasps(
     config = load_preset(preset) if isinstance(preset, str) else preset
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = Run(time.perf_counter(), deadline, progress, stop)
+    support, message, far = scene.support, "", np.zeros(3)
     # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing; and no search
     # finds what cannot be.
-    message = "" if run.over() else out_of_reach(scene, hand)
+    if not run.over():
+        scene, far = planning_scene(scene, config.resolution)
+        message = out_of_reach(scene, hand)
     rounds = [] if run.over() or message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
     hooks = Hooks(
@@ -83,7 +88,7 @@ def plan_grasps(
     )
     grasps: tuple[Grasp, ...] = ()
     trial_context = first = None
-    good, optimising = 0, 0.0
+    good, optimising = 0, time.perf_counter() - run.began
     # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
     for attempt, settings in enumerate(rounds):
         began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
@@ -117,7 +122,8 @@ def plan_grasps(
     )
     outcome = run.outcome(bool(grasps), good, count)
     run.report(Stage.DONE, 1, 1, 0.0, good)
-    return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, scene.support)
+    grasps = tuple(moved_grasp(grasp, far) for grasp in grasps)
+    return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, support)
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:

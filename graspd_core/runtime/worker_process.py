@@ -1,24 +1,30 @@
 """Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
 
-A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child. All
-others, the command line among them, do it themselves.
+A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child.
+All others, the command line among them, do it themselves. The child is a bare interpreter, not one of multiprocessing's,
+which would import the user's main module again: a script without a guard, or none at all, as in a notebook.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import pickle
 import signal
+import subprocess
+import sys
 import threading
 import traceback
 from collections.abc import Callable
-from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from typing import Any, TypeVar
 
 from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
 
 T = TypeVar("T")
+
+# The child finds modules where this process does.
+_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe})"
 
 
 class WorkerProcess:
@@ -38,18 +44,18 @@ class WorkerProcess:
         call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
         with self._lock:
             for _ in range(2):
-                if not self._process.is_alive():
+                if self._process.poll() is not None:
                     self._start()
                 try:
                     self._pipe.send_bytes(call)
                     told = self._pipe.recv_bytes()
                     break
                 except (EOFError, OSError):
-                    self._process.join()
+                    self._process.wait()
                 except BaseException:
                     # Ctrl-C while waiting: the answer, left in the pipe, would be taken for the next call's.
                     self._process.kill()
-                    self._process.join()
+                    self._process.wait()
                     raise
             else:
                 # Not called here instead: what killed them would kill this process.
@@ -62,20 +68,21 @@ class WorkerProcess:
     def close(self) -> None:
         """End the child."""
         self._pipe.close()
-        self._process.join()
+        self._process.kill()
+        self._process.wait()
 
     def _start(self) -> None:
-        # spawn: a fork would copy locks that other threads hold. Only the child's end of the pipe goes to the child, so
-        # that it reads an end of file when this process dies.
-        context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True, name="graspd_own_process")
+        # Only the child's end of the pipe goes to the child, so that it reads an end of file when this process dies.
+        self._pipe, theirs = Pipe()
+        path = [entry for entry in sys.path if isinstance(entry, str)]
+        program = _CHILD.format(path=path, module=__name__, pipe=theirs.fileno())
         # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
         # blocked, since it needs a second for its imports before it could ignore it.
-        resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._process.start()
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", program], stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()]
+            )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
@@ -87,7 +94,9 @@ _child: WorkerProcess | None = None
 def start_worker_process() -> None:
     """From now on do what goes through `run_isolated` in a child process, so that threads beside do not stand still."""
     global _child
-    _child = _child or WorkerProcess()
+    if _child is None:
+        _child = WorkerProcess()
+        atexit.register(_child.close)
 
 
 def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
@@ -95,7 +104,9 @@ def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
-def _serve(pipe: Connection) -> None:
+def serve(number: int) -> None:
+    """Do what comes through the pipe of this file descriptor, until its other end is closed."""
+    pipe = Connection(number)
     # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_malloc_arenas()

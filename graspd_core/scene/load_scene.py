@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from graspd_core.errors import MeshError
-from graspd_core.mesh.mesh_files import MESH_ENDINGS, load_mesh
+from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import load_library
 from graspd_core.pointcloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
@@ -57,20 +57,20 @@ def load_scene(
         ]
         scene = scene_from_views(views, target=target, alone=alone, source=given, device=device, **numbers)
         return replace(scene, object=replace(scene.object, scale=scale))
-    mesh = _read_mesh(source, scale)
+    mesh, warnings = _read_mesh(source, scale)
     # A distance grid that is remembered needs no Open3D, but the plan does.
     load_library()
-    return build_scene(mesh, source=given, scale=scale, device=device, started=started, **numbers)
+    return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 
 
-def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> TriangleMesh:
+def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[TriangleMesh, tuple[str, ...]]:
     if isinstance(source, TriangleMesh):
-        return TriangleMesh(source.vertices * scale, source.faces)
+        return TriangleMesh(source.vertices * scale, source.faces), ()
     name = str(source)
     if name.startswith(SHAPE_PREFIX):
         shape = make_shape(name.removeprefix(SHAPE_PREFIX))
-        return TriangleMesh(shape.vertices * scale, shape.faces)
+        return TriangleMesh(shape.vertices * scale, shape.faces), ()
     endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
     if Path(source).is_file() and Path(source).suffix.lower().lstrip(".") not in endings:
         raise MeshError(f"{name}: unknown ending {Path(source).suffix!r}; valid endings: {', '.join(endings)}")
-    return load_mesh(source, scale=scale)
+    return read_mesh(source, scale=scale)

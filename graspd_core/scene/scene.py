@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,9 +13,11 @@ from graspd_core.errors import MeshError
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
 from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
+from graspd_core.mesh.separate_bodies import bodies_apart
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.confidence import confidence_grid
+from graspd_core.scene.far_objects import far_centre, moved_mesh, moved_sdf
 from graspd_core.types import Plane, TriangleMesh
 
 # Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.
@@ -122,6 +124,9 @@ def build_scene(
     started = time.perf_counter() if started is None else started
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
     clean, found = check_mesh(mesh, source, MOST_FACES, scale=scale, dusty=confidence is None)
+    bodies, gap = bodies_apart(clean) if confidence is None else (1, 0.0)
+    if bodies > 1:
+        found += (f"{source}: {bodies} bodies, {1000 * gap:.0f} mm apart; they are grasped as one rigid thing",)
     model = _object_model(clean, source, mass, friction, scale, warnings + found)
     loaded = time.perf_counter()
     sdf = object_sdf(model, resolution)
@@ -137,38 +142,56 @@ def build_scene(
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
     """The object's signed distance (float32, CPU) on at most `resolution`³ nodes, remembered by content."""
+    near, far = near_object(model)
 
     def build() -> cache.Arrays:
-        sdf = build_sdf(model.mesh, resolution=resolution)
+        sdf = build_sdf(near.mesh, resolution=resolution)
         return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
 
     def valid(arrays: cache.Arrays) -> bool:
         shapes = {
-            "field": (4, *grid_layout(model.mesh, resolution).counts),
+            "field": (4, *grid_layout(near.mesh, resolution).counts),
             "origin": (3,),
             "spacing": (),
             "half": (3,),
         }
         return {name: array.shape for name, array in arrays.items()} == shapes
 
-    arrays = cache.remember(f"sdf-{model.sha256}-{resolution}", build, valid)
-    return GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()})
+    arrays = cache.remember(f"sdf-{near.sha256}-{resolution}", build, valid)
+    return moved_sdf(GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()}), far)
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
     """Convex parts that together fill the object and leave its hollows hollow, remembered by content."""
+    near, far = near_object(model)
 
     def build() -> cache.Arrays:
         # A second or two of Python's own work, beside the optimiser.
-        parts = run_isolated(convex_parts, model.mesh)
+        parts = run_isolated(convex_parts, near.mesh)
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
     def valid(arrays: cache.Arrays) -> bool:
         names = {f"{kind}{i}" for i in range(len(arrays) // 2) for kind in ("vertices", "faces")}
         return bool(names) and set(arrays) == names and all(a.shape[1:] == (3,) for a in arrays.values())
 
-    arrays = cache.remember(f"parts-{model.sha256}", build, valid)
-    return tuple(TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
+    arrays = cache.remember(f"parts-{near.sha256}", build, valid)
+    parts = (TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
+    return tuple(moved_mesh(part, far) for part in parts)
+
+
+def near_object(model: ObjectModel) -> tuple[ObjectModel, Float[np.ndarray, "3"]]:
+    """An object far from the origin about its centre, and that centre [m]; else the object itself, and zero."""
+    far = far_centre(model.mesh.vertices)
+    if not far.any():
+        return model, far
+    mesh = moved_mesh(model.mesh, -far)
+    near = replace(model, mesh=mesh, sha256=content_hash(mesh), center_of_mass=model.center_of_mass - far)
+    return near, far
+
+
+def moved_obstacle(neighbour: Obstacle, offset: Float[np.ndarray, "3"]) -> Obstacle:
+    """The thing elsewhere."""
+    return Obstacle(moved_mesh(neighbour.mesh, offset), moved_sdf(neighbour.sdf, offset))
 
 
 def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:

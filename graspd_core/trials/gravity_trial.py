@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.trials.hold_trial import DIRECTIONS, close_hand, diverged
 from graspd_core.trials.world import Protocol, World
 from graspd_core.types import Grasp
@@ -33,6 +34,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
     """
     import mujoco
 
+    grasp = moved_grasp(grasp, -world.origin)
     data = mujoco.MjData(world.model)
     if close_hand(world, data, grasp, protocol, np.zeros(2)):
         return LOST

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.trials.world import Protocol, World
 from graspd_core.types import Grasp, HoldResult, LiftResult, Posture, Verdict
 
@@ -33,6 +34,7 @@ def hold_trial(
     """
     import mujoco
 
+    grasp = moved_grasp(grasp, -world.origin)
     data = mujoco.MjData(world.model)
     worst = np.zeros(2)
     reason = close_hand(world, data, grasp, protocol, worst)

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel
+from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.trials.hold_trial import breach, set_hand_pose, set_joints, set_targets
 from graspd_core.trials.world import Protocol, World
@@ -80,6 +81,7 @@ def lift_trial(
     """
     import mujoco
 
+    grasp = moved_grasp(grasp, -world.origin)
     data = mujoco.MjData(world.model)
     begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
     through, reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)

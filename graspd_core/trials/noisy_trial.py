@@ -36,7 +36,7 @@ def noisy_holds(
     The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same
     errors. A start that the error pushes too deep into the object counts as not held.
     """
-    moved = [displaced(grasp, *error, world.center_of_mass) for error in pose_errors(seed, TRIALS)]
+    moved = [displaced(grasp, *error, world.center_of_mass + world.origin) for error in pose_errors(seed, TRIALS)]
     return tuple(hold_trial(world, g, protocol, stop=stop) for g in moved)
 
 
@@ -52,9 +52,9 @@ def noisy_share(
 
     None where `stop` ended one of them, or there is none.
     """
-    held = 0
+    held, center = 0, world.center_of_mass + world.origin
     for error in errors:
-        held += hold_trial(world, displaced(grasp, *error, world.center_of_mass), protocol, stop=stop).passed
+        held += hold_trial(world, displaced(grasp, *error, center), protocol, stop=stop).passed
         if stop():
             return None
     return held / len(errors) if errors else None

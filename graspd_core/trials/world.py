@@ -21,7 +21,8 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, Mimic
-from graspd_core.scene.scene import ObjectModel, Obstacle
+from graspd_core.scene.far_objects import moved_mesh, moved_plane
+from graspd_core.scene.scene import ObjectModel, Obstacle, moved_obstacle, near_object
 from graspd_core.se3 import quaternion_from_rotation
 from graspd_core.trials.bodies import (
     OBJECT,
@@ -100,7 +101,8 @@ class World:
         object_address: index into `qpos` of the object's free joint (position, then wxyz).
         object_velocity: index into `qvel` of its free joint.
         object_body: body id of the object.
-        center_of_mass: of the object, in its own frame [m].
+        center_of_mass: of the object [m].
+        origin: of the world, in the object's frame: zero, but for an object far from its own [m].
         hand_geoms: ids of the hand's geoms.
         obstacles: id and name of the geom of every obstacle to the hand.
         up: unit direction against gravity; None where there is none.
@@ -114,6 +116,7 @@ class World:
     object_velocity: int
     object_body: int
     center_of_mass: Float[np.ndarray, "3"]
+    origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     hand_geoms: tuple[int, ...] = ()
     obstacles: tuple[tuple[int, str], ...] = ()
     up: Float[np.ndarray, "3"] | None = None
@@ -142,6 +145,11 @@ def build_world(
     """
     import mujoco
 
+    # MuJoCo keeps vertices as float32, and finds no contacts a million metres away.
+    target, far = near_object(target)
+    parts = [moved_mesh(part, -far) for part in parts]
+    support = support and moved_plane(support, -far)
+    obstacles = [moved_obstacle(neighbour, -far) for neighbour in obstacles]
     # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
     mujoco.set_mju_user_warning(_ignore)
     spec = mujoco.MjSpec()
@@ -161,9 +169,9 @@ def build_world(
     fixed = [TABLE] if support is not None else []
     if support is not None:
         add_support(spec, hand, parts, protocol.friction, support)
-    for index, neighbour in enumerate(obstacles):
+    for index, obstacle in enumerate(obstacles):
         fixed.append(f"neighbour {index + 1}")
-        add_obstacle(spec, fixed[-1], neighbour, target, protocol.friction)
+        add_obstacle(spec, fixed[-1], obstacle, target, protocol.friction)
     model = spec.compile()
     return World(
         model=model,
@@ -172,6 +180,7 @@ def build_world(
         object_velocity=int(model.joint(OBJECT).dofadr[0]),
         object_body=int(model.body(OBJECT).id),
         center_of_mass=target.center_of_mass,
+        origin=far,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
         obstacles=tuple((int(model.geom(name).id), name) for name in fixed),
         up=None if support is None else support.normal,

@@ -21,6 +21,7 @@ from graspd_core.mesh.mesh_files import (
 from graspd_core.mesh.shapes import BOX_HALF, make_shape, shape_volume
 from graspd_core.mesh.topology import is_closed
 from graspd_core.mesh.units import unit_advice
+from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import TriangleMesh
 
 
@@ -138,6 +139,23 @@ def test_faces_without_area_alone_are_refused():
     line = TriangleMesh(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, 0, 0]]), np.array([[0, 1, 2]]))
     with pytest.raises(MeshError, match="no face has an area"):
         check_mesh(line, "line")
+
+
+@pytest.mark.parametrize("stray", [(3.0, 0, 0), (1e30, 0, 0), (np.nan,) * 3, (0, np.inf, 0)])
+@pytest.mark.parametrize("use", ["", "f 515 515 515\n", "f 1 1 515\n"], ids=["unused", "point", "line"])
+def test_a_stray_vertex_is_dropped_aloud_and_counts_nowhere(tmp_path, stray, use):
+    box = make_shape("box")
+    save_mesh(box, tmp_path / "box.obj")
+    text = (tmp_path / "box.obj").read_text() + "v {} {} {}\n".format(*stray) + use
+    from_file = load_scene(write(tmp_path / "box.obj", text), resolution=16)
+    faces = [[514, 514, 514]] if use.startswith("f 5") else [[0, 0, 514]] if use else np.zeros((0, 3), int)
+    spoilt = TriangleMesh(np.vstack([box.vertices, stray]), np.vstack([box.faces, faces]))
+    from_value = load_scene(spoilt, resolution=16)
+    for thing in (from_file.object, from_value.object):
+        assert np.ptp(thing.mesh.vertices, axis=0) == pytest.approx(2 * np.array(BOX_HALF), abs=1e-7)
+        assert thing.volume == pytest.approx(shape_volume("box"), rel=1e-6)
+        told = ["dropped 1 stray vertices that no face uses", *["dropped 1 faces without area"] * bool(use)]
+        assert [warning.partition(": ")[2] for warning in thing.warnings] == told
 
 
 def test_faces_beyond_the_vertices_are_refused():

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_arrays_tensors_and_named_arguments_travel(child: WorkerProcess):
 def test_an_error_says_where_it_came_from_and_one_that_cannot_travel_what_it_was(child: WorkerProcess):
     with pytest.raises(ValueError, match="math domain") as caught:
         child(math.sqrt, -1.0)
-    assert "worker_process.py" in caught.value.__notes__[0]
+    assert "own_process.py" in caught.value.__notes__[0]
     with pytest.raises(RuntimeError, match="Homebound: no luggage"):
         child(exec, "class Homebound(Exception): pass\nraise Homebound('no luggage')")
     assert child(math.sqrt, 4.0) == 2.0
@@ -63,14 +64,35 @@ def test_only_a_process_that_asked_for_it_has_its_work_done_elsewhere():
     program = (
         "import os\n"
         "from graspd_core.runtime.worker_process import elsewhere, start_worker_process\n"
-        "if __name__ == '__main__':\n"
-        "    start_worker_process()\n"
-        "    start_worker_process()\n"
-        "    print(elsewhere(os.getpid) == elsewhere(os.getpid) != os.getpid())\n"
-        "    print(elsewhere(elsewhere, os.getpid) == elsewhere(os.getpid))\n"
+        "start_worker_process()\n"
+        "start_worker_process()\n"
+        "print(elsewhere(os.getpid) == elsewhere(os.getpid) != os.getpid())\n"
+        "print(elsewhere(elsewhere, os.getpid) == elsewhere(os.getpid))\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["True", "True"]
+
+
+@pytest.mark.parametrize("way", ["script", "stdin", "command", "module"])
+def test_the_main_module_of_its_user_is_not_imported_again(way: str, tmp_path: Path):
+    """A script without a guard, what is typed into an interpreter, and a module that only the working directory has."""
+    program = (
+        "import os, sys\n"
+        "from graspd_core.runtime.worker_process import elsewhere, start_worker_process\n"
+        "sys.path.append(os.path.join(os.getcwd(), 'more'))\n"
+        "import beside\n"
+        "print('imported')\n"
+        "start_worker_process()\n"
+        "print(elsewhere(beside.whoami) not in (os.getpid(), None))\n"
+    )
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more/beside.py").write_text("import os\n\ndef whoami():\n    return os.getpid()\n")
+    (tmp_path / "mine.py").write_text(program)
+    how = {"script": ["mine.py"], "stdin": ["-"], "command": ["-c", program], "module": ["-m", "mine"]}
+    done = subprocess.run(
+        [sys.executable, *how[way]], input=program, cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert (done.stdout.split(), done.stderr) == (["imported", "True"], "")
 
 
 def test_when_the_child_is_killed_nothing_is_lost(child: WorkerProcess):
@@ -110,11 +132,10 @@ def test_the_child_ends_with_its_parent():
     program = (
         "import os, signal, math\n"
         "from graspd_core.runtime.worker_process import WorkerProcess\n"
-        "if __name__ == '__main__':\n"
-        "    aside = WorkerProcess()\n"
-        "    assert aside(math.sqrt, 4.0) == 2.0\n"
-        "    print(aside._process.pid, flush=True)\n"
-        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "aside = WorkerProcess()\n"
+        "assert aside(math.sqrt, 4.0) == 2.0\n"
+        "print(aside._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     child = int(done.stdout)

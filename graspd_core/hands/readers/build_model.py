@@ -1,6 +1,6 @@
 """A `HandModel` from links and joints, whichever format they were read from: checks, order, couplings, limits.
 
-The order of links and joints is pytorch-kinematics': depth-first, children in the order of the file.
+The order of links and joints is depth-first, children in the order of the file's joints.
 """
 
 from __future__ import annotations
@@ -171,9 +171,7 @@ def assemble(
 
 
 def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSpec]) -> list[str]:
-    """Link names in pytorch-kinematics' order, once links and joints are known to make one tree."""
-    import pytorch_kinematics as pk
-
+    """Link names, a link before its children, once links and joints are known to make one tree."""
     names = [link.name for link in links]
     _refuse_repeated(path, "link", names)
     _refuse_repeated(path, "joint", [joint.name for joint in joints])
@@ -198,16 +196,12 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
             f"{path}: links in a loop or more than {_LONGEST_CHAIN} joints from the root, "
             f"not reachable from the root: {', '.join(lost[:5])}"
         )
-    if not joints:
-        return roots
-    # By number: whatever the names hold, it is not read again.
-    number = {link: str(i) for i, link in enumerate(names)}
-    body = "".join(f'<link name="{i}"/>' for i in number.values()) + "".join(
-        f'<joint name="{i}" type="fixed"><parent link="{number[j.parent]}"/><child link="{number[j.child]}"/></joint>'
-        for i, j in enumerate(joints)
-    )
-    chain = pk.build_chain_from_urdf(f'<robot name="hand">{body}</robot>'.encode())
-    return [names[int(frame)] for frame in chain.get_frame_names(exclude_fixed=False)]
+    order, ahead = [], roots
+    while ahead:
+        link = ahead.pop()
+        order.append(link)
+        ahead.extend(joint.child for joint in reversed(joints) if joint.parent == link)
+    return order
 
 
 def _refuse_repeated(path: Path, what: str, names: Sequence[str]) -> None:
