@@ -11,6 +11,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
+    from graspd_ros.grasp_node import GraspNode
 
 STOP_TIMEOUT = 2.0  # seconds that a busy worker has to notice that it must stop
 # Seconds that a thread may keep Python from others (5 ms by itself): the executor asks for it several times a message.
@@ -27,15 +33,10 @@ def main(args: list[str] | None = None) -> int:
     _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
-    import rclpy
-    from rclpy.exceptions import ParameterException
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown
 
     from graspd_core import limit_malloc_arenas
-    from graspd_core.errors import GraspdError
-    from graspd_ros.grasp_node import GraspNode
 
     limit_malloc_arenas()
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -45,34 +46,13 @@ def main(args: list[str] | None = None) -> int:
         failed.set()
         wake.set()
 
-    try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # what rcl says of arguments that it cannot read, over several lines
-        sys.stderr.write(f"graspd_node: {' '.join(str(error).split())}\n")
-        return EXIT_BAD_INPUT
-    try:
-        node = GraspNode(on_failure=fail)
-    except (GraspdError, ParameterException) as error:
-        sys.stderr.write(f"graspd_node: {error}\n")
-        try_shutdown()
+    node = _make_node(args, fail)
+    if node is None:
         return EXIT_BAD_INPUT
     _on_signal(wake.set)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-
-    def spin() -> None:
-        try:
-            executor.spin()
-        except Exception:
-            if not wake.is_set():
-                raise
-            # The context was shut down, under a callback perhaps, to end this.
-        finally:
-            if not wake.is_set():
-                fail()
-
-    spinner = threading.Thread(target=spin, name="graspd_executor", daemon=True)
-    spinner.start()
+    spinner = _spinning(executor, wake, fail)
     wake.wait()
     ended = node.close(STOP_TIMEOUT)
     # In this order: shutting the executor down takes what it waits with from under it.
@@ -87,6 +67,48 @@ def main(args: list[str] | None = None) -> int:
         sys.stderr.flush()
         os._exit(status)
     return status
+
+
+def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
+    """A thread that runs the executor until `wake` is set; before that, an end of it is a failure."""
+
+    def spin() -> None:
+        try:
+            executor.spin()
+        except Exception:
+            if not wake.is_set():
+                raise
+            # The context was shut down, under a callback perhaps, to end this.
+        finally:
+            if not wake.is_set():
+                fail()
+
+    spinner = threading.Thread(target=spin, name="graspd_executor", daemon=True)
+    spinner.start()
+    return spinner
+
+
+def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspNode | None:
+    """The node; None where an argument or a parameter is bad, which standard error then says."""
+    import rclpy
+    from rclpy.exceptions import ParameterException
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import try_shutdown
+
+    from graspd_core.errors import GraspdError
+    from graspd_ros.grasp_node import GraspNode
+
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # what rcl says of arguments that it cannot read, over several lines
+        sys.stderr.write(f"graspd_node: {' '.join(str(error).split())}\n")
+        return None
+    try:
+        return GraspNode(on_failure=on_failure)
+    except (GraspdError, ParameterException) as error:
+        sys.stderr.write(f"graspd_node: {error}\n")
+        try_shutdown()
+        return None
 
 
 def _on_signal(action: Callable[[], None]) -> None:

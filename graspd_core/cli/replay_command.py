@@ -23,6 +23,7 @@ from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, E
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.transforms import SECOND
+from graspd_core.types import GraspResult
 
 
 @dataclass(frozen=True)
@@ -81,24 +82,25 @@ def run(options: argparse.Namespace) -> int:
             if options.out:
                 path = options.out if single else options.out / f"{job.name}.json"
                 save_result(path, result, scene.object, hand, config)
-            good = good_grasps(result)
-            first = result.timing.first_verified
-            print(
-                f"{job.label}: {sum(len(v.points) for v in job.views)} points, {good} of {options.count} grasps "
-                f"({len(result.grasps)} tried): {result.message or result.outcome.value}; "
-                + (f"first verified after {first:.2f} s, " if first else "")
-                + f"total {result.timing.total:.2f} s",
-                flush=True,
-            )
-            grasps += good
+            print(_outcome_line(job, result, options.count), flush=True)
+            grasps += good_grasps(result)
             statuses.append(exit_status(result))
-    refused = statuses.count(EXIT_BAD_INPUT)
+    enough, refused = statuses.count(EXIT_OK), statuses.count(EXIT_BAD_INPUT)
     print(
-        f"{len(statuses)} scenes: {statuses.count(EXIT_OK)} with enough grasps, "
-        f"{len(statuses) - refused - statuses.count(EXIT_OK)} with fewer, {refused} refused; "
-        f"{grasps} grasps in {time.perf_counter() - began:.1f} s"
+        f"{len(statuses)} scenes: {enough} with enough grasps, {len(statuses) - refused - enough} with fewer, "
+        f"{refused} refused; {grasps} grasps in {time.perf_counter() - began:.1f} s"
     )
     return EXIT_INTERRUPTED if interrupted else _status(statuses)
+
+
+def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
+    first = result.timing.first_verified
+    return (
+        f"{job.label}: {sum(len(v.points) for v in job.views)} points, {good_grasps(result)} of {count} grasps "
+        f"({len(result.grasps)} tried): {result.message or result.outcome.value}; "
+        + (f"first verified after {first:.2f} s, " if first else "")
+        + f"total {result.timing.total:.2f} s"
+    )
 
 
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:

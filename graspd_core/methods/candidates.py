@@ -89,9 +89,7 @@ def assemble(
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     order = scores.argsort(descending=True)
     return tuple(
-        _grasp(problem, hand, int(i), poses, opened, pressed, contact_set, float(scores[i]))
-        for i in order
-        if scores[i] > -1e3
+        _grasp(hand, int(i), poses, opened, pressed, contact_set, float(scores[i])) for i in order if scores[i] > -1e3
     )
 
 
@@ -121,7 +119,6 @@ def score(
 
 
 def _grasp(
-    problem: Problem,
     hand: HandModel,
     row: int,
     poses: Poses,

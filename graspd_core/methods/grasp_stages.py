@@ -233,12 +233,7 @@ def find_pregrasp(
     """
     start = torch.cat([poses.translation, poses.joints], -1)
     rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
-    rates = torch.full_like(start[0], config.open_joint_rate)
-    rates[3:] *= problem.hand.joint_scale
-    rates[:3] = config.open_base_rate
-    cost = torch.full_like(start[0], 0.1)
-    cost[3:] /= problem.hand.joint_scale**2
-    cost[:3] = 2e3
+    rates, cost = _rates_and_costs(problem, config)
     with torch.no_grad():
         reached = hand_distance(problem, poses.base, poses.joints)
     remaining = torch.tensor([1.0 - a for a in _WAY], dtype=start.dtype, device=start.device)[:, None, None]
@@ -272,6 +267,19 @@ def find_pregrasp(
     with torch.no_grad():
         share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
     return Poses(x[:, :3], poses.quaternion, x[:, 3:]), share
+
+
+def _rates_and_costs(
+    problem: Problem, config: GraspStagesConfig
+) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
+    """Of base translation and joints: step sizes, and what a square of travel costs."""
+    rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), config.open_joint_rate)
+    rates[3:] *= problem.hand.joint_scale
+    rates[:3] = config.open_base_rate
+    cost = torch.full_like(rates, 0.1)
+    cost[3:] /= problem.hand.joint_scale**2
+    cost[:3] = 2e3
+    return rates, cost
 
 
 def _obstacle_cost(

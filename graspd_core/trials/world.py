@@ -154,16 +154,7 @@ def build_world(
     mujoco.set_mju_user_warning(_ignore)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    option = spec.option
-    option.timestep = protocol.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = protocol.impratio
-    option.noslip_iterations = protocol.noslip_iterations
-    option.gravity = [0.0, 0.0, 0.0]
-    # Several contact points between flat faces: on one point each, a box between two plates rolls out. Later versions
-    # of MuJoCo have no such switch, because it is always on.
-    option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
+    _set_physics(spec.option, protocol)
     _add_hand(spec, hand, protocol)
     add_object(spec, target, parts, protocol.friction)
     fixed = [TABLE] if support is not None else []
@@ -187,6 +178,20 @@ def build_world(
         coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
         mimics=hand.mimics,
     )
+
+
+def _set_physics(option: Any, protocol: Protocol) -> None:
+    import mujoco
+
+    option.timestep = protocol.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = protocol.impratio
+    option.noslip_iterations = protocol.noslip_iterations
+    option.gravity = [0.0, 0.0, 0.0]
+    # Several contact points between flat faces: on one point each, a box between two plates rolls out. Later versions
+    # of MuJoCo have no such switch, because it is always on.
+    option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
 
 
 def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:

@@ -12,9 +12,9 @@ from launch_ros.actions import Node
 from graspd_core.paths import config_dir
 
 
-def generate_launch_description() -> LaunchDescription:
-    """One node; what differs from robot to robot can be given on the command line."""
-    arguments = [
+def _arguments() -> list[DeclareLaunchArgument]:
+    """What differs from robot to robot."""
+    return [
         DeclareLaunchArgument("points", default_value="points", description="PointCloud2 topic to listen to"),
         DeclareLaunchArgument(
             "depth_image", default_value="depth/image_rect", description="depth image topic to listen to"
@@ -36,9 +36,13 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument("respawn", default_value="false", description="start the node again when it dies"),
     ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """One node, with arguments on the command line."""
     return LaunchDescription(
         [
-            *arguments,
+            *_arguments(),
             SetEnvironmentVariable(
                 "FASTRTPS_DEFAULT_PROFILES_FILE",
                 str(config_dir() / "fastdds.xml"),

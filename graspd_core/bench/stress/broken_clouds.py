@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,11 @@ _SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
 
 def cloud_cases() -> tuple[Case, ...]:
     """Every broken cloud, through `scene_from_views`."""
+    return (*_measured(), *_refused(), *_special(), *_messages())
+
+
+def _measured() -> Iterator[Case]:
+    """What sensors and scenes do to clouds that grasps are still expected of."""
     box, mug, cylinder, block = (_true(shape) for shape in ("box", "mug", "cylinder", "l_block"))
     seen = (
         ("single-view", "one view of a box on a table", lambda: _views("box", 1), box),
@@ -73,6 +78,11 @@ def cloud_cases() -> tuple[Case, ...]:
         ("zero-filled", "two points of three are the camera's own place", lambda: zero_filled("box"), box),
         ("tilted-table", "camera coordinates: the table tilts by 40°", _in_camera, _box_in_camera),
     )
+    return (_case(name, about, make, truth=truth) for name, about, make, truth in seen)
+
+
+def _refused() -> Iterator[Case]:
+    """What holds no object."""
     refused = (
         ("empty", "no point at all", lambda: [_cloud(np.zeros((0, 3)))], ("CloudError",)),
         ("no-view", "a list of no views", lambda: [], ("CloudError",)),
@@ -84,15 +94,21 @@ def cloud_cases() -> tuple[Case, ...]:
         ("white-noise", "points anywhere in a cube of 2 m", _room, ("CloudError", "NoObjectError", *_FEW)),
         ("wrong-units", "a cloud in millimetres", lambda: _scaled(_views("box", 1), 1e3), None),
     )
-    cases = [_case(name, about, make, truth=truth) for name, about, make, truth in seen]
-    cases += [
+    return (
         _case(name, about, make, expect or ("CloudError", "NoObjectError"), whole=False)
         for name, about, make, expect in refused
-    ]
+    )
+
+
+def _special() -> tuple[Case, ...]:
+    """What is asked for or bounded in another way."""
     return (
-        *cases,
         _case(
-            "lone-object", "the object alone, nothing under it", lambda: _alone("cylinder"), alone=True, truth=cylinder
+            "lone-object",
+            "the object alone, nothing under it",
+            lambda: _alone("cylinder"),
+            alone=True,
+            truth=_true("cylinder"),
         ),
         _case(
             "touching-masked",
@@ -103,7 +119,13 @@ def cloud_cases() -> tuple[Case, ...]:
         ),
         _case("touching", "two things that touch, and no word which", _touching, (GRASP, *_FEW), whole=False),
         _case("touching-unequal", "a slab against a box, and no word which", unequal_pair, (GRASP, *_FEW), whole=False),
-        _case("ten-million-points", "ten million points", _many, memory=3000.0, loading=30.0, truth=box),
+        _case("ten-million-points", "ten million points", _many, memory=3000.0, loading=30.0, truth=_true("box")),
+    )
+
+
+def _messages() -> tuple[Case, ...]:
+    """PointCloud2 messages of other layouts."""
+    return (
         _layout("integer-fields", "coordinates as INT16", dtype="<i2", number=3),
         _layout("zero-width", "a message of width zero", width=0),
         _layout("lying-sizes", "a message that holds half of what it says", cut=2),
