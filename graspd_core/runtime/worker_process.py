@@ -2,7 +2,7 @@
 
 A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child.
 All others, the command line among them, do it themselves. The child is a bare interpreter, not one of
-multiprocessing's, which would import the user's main module again: a script without a guard, or none at all, as in a notebook.
+multiprocessing's, which would import the user's main module again: a script without a guard, or none, as in a notebook.
 """
 
 from __future__ import annotations
