@@ -7,8 +7,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from graspd_core.config import METHODS, ClosedFormConfig, LossWeights, load_preset
-from graspd_core.methods.candidates import SEARCHES
+from graspd_core.config import (
+    METHODS,
+    AnnealingConfig,
+    ClosedFormConfig,
+    Graspd2022Config,
+    LossWeights,
+    PlanConfig,
+    RandomClosureConfig,
+    load_preset,
+)
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form import ClosedForm, pack
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, minimise
@@ -38,10 +47,24 @@ def test_an_ablation_changes_only_what_it_names(preset: str, expected: ClosedFor
 
 
 @pytest.mark.parametrize("method", ["annealing", "random_closure"])
-def test_rivals_have_a_preset_and_a_search(method: str):
+def test_rivals_have_a_preset_that_changes_the_method_alone(method: str):
     assert load_preset(method) == replace(load_preset("balanced"), method=method)
-    assert method in METHODS
-    assert callable(SEARCHES[method])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_method_has_a_search_that_takes_its_own_steps(hand, scenes, method: str):
+    config = PlanConfig(
+        method=method,  # pyright: ignore[reportArgumentType]
+        closed_form=replace(DEFAULT, explore_steps=1, refine_steps=1, polish_steps=1),
+        graspd2022=Graspd2022Config(steps=4, coarse_steps=1),
+        annealing=AnnealingConfig(steps=5),
+        random_closure=RandomClosureConfig(close_steps=6),
+    )
+    steps: list[int] = []
+    hooks = Hooks(report=lambda _, of, __: steps.append(of), stop=lambda: bool(steps), interval=0.0)
+    find_candidates(scenes["sphere"], hand, count=1, seed=0, config=config, hooks=hooks)
+    # Fingers close over twice the way from open to closed.
+    assert steps[0] == {"closed_form": 3, "graspd2022": 4, "annealing": 5, "random_closure": 12}[method]
 
 
 def test_a_hard_contact_is_one_within_its_width_and_zero_beyond_without_gradient():

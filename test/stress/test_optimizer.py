@@ -19,7 +19,7 @@ from graspd_core.methods.closed_form.closed_form import ClosedForm, pack, unpack
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, Poses, minimise
 from graspd_core.methods.planner import PlannerInput, problem_of
-from graspd_core.methods.problem import Problem, evaluate, hand_forward
+from graspd_core.methods.problem import Problem, hand_forward
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
@@ -69,7 +69,6 @@ def test_starts_that_meet_a_poisoned_node_are_dropped_and_the_others_unharmed(so
     solution = minimise(ClosedForm(SHORT, BATCH), poisoned, starts, Hooks())
     found = torch.isfinite(solution.loss)
     assert found.any()
-    assert torch.isfinite(pack(solution.poses)[found]).all()
     same = (pack(solution.poses) == clean).all(-1)
     assert same.any()
     # Whoever never looked at the node goes the same way to the last bit; whoever did is dropped or went elsewhere.
@@ -123,34 +122,34 @@ def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     assert len(assemble(sound, hand, poses, PLAN)) > BATCH // 2
 
 
+def assert_every_start_moves(problem: Problem, starts: Poses, delta: float) -> None:
+    """Where a loss or a slope is no number, the solver says infinity and zero, so that such a start stands still."""
+    for polish in (False, True):
+        solver, radius = ClosedForm(SHORT, BATCH), torch.zeros(BATCH)
+        loss, gradient = solver.value_and_gradient(problem, pack(starts), radius, delta, polish)
+        assert torch.isfinite(loss).all()
+        assert (gradient.norm(dim=-1) > 0).all()
+
+
 @pytest.mark.parametrize("friction", [0.02, 0.2, 2.0, 20.0])
 def test_friction_over_three_decades_gives_finite_losses(sound, starts, friction: float):
-    solution = minimise(ClosedForm(SHORT, BATCH), replace(sound, friction=friction), starts, Hooks())
-    assert torch.isfinite(solution.loss).all()
-    assert torch.isfinite(pack(solution.poses)).all()
+    assert_every_start_moves(replace(sound, friction=friction), starts, 0.01)
 
 
 @pytest.mark.parametrize("delta", [1e-6, 1e-3, 1.0])
 def test_contact_widths_over_six_decades_give_finite_gradients(sound, starts, delta: float):
-    loss, gradient = ClosedForm(SHORT, BATCH).value_and_gradient(sound, pack(starts), torch.zeros(BATCH), delta, True)
-    assert torch.isfinite(loss).all()
-    assert torch.isfinite(gradient).all()
-    assert (gradient.norm(dim=-1) > 0).all()
+    assert_every_start_moves(sound, starts, delta)
 
 
 def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):
     """Distance zero and normal zero at every node: nothing to hold, and nothing to divide by."""
     nothing = replace(sound, sdf=replace(sound.sdf, field=torch.zeros_like(sound.sdf.field)))
-    loss, gradient = ClosedForm(SHORT, BATCH).value_and_gradient(nothing, pack(starts), torch.zeros(BATCH), 0.01, True)
-    assert torch.isfinite(loss).all()
-    assert torch.isfinite(gradient).all()
+    assert_every_start_moves(nothing, starts, 0.01)
 
 
 def test_a_closed_hand_on_the_centre_of_mass_gives_no_nan(sound, starts):
     """Contacts at the centre of mass have no arm, and disturbances no speed there."""
-    at_centre = starts.translation * 0 + sound.center
-    terms = evaluate(sound, at_centre, starts.quaternion, starts.joints, torch.zeros(BATCH), 0.004, fine=True)
-    assert all(torch.isfinite(term).all() for term in terms if term is not None)
+    assert_every_start_moves(sound, replace(starts, translation=starts.translation * 0 + sound.center), 0.004)
 
 
 _CAPPED = """
@@ -176,21 +175,3 @@ def test_too_little_memory_is_a_named_failure_and_no_crash():
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("ResourceError"), done.stdout
     assert "memory" in done.stdout
-
-
-@pytest.mark.slow
-def test_a_cold_process_keeps_a_deadline_of_a_fifth_of_a_second():
-    code = """
-import time, torch
-torch.set_num_threads(1)
-from graspd_core.hands.library import load_hand
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.scene.load_scene import load_scene
-hand, scene = load_hand("allegro_right"), load_scene("shape:box")
-began = time.process_time()
-print(plan_grasps(scene, hand, count=2, deadline=0.2).outcome.name, time.process_time() - began)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    outcome, seconds = done.stdout.split()
-    assert outcome == "DEADLINE"
-    assert float(seconds) < 0.7
