@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
 
 import hypothesis
+import pytest
 from jaxtyping import install_import_hook
 
 # Before anything imports graspd_core, or its functions would stay unchecked.
@@ -14,6 +21,62 @@ import torch  # noqa: E402
 
 torch.set_num_threads(1)
 
-hypothesis.settings.register_profile("dev", deadline=None, max_examples=25)
-hypothesis.settings.register_profile("ci", deadline=None, max_examples=25, derandomize=True)
+# A busy machine is no fault of a test: neither examples nor the drawing of them may take too long.
+hypothesis.settings.register_profile(
+    "dev", deadline=None, max_examples=25, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.register_profile("ci", hypothesis.settings.get_profile("dev"), derandomize=True)
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+
+@pytest.fixture(scope="session")
+def claim_domain() -> Iterator[Callable[[], int]]:
+    """Gives DDS domains that nobody else has: no other worker, and no other run of the tests beside this one."""
+    claimed: list[IO[str]] = []
+
+    def claim_domain() -> int:
+        for number in range(100):
+            domain = 1 + (os.getpid() + number) % 100
+            try:
+                claimed.append((Path(tempfile.gettempdir()) / f"graspd-test-domain-{domain}").open("w"))
+                # Until this process ends, however it ends.
+                fcntl.flock(claimed[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return domain
+            except OSError:
+                continue
+        pytest.fail("no DDS domain is free")
+
+    yield claim_domain
+    for file in claimed:
+        file.close()
+
+
+@pytest.fixture(scope="session")
+def domain(claim_domain: Callable[[], int]) -> int:
+    """The DDS domain of this process's tests."""
+    return claim_domain()
+
+
+@pytest.fixture(scope="session")
+def bytecodes() -> Callable[[Callable[[], Any]], int]:
+    """Counts the bytecodes that a call runs, the second time: Python's own work, however busy the machine is."""
+
+    def bytecodes(call: Callable[[], Any]) -> int:
+        ran = 0
+
+        def trace(frame: Any, event: str, _: Any) -> Any:
+            nonlocal ran
+            frame.f_trace_opcodes = True
+            ran += event == "opcode"
+            return trace
+
+        call()
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            call()
+        finally:
+            sys.settrace(before)
+        return ran
+
+    return bytecodes

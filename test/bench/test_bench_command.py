@@ -99,6 +99,13 @@ def finished(folder: Path) -> dict[str, float]:
     return {path.name: path.stat().st_mtime for path in folder.glob("raw-*.json")}
 
 
+def lives(process: str) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
 def wait_for_a_cell(process: subprocess.Popen[str], folder: Path) -> None:
     while not finished(folder):
         assert process.poll() is None, process.communicate()
@@ -112,10 +119,12 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
     command = [*GRASPD, *SMALL, "--seeds", "0", "1", "2", "--out", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     wait_for_a_cell(process, tmp_path)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     process.kill()
     process.communicate()
     # Its worker ends by itself, a moment later; until then it may finish a cell.
-    time.sleep(2.0)
+    while any(map(lives, children)):
+        time.sleep(0.05)
     before = finished(tmp_path)
     assert 1 <= len(before) < 3
     assert not (tmp_path / "results.json").exists()

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -201,13 +200,10 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
         "--html",
         "view.html",
     ]
-    done = subprocess.run(
-        [*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True, timeout=100
-    )
-    assert done.returncode in (EXIT_OK, EXIT_TOO_FEW), done.stderr
+    done = subprocess.run([*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == EXIT_OK, done.stderr
     document = load_document(tmp_path / "grasps.json")
-    verified = [grasp["verdict"] == "verified" for grasp in document["grasps"]]
-    assert (sum(verified) == 1) == (done.returncode == EXIT_OK)
+    assert [grasp["verdict"] for grasp in document["grasps"]].count("verified") == 1
     assert document["object"]["scale"] == 0.001
     assert document["seed"] == 1
     assert len(document["grasps"][0]["joint_positions"]) == len(document["hand"]["joint_names"]) == 16
@@ -222,12 +218,11 @@ def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path):
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     assert "optimise" in process.stderr.readline()
-    begun = time.monotonic()
     os.kill(process.pid, signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate()
     assert process.returncode == EXIT_INTERRUPTED, errors
     assert "Traceback" not in errors
     assert "cancelled" in output
     assert load_document(out)["outcome"]["name"] == "CANCELLED"
-    # One optimiser step, the collision parts of a box, and the end of the process; an uncancelled run takes a minute.
-    assert time.monotonic() - begun < 15
+    # Amid its first round: nothing was tried.
+    assert "verify" not in errors

@@ -6,7 +6,6 @@ import io
 import json
 import pickle
 import struct
-import time
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -50,10 +49,8 @@ def seed(fuzz: ModuleType, name: str, old: str, new: str) -> bytes:
 
 
 def refusal(fuzz: ModuleType, name: str, data: bytes, folder: Path) -> str:
-    """Why a target refuses an input; fails where it does not, or not as it should, or not soon."""
-    began = time.process_time()
+    """Why a target refuses an input; fails where it does not, or not as it should."""
     told = fuzz.try_input(fuzz.TARGETS[name], data, folder)
-    assert time.process_time() - began < 5.0
     assert told is not None, "it was taken"
     return told
 

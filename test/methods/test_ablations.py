@@ -7,13 +7,18 @@ from dataclasses import replace
 import pytest
 import torch
 
+from graspd_core.methods.annealing.annealing_config import AnnealingConfig
+from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form import ClosedForm
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.losses import hard_contact, soft_contact
-from graspd_core.methods.plan_config import load_preset
+from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.methods.poses import pack
+from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
+from graspd_core.methods.registry import METHODS
 
 DEFAULT = ClosedFormConfig()
 DOUBLE = torch.float64
@@ -39,8 +44,27 @@ def test_an_ablation_changes_only_what_it_names(preset: str, expected: ClosedFor
 
 
 @pytest.mark.parametrize("method", ["annealing", "random_closure"])
-def test_baselines_have_a_preset(method: str):
+def test_baselines_have_a_preset_that_changes_the_method_alone(method: str):
     assert load_preset(method) == load_preset("balanced").with_method(method)
+
+
+SHORT = {
+    "closed_form": (replace(DEFAULT, explore_steps=1, refine_steps=1, polish_steps=1), 3),
+    "graspd2022": (Graspd2022Config(steps=4, coarse_steps=1), 4),
+    "annealing": (AnnealingConfig(steps=5), 5),
+    # Fingers close over twice the way from open to closed.
+    "random_closure": (RandomClosureConfig(close_steps=6), 12),
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_method_takes_its_own_steps(hand, scenes, method: str):
+    settings, expected = SHORT[method]
+    steps: list[int] = []
+    hooks = Hooks(report=lambda _, of, __: steps.append(of), stop=lambda: bool(steps), interval=0.0)
+    config = PlanConfig(method=method, settings=settings)
+    find_candidates(scenes["sphere"], hand, count=1, seed=0, config=config, hooks=hooks)
+    assert steps[0] == expected
 
 
 def test_a_hard_contact_is_one_within_its_width_and_zero_beyond_without_gradient():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +16,6 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import Grasp, GraspResult, LiftResult, Outcome, Plane, Progress, Stage, Verdict
-
-# How late a run may end: one optimiser step on a busy machine, not the seconds that a run takes.
-LATE = 0.5
 
 
 @pytest.fixture(scope="module")
@@ -134,16 +130,13 @@ def test_the_same_seed_gives_the_same_grasps_and_another_others(scene, hand, res
 def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
     stop = threading.Event()
     steps: list[int] = []
-    times: list[float] = []
 
     def progress(report: Progress) -> None:
         if report.stage is Stage.OPTIMISE:
             steps.append(report.step)
-            times.append(time.perf_counter())
             stop.set()
 
     cancelled = plan_grasps(scene, hand, count=8, preset="accurate", progress=progress, stop=stop.is_set)
-    assert time.perf_counter() - times[0] < LATE
     assert cancelled.outcome is Outcome.CANCELLED
     assert cancelled.grasps == ()
     assert steps == [1]
@@ -164,11 +157,13 @@ def test_cancelling_while_verifying_keeps_what_is_verified(scene, hand):
 
 @pytest.mark.parametrize("verify", ["standard", "none"])
 def test_a_deadline_is_kept(scene, hand, result, verify: str):
-    begun = time.perf_counter()
-    late = plan_grasps(scene, hand, count=2, preset="accurate", deadline=0.2, verify=verify)
-    assert time.perf_counter() - begun < 0.2 + LATE
+    told: list[Progress] = []
+    late = plan_grasps(scene, hand, count=2, preset="accurate", deadline=0.2, verify=verify, progress=told.append)
     assert late.outcome is Outcome.DEADLINE
     assert late.grasps == ()
+    # Neither are all steps done, nor is any grasp tried.
+    assert {report.stage for report in told} <= {Stage.OPTIMISE, Stage.DONE}
+    assert all(report.step < report.of for report in told[:-1])
 
 
 def test_a_run_that_is_over_before_it_begins_begins_nothing(scene, hand):
@@ -204,14 +199,17 @@ def test_what_held_in_an_earlier_round_stays_told(scene, hand):
     assert 0 < told[-2].verified <= told[-1].verified
 
 
-def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
+def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
-    monkeypatch.setattr(trials, "object_parts", lambda _: release.wait(30))
-    begun = time.perf_counter()
-    late = plan_grasps(scene, hand, count=1, preset="fast", deadline=3.0)
-    assert time.perf_counter() - begun < 3.0 + LATE
+    # They come only once the run has ended; who waited for them would wait for ever.
+    monkeypatch.setattr(trials, "object_parts", lambda _: release.wait())
+    short = replace(load_preset("fast").closed_form, explore_steps=3, refine_steps=3, polish_steps=3)
+    try:
+        late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=2.0)
+    finally:
+        release.set()
     assert late.outcome is Outcome.DEADLINE
-    release.set()
+    assert late.grasps == ()
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from graspd_core.config import RoundsConfig
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Obstacle, Scene
 from graspd_core.types import Plane
 
 
@@ -19,18 +22,23 @@ def scene():
     return load_scene("shape:box", resolution=16)
 
 
-def efforts(*values: float) -> list[PlanConfig]:
-    return [PlanConfig().at_budget(value) for value in values]
+def rounds(scene: Scene, verify: str = "standard") -> list[tuple[int, float]]:
+    """Exploring steps and starts a grasp of each round, where the settings are 50 and 4."""
+    found = [config.settings for config in rounds_of(scene, PlanConfig(), verify)]
+    return [(config.explore_steps, config.starts_per_grasp) for config in found]
 
 
 def test_a_known_object_alone_begins_cheaply(scene):
-    assert rounds_of(scene, PlanConfig(), "standard") == efforts(0.5, 1.0, 2.0)
+    assert rounds(scene) == [(25, 4.0), (50, 4.0), (50, 8.0)]
 
 
 def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_steps(scene):
-    table = replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), -0.045))
-    assert rounds_of(scene, PlanConfig(), "none") == efforts(1.0, 2.0, 2.0)
-    assert rounds_of(table, PlanConfig(), "standard") == efforts(1.0, 2.0, 2.0)
+    all_steps = [(50, 4.0), (50, 8.0), (50, 8.0)]
+    neighbour = Obstacle(make_shape("box"), scene.sdf)
+    assert rounds(scene, "none") == all_steps
+    assert rounds(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), -0.045))) == all_steps
+    assert rounds(replace(scene, obstacles=(neighbour,))) == all_steps
+    assert rounds(replace(scene, confidence=torch.ones(scene.sdf.field.shape[1:]))) == all_steps
 
 
 def test_rounds_are_a_setting(scene):

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
 from rcl_interfaces.srv import SetParameters
@@ -25,7 +26,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState, PointCloud2, PointField
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from graspd_core.mesh.mesh_files import save_mesh
@@ -33,9 +34,7 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.paths import config_dir
 from graspd_ros.parameters import Settings
 
-DOMAIN = 1 + os.getpid() % 100
-START_TIMEOUT = 60.0  # imports, hand and warm-up; 10 s on a quiet machine
-MATCH_SETTLE = 0.3  # seconds after the match in which the first messages could still be lost
+PATIENCE = 100.0  # seconds until what is waited for is held to never come; pytest's own limit is 120
 
 READ_ONLY = {"hand", "device", "torch_threads", "queue_size"}
 DEFAULTS = {n: v for n, v in dataclasses.asdict(Settings()).items() if n not in READ_ONLY} | {"output_dir": "out"}
@@ -47,11 +46,12 @@ Event = dict[str, Any]
 class Client:
     """Publishes what the node takes, keeps what it answers."""
 
-    def __init__(self) -> None:
+    def __init__(self, domain: int) -> None:
+        self.domain = domain
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(config_dir() / "fastdds.xml")  # for large clouds
         self.context = Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
+        rclpy.init(context=self.context, domain_id=domain)
         self.node = rclpy.create_node("graspd_test_client", context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
@@ -72,20 +72,22 @@ class Client:
         self._cancel = self.node.create_publisher(String, "/graspd/cancel", 10)
         self._points = self.node.create_publisher(PointCloud2, "/points", 10)
         self._services: dict[str, Any] = {}
+        self._health: list[Any] = []
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._health.append, 10)
 
     def _on_status(self, message: String) -> None:
         self.events.append(json.loads(message.data))
 
-    def spin_until(self, condition: Callable[[], Any], timeout: float, what: str) -> Any:
-        """Spin until the condition gives something true, and return that; fail the test after `timeout` seconds."""
-        end = time.monotonic() + timeout
+    def spin_until(self, condition: Callable[[], Any], what: str) -> Any:
+        """Spin until the condition gives something true, and return that; fail the test where it never comes."""
+        end = time.monotonic() + PATIENCE
         while not (found := condition()):
             if time.monotonic() > end:
-                pytest.fail(f"no {what} within {timeout:.0f} s; events: {self.events[-5:]}")
+                pytest.fail(f"no {what} within {PATIENCE:.0f} s; events: {self.events[-5:]}")
             self._executor.spin_once(timeout_sec=0.02)
         return found
 
-    def event(self, timeout: float, **wanted: Any) -> Event:
+    def event(self, **wanted: Any) -> Event:
         """Wait for the first event, seen or yet to come, whose entries are those wanted; an error fails the test."""
 
         def find() -> Event | None:
@@ -94,13 +96,26 @@ class Client:
                 pytest.fail(f"while waiting for {wanted}: {error}")
             return next((e for e in self.events if all(e.get(k) == v for k, v in wanted.items())), None)
 
-        return self.spin_until(find, timeout, f"event {wanted}")
+        return self.spin_until(find, f"event {wanted}")
 
     def wait_for_match(self) -> None:
+        """Wait until the node hears this client, and this client the node's answer."""
         publishers = (self._mesh, self._cancel, self._points, self._request)
         matched = lambda: all(p.get_subscription_count() for p in publishers)  # noqa: E731
-        self.spin_until(matched, START_TIMEOUT, "match")
-        self.spin_for(MATCH_SETTLE)
+        self.spin_until(matched, "match")
+        self.send_cancel("nobody")
+        self.event(event="error", request="nobody")
+        self.call(Trigger, "reset")
+
+    def health(self, condition: Callable[[dict[str, str]], bool] = bool) -> dict[str, str]:
+        """Wait until the node says of itself what is wanted; it speaks once a second."""
+        self._health.clear()
+
+        def find() -> dict[str, str] | None:
+            told = ({pair.key: pair.value for pair in array.status[0].values} for array in self._health)
+            return next(filter(condition, told), None)
+
+        return self.spin_until(find, "health")
 
     def spin_for(self, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -121,18 +136,31 @@ class Client:
     def send_message(self, request: GraspRequest) -> None:
         self._request.publish(request)
 
-    def answer(self, request_id: str, timeout: float) -> GraspArray:
+    def show(self, send: Callable[[], Any], header: Header) -> None:
+        """Send what a camera sees until it is the node's newest: it comes once, and the node may miss it."""
+
+        def is_newest() -> bool:
+            send()
+            probe = f"probe-{len(self.answers)}"
+            self.send_request(id=probe, source=GraspRequest.LATEST_CLOUD)
+            self.send_cancel(probe)
+            return self.answer(probe).header == header
+
+        self.spin_until(is_newest, "sight of it")
+        self.events = [event for event in self.events if not event["request"].startswith("probe-")]
+
+    def answer(self, request_id: str) -> GraspArray:
         """Wait for the answer to a request."""
         find = lambda: next((a for a in self.answers if a.request_id == request_id), None)  # noqa: E731
-        return self.spin_until(find, timeout, f"answer to {request_id}")
+        return self.spin_until(find, f"answer to {request_id}")
 
-    def call(self, kind: Any, name: str, request: Any = None, timeout: float = 10.0) -> Any:
+    def call(self, kind: Any, name: str, request: Any = None) -> Any:
         """Call a service of the node and wait for its answer."""
         service = self._services.get(name) or self.node.create_client(kind, f"/graspd/{name}")
         self._services[name] = service
-        self.spin_until(service.service_is_ready, timeout, f"service {name}")
+        self.spin_until(service.service_is_ready, f"service {name}")
         future = service.call_async(request or kind.Request())
-        return self.spin_until(lambda: future.done() and future.result(), timeout, f"answer of {name}")
+        return self.spin_until(lambda: future.done() and future.result(), f"answer of {name}")
 
     def send_cancel(self, request_id: str) -> None:
         self._cancel.publish(String(data=request_id))
@@ -156,7 +184,7 @@ class Client:
             ends = {event["request"] for event in self.events if event["event"] in TERMINAL}
             return all(event["request"] in ends for event in self.events if event["event"] == "accepted")
 
-        self.spin_until(ended, 20.0, "end of everything")
+        self.spin_until(ended, "end of everything")
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -167,9 +195,9 @@ class Client:
 class NodeProcess:
     """`graspd_node` as a user starts it, with parameters; or a module that does as it does."""
 
-    def __init__(self, directory: Path, parameters: dict[str, Any], module: Path | None = None) -> None:
+    def __init__(self, domain: int, directory: Path, parameters: dict[str, Any], module: Path | None = None) -> None:
         arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": str(directory / "log")}
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(directory / "log")}
         self.directory = directory
         self.log = directory / "node.log"
         self._file = self.log.open("w")
@@ -184,18 +212,17 @@ class NodeProcess:
     def alive(self) -> bool:
         return self.process.poll() is None
 
-    def stop(self, number: signal.Signals = signal.SIGINT, timeout: float = 10.0) -> tuple[int, float, str]:
-        """Send a signal; exit status, seconds until the end, and the log."""
-        begun = time.monotonic()
+    def stop(self, number: signal.Signals = signal.SIGINT) -> tuple[int, str]:
+        """Send a signal; exit status and the log. One that does not end is killed, whose status is below zero."""
         if self.alive():
             self.process.send_signal(number)
         try:
-            status = self.process.wait(timeout)
+            status = self.process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             self.process.kill()
             status = self.process.wait()
         self._file.close()
-        return status, time.monotonic() - begun, self.log.read_text()
+        return status, self.log.read_text()
 
 
 def cloud_message(points: np.ndarray, frame: str = "camera") -> PointCloud2:
@@ -214,8 +241,8 @@ def make_cloud() -> Callable[..., PointCloud2]:
 
 
 @pytest.fixture(scope="session")
-def client() -> Iterator[Client]:
-    client = Client()
+def client(domain: int) -> Iterator[Client]:
+    client = Client(domain)
     yield client
     client.close()
 
@@ -223,9 +250,9 @@ def client() -> Iterator[Client]:
 def start_ready(client: Client, directory: Path, module: Path | None = None, **parameters: Any) -> NodeProcess:
     """A node that has said it is ready and that hears the client."""
     client.forget()
-    process = NodeProcess(directory, parameters, module)
+    process = NodeProcess(client.domain, directory, parameters, module)
     try:
-        client.event(START_TIMEOUT, event="ready")
+        client.event(event="ready")
         client.wait_for_match()
     except BaseException:
         process.stop()
@@ -287,7 +314,10 @@ def start_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Itera
     started: list[NodeProcess] = []
 
     def start(ready: bool = True, **parameters: Any) -> NodeProcess:
-        started.append(start_ready(client, tmp_path, **parameters) if ready else NodeProcess(tmp_path, parameters))
+        if ready:
+            started.append(start_ready(client, tmp_path, **parameters))
+        else:
+            started.append(NodeProcess(client.domain, tmp_path, parameters))
         return started[-1]
 
     yield start

@@ -14,10 +14,9 @@ from rclpy.action.server import RCLError
 
 from graspd_ros.action_server import Goal as OurGoal
 
-RESULT_TIMEOUT = 60.0
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
-FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 40.0}
-LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 60.0}
+FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
+LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -30,21 +29,21 @@ class Goal:
         self.feedback = []
         goal = SynthesizeGrasps.Goal(request=GraspRequest(**SPHERE, **fields))
         sent = actions.send_goal_async(goal, feedback_callback=lambda message: self.feedback.append(message.feedback))
-        self.handle = client.spin_until(lambda: sent.done() and sent.result(), 10.0, "answer to a goal")
+        self.handle = client.spin_until(lambda: sent.done() and sent.result(), "answer to a goal")
         assert self.handle.accepted
         self._result = self.handle.get_result_async()
 
     def work_begins(self) -> None:
         stages = lambda: [f.progress.stage for f in self.feedback]  # noqa: E731
-        self._client.spin_until(lambda: set(stages()) - {"queued"}, 10.0, "feedback")
+        self._client.spin_until(lambda: set(stages()) - {"queued"}, "feedback")
 
     def cancel(self) -> int:
         asked = self.handle.cancel_goal_async()
-        answer = self._client.spin_until(lambda: asked.done() and asked.result(), 10.0, "answer to a cancel")
+        answer = self._client.spin_until(lambda: asked.done() and asked.result(), "answer to a cancel")
         return len(answer.goals_canceling)
 
-    def end(self, timeout: float = 10.0) -> tuple[int, GraspArray]:
-        ended = self._client.spin_until(lambda: self._result.done() and self._result.result(), timeout, "result")
+    def end(self) -> tuple[int, GraspArray]:
+        ended = self._client.spin_until(lambda: self._result.done() and self._result.result(), "result")
         return ended.status, ended.result.result
 
 
@@ -69,18 +68,18 @@ def test_a_goal_that_is_cancelled_in_the_moment_that_it_begins_still_ends():
 @pytest.fixture
 def actions(client, node):
     actions = ActionClient(client.node, SynthesizeGrasps, "/graspd/synthesize")
-    client.spin_until(actions.server_is_ready, 10.0, "action server")
+    client.spin_until(actions.server_is_ready, "action server")
     yield actions
     actions.destroy()
 
 
 def test_a_goal_gets_feedback_and_the_same_answer_as_the_topic(client, node, actions):
     goal = Goal(client, actions, id="goal-a", **FEW)
-    status, result = goal.end(RESULT_TIMEOUT)
+    status, result = goal.end()
     assert status == GoalStatus.STATUS_SUCCEEDED
     assert (result.status, result.request_id, len(result.grasps) > 0) == (GraspArray.SUCCEEDED, "goal-a", True)
     assert {f.progress.stage for f in goal.feedback} >= {"load", "optimise"}
-    assert client.answer("goal-a", 5.0) == result
+    assert client.answer("goal-a") == result
 
 
 def test_a_goal_is_cancelled_while_it_runs_and_while_it_waits(client, node, actions):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import time
 
 import numpy as np
 import pytest
@@ -13,9 +12,6 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from graspd_core.bags.messages import points_from_message
 from graspd_core.errors import CloudError
-
-# Seconds for 640 x 480 points on a machine that does other things too; 8 ms on a quiet one, a 30 Hz camera leaves 33.
-VGA_TIME = 0.06
 
 
 def encode(points: np.ndarray, order: str, formats: list[str], offsets: list[int], step: int, row_padding: int):
@@ -121,14 +117,8 @@ def test_a_broken_cloud_is_refused_by_name(spoil, culprit):
     assert "\n" not in str(refused.value)
 
 
-def test_a_camera_image_converts_within_a_frame():
+def test_a_camera_image_is_converted_without_looking_at_each_point(bytecodes):
     points = np.random.default_rng(0).normal(size=(480, 640, 3))
     points[::3, ::2] = np.nan
     message = encode(points, "<", ["f4"] * 3, [0, 4, 8], 16, 0)
-    seconds = []
-    for _ in range(9):
-        begun = time.perf_counter()
-        points_from_message(message)
-        seconds.append(time.perf_counter() - begun)
-    # The quickest of nine: the others measure who else is on the machine.
-    assert min(seconds) < VGA_TIME
+    assert bytecodes(lambda: points_from_message(message)) < 480 * 640 / 10

@@ -35,7 +35,6 @@ from graspd_core.rendering.depth_noise import DEFAULT
 from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
 from graspd_core.transforms import SECOND
 
-RESULT_TIMEOUT = 60.0
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 ONE = {"num_grasps": 1, "preset": "fast"}
 REACH = 0.2  # metres from the hand's base to what it holds
@@ -55,7 +54,7 @@ node = rclpy.create_node("doomed")
 client = ActionClient(node, SynthesizeGrasps, "/graspd/synthesize")
 client.wait_for_server()
 request = GraspRequest(id="orphan", source=GraspRequest.MESH, mesh_uri="sphere.obj", num_grasps=64)
-request.preset, request.time_budget = "accurate", 5.0
+request.preset, request.time_budget = "accurate", 600.0
 tell = lambda told: print(told.feedback.progress.stage, flush=True)
 goal = client.send_goal_async(SynthesizeGrasps.Goal(request=request), feedback_callback=tell)
 rclpy.spin_until_future_complete(node, goal)
@@ -108,8 +107,7 @@ def publish(client) -> Iterator[Callable[[Any, str], None]]:
     def publish(message: Any, topic: str) -> None:
         if topic not in publishers:
             publishers[topic] = client.node.create_publisher(type(message), topic, 10)
-            client.spin_until(publishers[topic].get_subscription_count, 10.0, f"subscriber of {topic}")
-            client.spin_for(0.3)
+            client.spin_until(publishers[topic].get_subscription_count, f"subscriber of {topic}")
         publishers[topic].publish(message)
 
     yield publish
@@ -160,15 +158,15 @@ def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_read
 ):
     scene = tabletop("cylinder", yaw=0.3)
     T_world_camera = record_scene(tmp_path / "scene", scene)
-    play = partial(start_process, "-m", "graspd_ros.player", "--wait", "20")
+    play = partial(start_process, "-m", "graspd_ros.player", "--wait", "100")
     raw: list[bytes] = []
     recorder = client.node.create_subscription(GraspArray, "/graspd/grasps", raw.append, 10, raw=True)
     client.set_parameters(output_frame="world", **ONE)
     remaps = ("-r", "/camera/image_rect:=/depth/image_rect", "-r", "/camera/camera_info:=/depth/camera_info")
     player, told = play(tmp_path / "scene", "--now", "--ros-args", *remaps)
-    result = client.event(RESULT_TIMEOUT, event="result")
-    answer = client.answer(result["request"], 5.0)
-    assert player.wait(10.0) == 0, told.read_text()
+    result = client.event(event="result")
+    answer = client.answer(result["request"])
+    assert player.wait() == 0, told.read_text()
 
     assert (answer.status, answer.header.frame_id) == (GraspArray.SUCCEEDED, "world"), answer.message
     best = answer.grasps[0]
@@ -184,7 +182,7 @@ def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_read
     T_camera_base = rigid(Rotation.from_quat(seen.quaternion_wxyz, scalar_first=True), list(seen.position))
     np.testing.assert_allclose(T_world_base, T_world_camera @ T_camera_base, atol=1e-6)
 
-    client.spin_until(lambda: raw, 5.0, "the answer as bytes")
+    client.spin_until(lambda: raw, "the answer as bytes")
     client.node.destroy_subscription(recorder)
     record_answer(tmp_path / "answer", raw[0])
     with AnyReader([tmp_path / "answer"]) as reader:
@@ -194,7 +192,7 @@ def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_read
     replayed: list[GraspArray] = []
     subscription = client.node.create_subscription(GraspArray, "/recorded/grasps", replayed.append, 10)
     play(tmp_path / "answer")
-    client.spin_until(lambda: replayed, 20.0, "the answer once more")
+    client.spin_until(lambda: replayed, "the answer once more")
     client.node.destroy_subscription(subscription)
     assert replayed == [answer]
 
@@ -212,31 +210,31 @@ def test_a_cloud_that_tf_does_not_lead_from_is_refused_and_the_node_lives(client
     cloud.header.stamp = Time(sec=now.sec - 3, nanosec=now.nanosec)
     client.send_request(id="too-early", source=GraspRequest.CLOUD, cloud=cloud)
     for request_id, culprit in (("nowhere", "'nowhere'"), ("too-early", "rig in robot is known from")):
-        answer = client.answer(request_id, 10.0)
+        answer = client.answer(request_id)
         assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_TRANSFORM")
         assert culprit in answer.message
         assert answer.grasps == []
     client.set_parameters(output_frame="")
     client.send_request(id="next", **SPHERE)
-    assert client.answer("next", RESULT_TIMEOUT).status == GraspArray.SUCCEEDED
+    assert client.answer("next").status == GraspArray.SUCCEEDED
 
 
 def test_a_client_killed_amid_its_goal_leaves_the_node_serving(client, node, start_process):
     doomed, told = start_process("-c", DOOMED)
     heard = lambda: {"asked for the result", "optimise"} <= set(told.read_text().splitlines())  # noqa: E731
-    client.spin_until(heard, 20.0, "feedback in the other process")
+    client.spin_until(heard, "feedback in the other process")
     assert not client.answers
     doomed.send_signal(signal.SIGKILL)
-    assert doomed.wait(10.0) == -signal.SIGKILL
-    # Nobody waits for it any more; it ends at its deadline, and a goal that waits behind it is served.
+    assert doomed.wait() == -signal.SIGKILL
+    # Nobody waits for it any more; it can be cancelled still, and a goal that waits behind it is served.
     actions = ActionClient(client.node, SynthesizeGrasps, "/graspd/synthesize")
-    client.spin_until(actions.server_is_ready, 10.0, "action server")
+    client.spin_until(actions.server_is_ready, "action server")
     sent = actions.send_goal_async(SynthesizeGrasps.Goal(request=GraspRequest(id="heir", **SPHERE, **ONE)))
-    handle = client.spin_until(lambda: sent.done() and sent.result(), 10.0, "answer to a goal")
+    handle = client.spin_until(lambda: sent.done() and sent.result(), "answer to a goal")
     asked = handle.get_result_async()
-    orphan = client.answer("orphan", 20.0)
-    assert orphan.error_code == "DEADLINE"
-    ended = client.spin_until(lambda: asked.done() and asked.result(), RESULT_TIMEOUT, "result")
+    client.send_cancel("orphan")
+    assert client.answer("orphan").status == GraspArray.CANCELLED
+    ended = client.spin_until(lambda: asked.done() and asked.result(), "result")
     assert ended.result.result.status == GraspArray.SUCCEEDED
     assert node.alive()
     actions.destroy()
@@ -248,8 +246,11 @@ def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_no
     subscription = client.node.create_subscription(DiagnosticArray, "/diagnostics", health.append, 10)
 
     def set_time(stamp: int) -> None:
-        publish(Clock(clock=Time(sec=stamp // SECOND)), "/clock")
-        client.spin_until(lambda: health and health[-1].header.stamp.sec == stamp // SECOND, 10.0, "the node's time")
+        def told() -> bool:
+            publish(Clock(clock=Time(sec=stamp // SECOND)), "/clock")
+            return bool(health) and health[-1].header.stamp.sec == stamp // SECOND
+
+        client.spin_until(told, "the node's time")
 
     directions = np.random.default_rng(0).normal(size=(8000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -257,12 +258,12 @@ def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_no
     cloud.header.stamp = Time(sec=START // SECOND)
     set_time(START + SECOND)
     client.send_cloud(cloud)
-    result = client.event(RESULT_TIMEOUT, event="result")  # though the clock stands still meanwhile
-    answer = client.answer(result["request"], 5.0)
+    result = client.event(event="result")  # though the clock stands still meanwhile
+    answer = client.answer(result["request"])
     assert (answer.status, answer.header) == (GraspArray.SUCCEEDED, cloud.header), answer.message
     set_time(START + 10 * SECOND)
     client.send_request(id="late", source=GraspRequest.LATEST_CLOUD)
-    late = client.answer("late", 10.0)
+    late = client.answer("late")
     assert (late.status, late.error_code) == (GraspArray.REFUSED, "STALE_CLOUD")
     assert "is 10.0 s old" in late.message
     client.node.destroy_subscription(subscription)

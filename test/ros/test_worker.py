@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from graspd_ros.worker import BusyPolicy, Ending, Refusal, Report, Worker
 
-TIMEOUT = 10.0  # seconds; what is waited for takes milliseconds
+TIMEOUT = 100.0  # seconds; what is waited for takes milliseconds
 
 
 @dataclass(frozen=True)

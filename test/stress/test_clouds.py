@@ -1,7 +1,6 @@
 """The clouds that break things: each ends in a grasp, or in one line that says what is wrong (docs/clouds.md)."""
 
 import re
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,9 +23,6 @@ from graspd_core.types import Outcome, Verdict
 PAGE = Path(__file__).parents[2] / "docs" / "clouds.md"
 POSES = ring_poses(3, elevation=0.7, azimuth=0.5)
 
-# Seconds that a case may take, and that planning is given: on a quiet machine all take a tenth of that.
-DEADLINE = 90.0
-
 
 @pytest.fixture(scope="module")
 def hand():
@@ -39,15 +35,13 @@ def box_view() -> PointCloud:
 
 
 def grasp_of(views, hand, **options):
-    """The scene of the views and its best grasp; the case fails unless that was verified in time."""
-    began = time.perf_counter()
+    """The scene of the views and its best grasp; the case fails unless that was verified."""
     scene = scene_from_views(views, **options)
     assert is_closed(scene.object.mesh)
-    result = plan_grasps(scene, hand, count=1, preset="fast", deadline=DEADLINE)
+    result = plan_grasps(scene, hand, count=1, preset="fast")
     assert [g.verdict for g in result.grasps[:1]] == [Verdict.VERIFIED], result.outcome
     best = result.grasps[0].grasp
     assert np.isfinite([*best.position, *best.quaternion_wxyz, *best.joint_positions]).all()
-    assert time.perf_counter() - began < DEADLINE
     return scene, result.grasps[0]
 
 
@@ -163,7 +157,7 @@ def test_two_touching_objects_without_a_hint_are_at_worst_one_thing(hand):
     found = scene.object.mesh.vertices
     assert (found.min(0) > both.min(0) - 0.02).all()
     assert (found.max(0) < both.max(0) + 0.02).all()
-    result = plan_grasps(scene, hand, count=1, preset="fast", deadline=DEADLINE)
+    result = plan_grasps(scene, hand, count=1, preset="fast")
     verified = any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
     assert result.outcome in ((Outcome.SUCCEEDED,) if verified else (Outcome.TOO_FEW, Outcome.NO_CANDIDATES))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from graspd_core.trials.gravity_trial import LOST, gravity_trial
@@ -36,7 +35,17 @@ def test_an_open_hand_stops_the_object_in_the_directions_where_it_stands(world, 
     assert moved == pytest.approx((3 * LOST + 2 * 0.005 + 0.01) / 6, abs=0.002)
 
 
-def test_the_same_trial_gives_the_same_figure_and_can_be_stopped(world, closing):
+def test_the_same_trial_gives_the_same_figure_whatever_was_tried_between(world, closing):
     grasp = closing(0.015, 0.025, (0.026, 0.026))
-    assert gravity_trial(world, grasp, STANDARD) == gravity_trial(world, grasp, STANDARD)
-    assert np.isfinite(gravity_trial(world, grasp, STANDARD, stop=lambda: True))
+    first = gravity_trial(world, grasp, STANDARD)
+    assert 0 < first < LOST
+    assert gravity_trial(world, closing(0.015, 0.025, (0.03, 0.03), height=-0.3), STANDARD) > first
+    assert gravity_trial(world, grasp, STANDARD) == first
+
+
+def test_a_direction_that_is_cut_short_counts_with_what_it_came_to(world, closing):
+    far = closing(0.015, 0.025, (0.03, 0.03), height=-0.3)
+    assert gravity_trial(world, far, STANDARD, stop=lambda: True) == 0.0
+    # After 0.2 s, two looks, the object has fallen 20 cm and is lost; the other directions are not begun.
+    looks = iter([False, False])
+    assert gravity_trial(world, far, STANDARD, stop=lambda: next(looks, True)) == pytest.approx(LOST / 6)

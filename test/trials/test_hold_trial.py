@@ -50,10 +50,12 @@ def test_a_hand_ten_centimetres_away_holds_nothing(world, closing):
     assert hold.reason.endswith("under a pull along +x")
 
 
-def test_a_push_from_one_side_fails_while_squeezing(world, closing):
+def test_a_push_from_one_side_holds_nothing(world, closing):
     hold = hold_trial(world, closing(0.015, 0.025, (0.04, 0.0)), STANDARD)
     assert not hold.passed
-    assert "moved" in hold.reason or "turned" in hold.reason
+    # The finger pushes it 15 mm, which is allowed, to where nothing presses from the other side.
+    assert hold.reason.startswith("the object moved")
+    assert hold.reason.endswith("under a pull along +x")
     judged = with_trials(closing(*GOOD), hold)
     assert (judged.verdict, judged.reason) == (Verdict.FAILED, hold.reason)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -120,18 +119,18 @@ def test_axes_are_normalised_and_inertials_optional(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ("<robot ", '<!DOCTYPE a [<!ENTITY x "xx">]><robot ', r"tiny.urdf:1: a <!DOCTYPE> is refused"),
-        ("</robot>", "", "not well-formed XML"),
-        ("<robot", "<sdf", "not well-formed XML"),
+        ("</robot>", "", "not well-formed XML: no element found"),
+        ("<robot", "<sdf", "not well-formed XML: mismatched tag"),
         ("</robot>", "<xacro:macro/></robot>", r"is a xacro file \(<xacro:macro>\)"),
         ('lower="-0.5"', 'lower="${low}"', r"joint 'hinge': xacro left over in <limit>: \$\{low\}"),
         ('lower="-0.5"', 'lower="nan"', r"joint 'hinge': <limit lower='nan'>: expected 1 finite number"),
         ('upper="1"', 'upper="-1"', r"joint 'hinge' has lower -0.5 above upper -1"),
-        ("<limit", "<limits", "not well-formed XML|joint 'hinge' has no <limit>"),
+        ("<limit", "<limits", "joint 'hinge' has no <limit>"),
         ('"0 1 0"', '"0 0 0"', "joint 'hinge' has a zero axis"),
         ('type="revolute"', 'type="planar"', "joint 'hinge' is of type 'planar'; known: revolute, continuous"),
         ('type="revolute"', 'type="prismatic"', None),
         ('<child link="finger"/>', "", "joint 'hinge' has no <child link"),
-        ('name="finger"', 'name="palm"', "link 'palm' is defined twice|child link 'finger', which the file does not"),
+        ('name="finger"', 'name="palm"', "link 'palm' is defined twice"),
         ('name="finger"', 'name=""', "a <link> has no name"),
         ('name="finger"', 'name="fin&#10;ger"', r"tiny.urdf:1: link 'fin\\nger' has a name with a line end"),
         ('xyz="0 0 0.03"', 'xyz="0 0 30"', r"joint 'hinge': <origin xyz='0 0 30'>: more than 10 m away"),
@@ -165,17 +164,16 @@ def test_errors_name_the_line_of_the_file(tmp_path: Path, before: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "<!--" * 100_000,
-        "<?xml " * 100_000,
-        "<?xml encoding='punycode'?>" + "a" * 100_000 + "-" + "a" * 400_000,
+        "<!--" * 200_000,
+        "<?xml " * 200_000,
+        "<?xml encoding='punycode'?>" + "a" * 500_000 + "-" + "a" * 2_000_000,
     ],
     ids=["comments", "headers", "encoding"],
 )
 def test_a_file_made_to_take_long_is_refused_soon(tmp_path: Path, text: str) -> None:
-    began = time.process_time()
+    """Read in quadratic time, each would take minutes, and the test's time would be over."""
     with pytest.raises(HandError, match="not well-formed"):
         _read(tmp_path, text)
-    assert time.process_time() - began < 5.0
 
 
 @pytest.mark.parametrize(

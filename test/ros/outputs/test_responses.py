@@ -19,7 +19,7 @@ from visualization_msgs.msg import MarkerArray
 from graspd_core.errors import MeshError
 from graspd_core.hands.library import load_hand
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Timing, Verdict
+from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Progress, Stage, Timing, Verdict
 from graspd_ros.inputs.requests import Request
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings
@@ -100,6 +100,17 @@ def test_a_result_is_answered_once_whatever_its_listener_does(node, listener):
     assert {type(message) for message in messages} >= {PoseStamped, MarkerArray}
     assert isinstance(messages[-1], GraspArray)
     assert events == ["result"]
+
+
+def test_progress_is_told_at_the_rate_that_is_set(node):
+    answers: Any = Responses(node, HAND)
+    outlets = answers.outlets = Publishers()
+    settings = Settings(progress_rate=1e-4)  # once in three hours
+    tell = answers.progress_hook(Request("r", "mesh", "object", Time(), settings, load_scene))
+    for step in range(100):
+        tell(Progress(Stage.OPTIMISE, step, 100, 0.0, 0, 0.0))
+    assert [message.step for message in outlets.published] == [0]
+    assert outlets.events == ["progress"]
 
 
 def test_a_request_that_was_never_worked_on_leaves_the_markers_as_they_are(node):
