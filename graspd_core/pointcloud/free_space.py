@@ -16,12 +16,12 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.se3 import perpendicular
 
 # Depth images of more cells than this across the object tell no more.
-MOST_CELLS = 160
+MAX_IMAGE_CELLS = 160
 # Points, itself among them, that a point's spacing is taken from.
-SPACED = 5
+SPACING_NEIGHBOURS = 5
 
 # Outlines and surfaces are seen to within the first [m]; a point the second deeper in empty space is impossible.
-SLACK, CONTRADICTION = 0.003, 0.01
+SLACK, CONTRADICTION_DEPTH_M = 0.003, 0.01
 # A guessed point this near to a seen surface [m] confirms the guess.
 TOLERANCE = 0.004
 
@@ -80,11 +80,11 @@ def _make_view_depth(view: PointCloud) -> ViewDepth | None:
     frame = view_frame(view)
     local = (view.points - view.viewpoint) @ frame
     local = local[local[:, 2] > 1e-3]
-    if len(local) < SPACED:
+    if len(local) < SPACING_NEIGHBOURS:
         return None
     plane = local[:, :2] / local[:, 2:]
-    spacing = float(np.median(KDTree(plane).query(plane, k=SPACED)[0][:, -1]))
-    cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MOST_CELLS)
+    spacing = float(np.median(KDTree(plane).query(plane, k=SPACING_NEIGHBOURS)[0][:, -1]))
+    cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MAX_IMAGE_CELLS)
     if cell < 1e-9:
         return None
     margin = 6
@@ -112,7 +112,7 @@ def weigh(
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
     confirmed, deep = _judge(free_space, points, normals)
-    return confirmed, np.clip((deep - SLACK) / CONTRADICTION, 0.0, 1.0)
+    return confirmed, np.clip((deep - SLACK) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
 
 def on_seen(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError
-from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud
 from graspd_core.se3 import perpendicular
 
 # Points that a local plane is fitted to.
 NEIGHBOURS = 28
 # Points farther than this from their neighbours' plane [m], or seen flatter than this cosine, flew off an edge.
-STRAY, GRAZING = 0.006, 0.1
+STRAY, MIN_VIEW_COSINE = 0.006, 0.1
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ def merge_views(views: Sequence[PointCloud], step: float | None = None) -> Surfe
     """
     step = point_step(views) if step is None else step
     together = join(*(orient_view(view, step) for view in views))
-    if len(together.points) < FEWEST_POINTS:
+    if len(together.points) < MIN_POINTS:
         raise CloudError(
             f"cloud: only {len(together.points)} of its {sum(len(view.points) for view in views)} points lie on a "
-            f"surface; at least {FEWEST_POINTS} are needed: it is too sparse, or shows no surface"
+            f"surface; at least {MIN_POINTS} are needed: it is too sparse, or shows no surface"
         )
     return thin(together, step) if len(views) > 1 else together
 
@@ -101,7 +101,7 @@ def orient_view(view: PointCloud, step: float) -> Surfels:
     slope = -np.einsum("nd,nd->n", normals, view_depth)
     shift = np.einsum("nd,nd->n", points - centre, normals) / np.maximum(slope, 1e-3)
     crowded = distance[:, -1] < 2.5 * np.median(distance[:, -1])
-    kept = (slope > GRAZING) & (np.abs(shift) < STRAY) & crowded
+    kept = (slope > MIN_VIEW_COSINE) & (np.abs(shift) < STRAY) & crowded
     smooth = points + shift[:, None] * view_depth
     return Surfels(smooth[kept], normals[kept])
 

@@ -18,7 +18,7 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
-from graspd_core.reconstruction.extrusion import LOW, stand
+from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
 from graspd_core.reconstruction.merge_views import NEIGHBOURS, Surfels, join, merge_views, point_step
 from graspd_core.reconstruction.poisson import close_surface, fit_poisson, part_walls
 from graspd_core.reconstruction.shape_completion import OPEN, complete_shape
@@ -31,7 +31,7 @@ SEEN_CONFIDENCE, GUESSED = 0.004, 0.02
 # Faces of the result at most.
 MOST_FACES = 16_000
 # Share of the seen points that must lie within this [m] of the result.
-FITTED, FIT = 0.85, 0.004
+MIN_FITTED_SHARE, FIT = 0.85, 0.004
 # Points of all views together that are looked at.
 MOST_POINTS = 160_000
 
@@ -75,7 +75,7 @@ def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) ->
         known = seen
     else:
         seen = merge_views(local, step)
-        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
+        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, MAX_FOOT_HEIGHT_M)) if standing else 0.0
         free_space = FreeSpace(make_view_depths(local), standing, lowest)
         guess = complete_shape(seen, free_space, step)
         known = join(seen, guess.surfels)
@@ -149,7 +149,7 @@ def _finished(mesh: TriangleMesh, seen: Surfels) -> TriangleMesh:
     except MeshError as error:
         raise CloudError(f"cloud: no usable surface fits its {len(seen.points)} points ({error})") from None
     fitted = float((surface_distance(make_surface(mesh), seen.points) < FIT).mean())
-    if not is_closed(mesh) or fitted < FITTED:
+    if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
         raise CloudError(
             f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed"
         )

@@ -18,11 +18,11 @@ from graspd_core.reconstruction.revolution import find_revolution
 from graspd_core.reconstruction.symmetry import find_centre, find_mirrors, image
 
 # A body of revolution accounts for this share of what was seen (the rest is a handle), less so much of its faults.
-WHOLE, FAULTS = 0.8, 5.0
+WHOLE, FAULT_WEIGHT = 0.8, 5.0
 # Symmetries that are worth less than this, or contradicted by more, are chance.
-WORTH, DOUBTED = 0.5, 0.02
+WORTH, MAX_SYMMETRY_FAULTS = 0.5, 0.02
 # Two rules' guesses keep this far from each other [m].
-APART = 0.008
+RULE_DISTANCE_M = 0.008
 # A surface that is open by no more than this share needs no further guess.
 OPEN = 0.12
 
@@ -49,7 +49,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float) -> Complet
     known = join(seen, stand(seen, free_space, step)) if free_space.standing else seen
     missing = openness(known, step)
     turned = find_revolution(seen, free_space, step)
-    if turned is not None and turned.share - FAULTS * turned.wrong > WHOLE:
+    if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > WHOLE:
         guess = plausible(turned.surfels, seen, free_space, step)
         # What a handle hides of itself, and the like, is left to Poisson.
         return Completion("revolution" if _counts(guess, seen) else "", guess, missing)
@@ -65,7 +65,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float) -> Complet
         images = plausible(raw, known, free_space, step)
         if len(guess.points):
             # Where both speak, walls beneath seen outlines are the surer.
-            apart = KDTree(guess.points).query(images.points)[0] > APART
+            apart = KDTree(guess.points).query(images.points)[0] > RULE_DISTANCE_M
             images = take(images, apart)
         methods += [name] if _counts(images, seen) else []
         guess = join(guess, images)
@@ -94,9 +94,9 @@ def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float
 def _symmetric(seen: Surfels, free_space: FreeSpace) -> tuple[str, Surfels]:
     mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
     value = {"mirror": 0.0, "point symmetry": 0.0}
-    if mirrors and mirrors[0].wrong < DOUBTED:
+    if mirrors and mirrors[0].wrong < MAX_SYMMETRY_FAULTS:
         value["mirror"] = mirrors[0].worth
-    if centre.wrong < DOUBTED:
+    if centre.wrong < MAX_SYMMETRY_FAULTS:
         value["point symmetry"] = centre.worth
     best = max(value, key=lambda name: value[name])
     if value[best] < WORTH:

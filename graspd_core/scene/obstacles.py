@@ -24,11 +24,11 @@ from graspd_core.types import Plane, TriangleMesh
 
 # Skin around what was seen [m]; it also gives a single flat face a thickness.
 PADDING = 0.005
-RESOLUTION = 32
+GRID_RESOLUTION = 32
 # Fewer points than this are a stray speck, not a thing.
 FEWEST_POINTS = 10
 # Side of the parts that a thing is taken in whose hull would hold the object [m], and how many across it at most.
-PART, MOST_PARTS = 0.05, 8
+PART, MAX_PARTS_ACROSS = 0.05, 8
 _TARGET_SAMPLES = 2000
 
 
@@ -61,7 +61,7 @@ def make_obstacles(
 
 def _obstacle(points: Float[np.ndarray, "n 3"], support: Plane | None) -> Obstacle:
     mesh = padded_hull(points, support)
-    return Obstacle(mesh, build_sdf(mesh, resolution=RESOLUTION, padding=0.02))
+    return Obstacle(mesh, build_sdf(mesh, resolution=GRID_RESOLUTION, padding=0.02))
 
 
 def _swallows(neighbour: Obstacle, target: TriangleMesh) -> bool:
@@ -77,7 +77,7 @@ def _cells(points: Float[np.ndarray, "n 3"], support: Plane | None) -> list[Floa
     else:
         right = perpendicular(support.normal)
         local = points @ np.column_stack([right, np.cross(support.normal, right)])
-    side = max(PART, float(np.ptp(local, axis=0).max()) / MOST_PARTS)
+    side = max(PART, float(np.ptp(local, axis=0).max()) / MAX_PARTS_ACROSS)
     _, which = np.unique(np.floor((local - local.min(0)) / side).astype(int), axis=0, return_inverse=True)
     return [points[which.reshape(-1) == part] for part in range(which.max() + 1)]
 

@@ -9,17 +9,17 @@ from jaxtyping import Float, Int
 # along their lines of sight between two surfaces, have fewer. The second share is of the weight around a usual point:
 # it tells them where many views have filled the space around an edge with them.
 FEWEST_NEIGHBOURS = 0.3
-LEAST_WEIGHT = 0.04
+MIN_WEIGHT_SHARE = 0.04
 # Points are linked over this share of the gap between things; noise takes the rest.
-LINKED = 0.75
+LINK_SHARE_OF_GAP = 0.75
 # Points are dense if their fourth neighbours are so many times nearer than that.
-DENSE = 1.6
+DENSE_SPACING_RATIO = 1.6
 # Sparse ones are linked over this many times the distance to the fourth neighbour: surfaces seen at a small angle have
 # their points far apart along the line of sight.
-SPARSE = 2.5
+SPARSE_LINK_RATIO = 2.5
 # But never over more than this [m]: a few points scattered over a room are no thing.
 LONGEST = 0.05
-SAMPLE = 2000
+SPACING_SAMPLES = 2000
 
 
 def link_length(points: Float[np.ndarray, "n 3"], gap: float) -> float:
@@ -28,9 +28,13 @@ def link_length(points: Float[np.ndarray, "n 3"], gap: float) -> float:
 
     if len(points) < 5:
         return gap
-    some = points[:: max(1, len(points) // SAMPLE)]
+    some = points[:: max(1, len(points) // SPACING_SAMPLES)]
     spacing = float(np.median(KDTree(points).query(some, k=5)[0][:, -1]))
-    return LINKED * gap if DENSE * spacing <= LINKED * gap else min(SPARSE * spacing, LONGEST)
+    return (
+        LINK_SHARE_OF_GAP * gap
+        if DENSE_SPACING_RATIO * spacing <= LINK_SHARE_OF_GAP * gap
+        else min(SPARSE_LINK_RATIO * spacing, LONGEST)
+    )
 
 
 def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float) -> Int[np.ndarray, "n"]:
@@ -58,7 +62,7 @@ def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"]
     around = weight + sum(np.bincount(pairs[:, k], weight[pairs[:, 1 - k]], minlength=len(points)) for k in (0, 1))
     usual = degree > 0
     core = degree >= max(2.0, FEWEST_NEIGHBOURS * float(np.median(degree[usual])))
-    seen = around >= LEAST_WEIGHT * float(np.median(around[usual]))
+    seen = around >= MIN_WEIGHT_SHARE * float(np.median(around[usual]))
     core &= seen
     if not core.any():
         return label

@@ -15,17 +15,17 @@ from graspd_core.segmentation.clusters import extent, renumber
 from graspd_core.segmentation.planes import FlatPart
 
 # Beyond so many pieces the rest is noise.
-MOST_PIECES = 40
+MAX_PIECES = 40
 # What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
-FLOATING, COVERED = 0.5, 0.5
+FLOATING_LINKS, HIDDEN_FOOT_SHARE = 0.5, 0.5
 # A hanging piece, a cup's far wall or its handle, belongs to what is this near [m].
 HANGING = 0.03
 # Without a support nothing tells one thing behind another from one thing's two sides: this near, they are one [m].
 UNSUPPORTED = 0.15
 # Outlines this many link lengths apart touch in an image: pixels at edges are lost.
-IMAGE_GAP = 1.5
+IMAGE_GAP_LINKS = 1.5
 # Share of a piece that lies within another's outline.
-WITHIN = 0.6
+OUTLINE_SHARE = 0.6
 
 
 def merge_occluded(
@@ -49,7 +49,7 @@ def merge_occluded(
         largest: pieces that would be longer than this together are not one thing [m].
         support: what the things stand on; pieces that end well above it hang on others.
     """
-    many = min(int(label.max(initial=-1)) + 1, MOST_PIECES)
+    many = min(int(label.max(initial=-1)) + 1, MAX_PIECES)
     pieces = [points[label == k] for k in range(many)]
     small = [k for k in range(many) if extent(pieces[k]) <= largest]
     hangs = [
@@ -62,8 +62,8 @@ def merge_occluded(
             continue
         reach = UNSUPPORTED if support is None else HANGING if hangs[a] or hangs[b] else link
         one = _apart(pieces[a], pieces[b]) <= reach
-        one = one or (support is not None and _share_within(pieces[b], pieces[a], support) >= WITHIN)
-        if one and any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP * link) for eye in viewpoints):
+        one = one or (support is not None and _share_within(pieces[b], pieces[a], support) >= OUTLINE_SHARE)
+        if one and any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP_LINKS * link) for eye in viewpoints):
             root, leaf = sorted((owner[a], owner[b]))
             owner = [root if k == leaf else k for k in owner]
     joined = label.copy()
@@ -81,13 +81,13 @@ def _hangs(
 ) -> bool:
     """Whether a piece ends above the support and does not itself hide, from all cameras, what it might stand on."""
     height = support.height(piece)
-    if (height - support.tolerance(distance)).min() <= FLOATING * link:
+    if (height - support.tolerance(distance)).min() <= FLOATING_LINKS * link:
         return False
     below = piece - height[:, None] * support.plane.normal
     for eye in viewpoints:
         (seen, near), (foot, far) = _directions(piece, eye), _directions(below, eye)
         apart, which = _tree(seen).query(foot)
-        if np.mean((apart * near[which] <= link) & (near[which] < far)) >= COVERED:
+        if np.mean((apart * near[which] <= link) & (near[which] < far)) >= HIDDEN_FOOT_SHARE:
             return False
     return True
 

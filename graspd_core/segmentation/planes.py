@@ -18,17 +18,17 @@ RANSAC_TRIALS = 400
 COARSE = 0.01
 # Residuals of a plane gather in the middle of that gate: their median is this share of it at most, and the tolerance
 # they ask for is not much wider. Those of a curved surface fill the gate, and the next, wider one again.
-GATHERED, WIDENED = 0.4, 1.5
+MAX_MEDIAN_RESIDUAL_SHARE, MAX_GATE_GROWTH = 0.4, 1.5
 # A point is on the plane within so many standard deviations, and never farther than WIDEST [m].
-DEVIATIONS = 4.0
+INLIER_DEVIATIONS = 4.0
 # It is fitted to those within so many.
-FITTED = 3.0
+FIT_DEVIATIONS = 3.0
 WIDEST = 0.02
 # Side of the cells by which a plane's visible part is measured; occlusion and holes of a few cells are bridged [m].
-CELL = 0.01
+RASTER_CELL_M = 0.01
 # Cells of that raster along a side at most; of larger parts the cells are wider.
-MOST_CELLS = 2000
-BRIDGED = 3
+MAX_RASTER_CELLS = 2000
+BRIDGED_CELLS = 3
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class FlatPart:
 
     def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """How high a point may be and still belong to the plane, by its distance from the camera [m]."""
-        return np.clip(DEVIATIONS * self.noise * distance**2, self.least, WIDEST)
+        return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, WIDEST)
 
     def beneath(self, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
         """Whether points lie over the seen part, or at most `margin` beside it [m]."""
@@ -144,15 +144,15 @@ def _refine(
         offset = float(normal @ centre)
         residual = np.abs(near[inlier] @ normal - offset)
         noise = 1.4826 * float(np.median(residual / far[inlier].clip(1e-4)))
-        runs_away = DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > WIDENED
-        if runs_away or (step == 0 and np.median(residual / width[inlier]) > GATHERED):
+        runs_away = INLIER_DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > MAX_GATE_GROWTH
+        if runs_away or (step == 0 and np.median(residual / width[inlier]) > MAX_MEDIAN_RESIDUAL_SHARE):
             return None
         # Tighter than the tolerance: the feet of what stands on it would tilt it.
-        width = np.clip(FITTED * noise * far, 0.25 * least, WIDEST)
+        width = np.clip(FIT_DEVIATIONS * noise * far, 0.25 * least, WIDEST)
     if normal @ viewpoint < offset:
         normal, offset = -normal, -offset
     inliers = np.zeros(len(points), dtype=bool)
-    inliers[left] = np.abs(near @ normal - offset) < np.clip(DEVIATIONS * noise * far, least, WIDEST)
+    inliers[left] = np.abs(near @ normal - offset) < np.clip(INLIER_DEVIATIONS * noise * far, least, WIDEST)
     return _measure(points, inliers, Plane(normal, offset), noise, least)
 
 
@@ -167,11 +167,11 @@ def _measure(
     rows = np.flatnonzero(inliers)
     flat = points[rows] @ axes
     low = flat.min(0)
-    width = max(CELL, float(np.ptp(flat, axis=0).max()) / MOST_CELLS)
-    cell = np.round((flat - low) / width).astype(int) + BRIDGED
-    raster = np.zeros(cell.max(0) + 2 * BRIDGED, dtype=bool)
+    width = max(RASTER_CELL_M, float(np.ptp(flat, axis=0).max()) / MAX_RASTER_CELLS)
+    cell = np.round((flat - low) / width).astype(int) + BRIDGED_CELLS
+    raster = np.zeros(cell.max(0) + 2 * BRIDGED_CELLS, dtype=bool)
     raster[tuple(cell.T)] = True
-    names, _ = label(binary_dilation(raster, iterations=BRIDGED))  # pyright: ignore[reportGeneralTypeIssues]
+    names, _ = label(binary_dilation(raster, iterations=BRIDGED_CELLS))  # pyright: ignore[reportGeneralTypeIssues]
     name = names[tuple(cell.T)]
     largest = name == np.bincount(name)[1:].argmax() + 1
     flat = flat[largest]

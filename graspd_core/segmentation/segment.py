@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.image_border import reaches_image_border
-from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud
 from graspd_core.pointcloud.voxel_downsample import VoxelScene, voxel_downsample
 from graspd_core.segmentation.clusters import extent, link_length, link_points, renumber
 from graspd_core.segmentation.occlusion_merge import merge_occluded
@@ -21,7 +21,7 @@ from graspd_core.segmentation.target_selection import Target, check_target, seen
 from graspd_core.types import Plane
 
 # Scenes nearer than this to their cameras are in another unit than metres [m].
-CLOSEST = 0.02
+MIN_SCENE_DISTANCE_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def segment(
     chosen = select_target(scene, label, free, target, views, reach=settings.target_reach)
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found)
-    if total < FEWEST_POINTS:
-        raise CloudError(f"cloud: only {total} points show the object; at least {FEWEST_POINTS} are needed")
+    if total < MIN_POINTS:
+        raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     support = None if ground.support is None else ground.support.plane
     obstacles = _obstacles(scene, label, chosen, ground, settings)
     return Segmentation(found, support, obstacles, _doubts(scene, eyes, chosen, ground, bool(obstacles), settings))
@@ -211,7 +211,7 @@ def _nothing(scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground
         near = float(np.median(scene.mean_distance))
         told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
         unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
-        return told + unit if near < CLOSEST else told
+        return told + unit if near < MIN_SCENE_DISTANCE_M else told
     part = flat[0]
     away = float(np.median(scene.mean_distance[part.inliers]))
     return (

@@ -15,7 +15,7 @@ from graspd_core.pointcloud.voxel_downsample import VoxelScene
 # A thing of which a box or mask covers this share is meant as a whole; of less, the part that is covered.
 WHOLE = 0.8
 # Errors list so many things.
-LISTED = 4
+MAX_LISTED_THINGS = 4
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def seen(scene: VoxelScene, label: Int[np.ndarray, "voxels"]) -> str:
     many = int(label.max(initial=-1)) + 1
     if many == 0:
         return "nothing stands anywhere in the scene"
-    places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, LISTED))]
+    places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, MAX_LISTED_THINGS))]
     told = f"{many} things are seen, the largest" if many > 1 else "one thing is seen,"
     return f"{told} about {', '.join(places)} m"
 
