@@ -11,9 +11,11 @@ from graspd_core.config.baselines import AnnealingConfig, RandomClosureConfig
 from graspd_core.config.closed_form import ClosedFormConfig, LossWeights
 from graspd_core.config.grasp_stages import GraspStagesConfig
 from graspd_core.config.graspd2022 import Graspd2022Config
-from graspd_core.config.mapping import from_mapping
+from graspd_core.config.mapping import from_mapping, read_config
+from graspd_core.config.reconstruction import ReconstructionConfig
 from graspd_core.config.robust import RobustConfig
 from graspd_core.config.rounds import RoundsConfig
+from graspd_core.config.scene import ObstacleConfig, SceneConfig, load_scene_config
 from graspd_core.config.segmentation import SegmentationConfig
 from graspd_core.errors import ConfigError
 from graspd_core.paths import config_dir
@@ -26,13 +28,17 @@ __all__ = [
     "GraspStagesConfig",
     "Graspd2022Config",
     "LossWeights",
+    "ObstacleConfig",
     "PlanConfig",
     "RandomClosureConfig",
+    "ReconstructionConfig",
     "RobustConfig",
     "RoundsConfig",
+    "SceneConfig",
     "SegmentationConfig",
     "from_mapping",
     "load_preset",
+    "load_scene_config",
     "preset_names",
 ]
 
@@ -80,15 +86,7 @@ def load_preset(name: str) -> PlanConfig:
     Raises:
         ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
     """
-    from graspd_core.config.yaml_text import YamlError, parse_yaml
-
     path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
         raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
-    try:
-        _, values = parse_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from None
-    except (YamlError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {error}") from None
-    return from_mapping(PlanConfig, {} if values is None else values, where=path.name)
+    return read_config(PlanConfig, path)

@@ -7,6 +7,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from graspd_core.errors import ConfigError, shown
@@ -30,6 +31,23 @@ def from_mapping(cls: type[T], values: Any, where: str = "config") -> T:
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]}; valid keys: {', '.join(sorted(hints))}")
     return cls(**{key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()})
+
+
+def read_config(cls: type[T], path: Path) -> T:
+    """Build a config dataclass from a YAML file; of an empty one, the defaults.
+
+    Raises:
+        ConfigError: no such file, malformed YAML, or a bad key or value.
+    """
+    from graspd_core.config.yaml_text import YamlError, parse_yaml
+
+    try:
+        _, values = parse_yaml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except (YamlError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
+    return from_mapping(cls, {} if values is None else values, where=path.name)
 
 
 def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:

@@ -8,8 +8,6 @@ from jaxtyping import Bool, Float
 from graspd_core.pointcloud.free_space import view_frame
 from graspd_core.pointcloud.point_cloud import PointCloud
 
-# Directions this near to the hull of all directions are on the border [rad]: two or three pixels.
-REACH = 0.004
 # So many points on one side of the hull, of the object and of other things each: an object that stands out alone
 # against nothing makes a hull of its own.
 MIN_BORDER_POINTS = 8
@@ -21,9 +19,12 @@ SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
 
 
 def reaches_image_border(
-    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"]
+    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Whether the points of an object lie on a side of the view's outline on which other points lie too."""
+    """Whether the points of an object lie on a side of the view's outline on which other points lie too.
+
+    Directions within `width` [rad] of the hull of all directions are on the outline.
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     if not mine.any():
@@ -38,7 +39,7 @@ def reaches_image_border(
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * np.ptp(plane, axis=0).max()
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
-        near = plane @ np.array(normal) + offset > -REACH
+        near = plane @ np.array(normal) + offset > -width
         if (
             min((near & mine).sum(), (near & ~mine).sum()) >= MIN_BORDER_POINTS
             and _filled(plane[near], start, end) >= MIN_FILLED_SHARE

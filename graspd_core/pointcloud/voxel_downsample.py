@@ -17,8 +17,6 @@ from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud, measured
 
 # Of more points than this, every second, or third, ... is taken.
 MAX_SCENE_POINTS = 5_000_000
-# More voxels than this are thinned again by larger ones: the time of all that follows is bounded.
-MOST_VOXELS = 150_000
 # Units that clouds come in by mistake, how many of them a metre has, and the least distance that is told from them [m].
 UNITS_PER_METRE, MIN_CAMERA_DISTANCE_M = (("millimetres", 1000), ("centimetres", 100)), 0.1
 
@@ -82,7 +80,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
             roi = "" if settings.roi_low is None and settings.roi_high is None else " and in the region of interest"
             few = f"only {len(points)} of {finite} points are within {settings.max_range:g} m of the camera{roi}"
         raise CloudError(f"cloud: {few}; at least {MIN_POINTS} are needed{_unit_hint(views, settings.max_range)}")
-    voxel, size = _voxels(points, settings.voxel)
+    voxel, size = _voxels(points, settings.voxel, settings.max_voxels)
     count = np.bincount(voxel)
     mean = np.column_stack([np.bincount(voxel, points[:, axis]) / count for axis in range(3)])
     if float(np.ptp(mean, axis=0).max()) <= 0:
@@ -135,14 +133,14 @@ def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
     return ""
 
 
-def _voxels(points: Float[np.ndarray, "n 3"], size: float) -> tuple[Int[np.ndarray, "n"], float]:
+def _voxels(points: Float[np.ndarray, "n 3"], size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
     """Which voxel each point lies in, counted without gaps, and the side it came to."""
     low = points.min(0)
     # The cells' numbers have 21 bits an axis.
     size = max(size, float(np.ptp(points, axis=0).max()) / 2**20)
     cell, voxel = _distinct(((points[:, axis] - low[axis]) / size).astype(np.int64) for axis in range(3))
-    while len(cell) > MOST_VOXELS:
-        growth = max(1.2, (len(cell) / MOST_VOXELS) ** 0.5)
+    while len(cell) > most:
+        growth = max(1.2, (len(cell) / most) ** 0.5)
         size *= growth
         cell, coarser = _distinct(((cell[:, axis] + 0.5) / growth).astype(np.int64) for axis in range(3))
         voxel = coarser[voxel]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth, facing
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, facing
 from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
 
 # A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
@@ -48,11 +48,11 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
         facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
     )
-    proven = (empty_depth(free_space, place + OUTLINE_STEP_M * outward) > SLACK) & level
+    proven = (empty_depth(free_space, place + OUTLINE_STEP_M * outward) > free_space.slack) & level
     levels = np.arange(0.5 * step, max(float(height.max()), step), step)
     row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
     points = np.column_stack([place[row, :2], levels[level]])
-    wrong = empty_depth(free_space, points) > SLACK
+    wrong = empty_depth(free_space, points) > free_space.slack
     bad = np.bincount(row, wrong, len(place)) > 0.15 * np.bincount(row, minlength=len(place))
     return take(Surfels(points, outward[row]), ~bad[row])
 
@@ -93,5 +93,5 @@ def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) ->
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     within = grid[(grid @ hull.equations[:, :2].T + hull.equations[:, 2] < -0.5 * step).all(1)]
     base = np.column_stack([within, np.zeros(len(within))])
-    base = base[empty_depth(free_space, base) < SLACK]
+    base = base[empty_depth(free_space, base) < free_space.slack]
     return Surfels(base, np.tile(np.array([0.0, 0.0, -1.0]), (len(base), 1)))

@@ -14,26 +14,27 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError
 from graspd_core.mesh.surface_queries import closest_points, make_surface
-from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.types import TriangleMesh
 
-# Cells of the grid along the object's longest side, and the least width of one [m].
-GRID_CELLS, FINEST = 60, 0.0017
+# Cells of the grid along the object's longest side.
+GRID_CELLS = 60
 # Cells that a wall is made thick, if it is thinner.
 MIN_WALL_CELLS = 2.2
-# Poisson's own finest cells are wider than this [m]: twice the noise.
-COARSEST = 0.0022
 # Beyond so many cells from the Poisson surface a node's side is its region's.
 BAND_CELLS = 2
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
 
 
-def fit_poisson(surfels: Surfels) -> TriangleMesh:
-    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size."""
+def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
+    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size.
+
+    Its finest cells are wider than `finest` [m].
+    """
     size = float(np.ptp(surfels.points, axis=0).max())
-    depth = int(np.clip(np.ceil(np.log2(1.2 * size / COARSEST)), 5, 7))
+    depth = int(np.clip(np.ceil(np.log2(1.2 * size / finest)), 5, 7))
     vertices, faces = _fit(surfels.points, surfels.normals, depth)
     if len(faces) == 0:
         raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
@@ -52,17 +53,17 @@ def _fit(
     return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
 
 
-def grid_cell(surfels: Surfels) -> float:
-    """Width of the cells that a surface through these points is closed on [m]."""
-    return max(float(np.ptp(surfels.points, axis=0).max()) / GRID_CELLS, FINEST)
+def grid_cell(surfels: Surfels, least: float) -> float:
+    """Width of the cells that a surface through these points is closed on, at least `least` [m]."""
+    return max(float(np.ptp(surfels.points, axis=0).max()) / GRID_CELLS, least)
 
 
-def part_walls(surfels: Surfels) -> Surfels:
+def part_walls(surfels: Surfels, cell: float) -> Surfels:
     """The two sides of walls too thin for the grid moved apart, for they would cancel; by a millimetre or two."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
-    thinnest = MIN_WALL_CELLS * grid_cell(surfels)
+    thinnest = MIN_WALL_CELLS * cell
     # Nearest in place and in opposite normal: the other side of a wall.
     tree = KDTree(np.hstack([points, thinnest * normals]))
     _, other = tree.query(np.hstack([points, -thinnest * normals]))
@@ -74,18 +75,18 @@ def part_walls(surfels: Surfels) -> Surfels:
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 
 
-def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace) -> TriangleMesh:
+def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace, cell: float) -> TriangleMesh:
     """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
     from scipy.ndimage import gaussian_filter
 
     low, high = surfels.points.min(0), surfels.points.max(0)
-    cell = grid_cell(surfels)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     value = _signed(surface, nodes, cell)
     inner = value < BAND_CELLS * cell
     beyond = (
-        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell)) - SLACK
+        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell))
+        - free_space.slack
     )
     value[inner] = np.maximum(value[inner], beyond)
     value = gaussian_filter(value, 0.5)
