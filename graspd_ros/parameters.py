@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from graspd_core import load_preset
-from graspd_core.config import VERIFICATIONS
+from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError
 from graspd_ros.worker import BusyPolicy
 
@@ -56,6 +56,11 @@ def _check_device(name: str) -> None:
         raise ConfigError(f"{name!r} is not a device of this machine; valid: {', '.join(valid)}") from None
 
 
+def _check_scene_config(path: str) -> None:
+    if path:
+        load_scene_config(path)
+
+
 def _check_corner(corner: list[float]) -> None:
     if len(corner) != 3 or not np.isfinite(corner).all():
         raise ConfigError(f"{list(corner)} is no corner; give three finite numbers, x, y and z in metres")
@@ -90,6 +95,12 @@ class Settings:
     )
     roi_max: list[float] = _setting(
         [WORKSPACE] * 3, "upper corner of the workspace, in the frame of the cloud [m]", check=_check_corner
+    )
+    scene_config: str = _setting(
+        "",
+        "path of a yaml file with settings of segmentation, reconstruction and obstacles, as of `graspd --scene`; "
+        "empty: the defaults",
+        check=_check_scene_config,
     )
     fixed_frame: str = _setting("", "frame that ~/add_view keeps views in, by /tf; empty: that of the first view")
     output_frame: str = _setting("", "frame of the results, by /tf; empty: the frame of the input")

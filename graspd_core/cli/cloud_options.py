@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graspd_core.bags.reader import BagFrame, is_bag, read_frames, read_transforms
+from graspd_core.config import SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.pointcloud.point_cloud import PointCloud
 
@@ -27,13 +28,17 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_object_options(parser: argparse.ArgumentParser) -> None:
-    """Which of the things that a cloud shows is meant."""
+    """Which of the things that a cloud shows is meant, and how clouds become scenes."""
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
         help="a point on the object, in metres; else what is nearest the axis of view",
     )  # fmt: skip
     which.add_argument("--alone", action="store_true", help="the clouds show the object and nothing else")
+    parser.add_argument(
+        "--scene", type=Path, default=None, metavar="FILE.yaml",
+        help="settings of segmentation, reconstruction and obstacles (docs/clouds.md)",
+    )  # fmt: skip
 
 
 def target_of(options: argparse.Namespace):
@@ -41,6 +46,11 @@ def target_of(options: argparse.Namespace):
     from graspd_core.segmentation.target_selection import Target
 
     return Target(point=np.array(options.target)) if options.target else None
+
+
+def scene_config_of(options: argparse.Namespace) -> SceneConfig:
+    """The settings in the file that the options name, else the defaults. Raises ConfigError."""
+    return load_scene_config(options.scene) if options.scene else SceneConfig()
 
 
 def check_bag_options(options: argparse.Namespace) -> None:

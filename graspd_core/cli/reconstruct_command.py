@@ -7,7 +7,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from graspd_core.cli.cloud_options import add_bag_options, add_object_options, check_bag_options, load_views, target_of
+from graspd_core.cli.cloud_options import (
+    add_bag_options,
+    add_object_options,
+    check_bag_options,
+    load_views,
+    scene_config_of,
+    target_of,
+)
 from graspd_core.cli.running import EXIT_OK
 
 
@@ -30,12 +37,13 @@ def run(options: argparse.Namespace) -> int:
 
     check_bag_options(options)
     check_writable(options.out)
+    settings = scene_config_of(options)
     views = load_views(options.cloud, options)
     support, warnings = None, ()
     if not options.alone:
-        seen = segment(views, target=target_of(options))
+        seen = segment(views, target=target_of(options), settings=settings.segmentation)
         views, support, warnings = seen.views, seen.support, seen.warnings
-    whole = reconstruct(views, support=support)
+    whole = reconstruct(views, support=support, settings=settings.reconstruction)
     mesh = whole.mesh
     save_mesh(mesh, options.out)
     for warning in (*warnings, *whole.warnings):

@@ -16,10 +16,12 @@ from graspd_core.cli.cloud_options import (
     bag_views,
     check_bag_options,
     merged_views,
+    scene_config_of,
     target_of,
 )
 from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt, Reporter
+from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.transforms import SECOND
@@ -56,6 +58,7 @@ def run(options: argparse.Namespace) -> int:
 
     config, request = planning_options(options)
     check_bag_options(options)
+    settings = scene_config_of(options)
     single = options.out is not None and options.out.suffix == ".json"
     if single and not (options.fuse or options.limit == 1):
         raise ConfigError(f"{options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
@@ -69,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
             if interrupted := interrupt.came():
                 break
             try:
-                scene = _scene_of(job, options, config.resolution)
+                scene = _scene_of(job, options, settings, config.resolution)
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
                 # An empty table is an answer; a cloud that cannot be used is bad input.
@@ -118,7 +121,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
             yield _Job(name, label, (seen,))
 
 
-def _scene_of(job: _Job, options: argparse.Namespace, resolution: int):
+def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig, resolution: int):
     """What the views of a job show. Raises a GraspdError: they show no usable object."""
     from graspd_core.scene.scene_from_views import scene_from_views
 
@@ -128,6 +131,7 @@ def _scene_of(job: _Job, options: argparse.Namespace, resolution: int):
         job.views,
         target=target_of(options),
         alone=options.alone,
+        settings=settings,
         mass=options.mass,
         friction=options.friction,
         source=f"{options.bag}: {job.label}",

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from graspd_core.cli.cloud_options import add_object_options, target_of
+from graspd_core.cli.cloud_options import add_object_options, scene_config_of, target_of
 from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options, summary
 from graspd_core.cli.running import Interrupt, Reporter
 
@@ -50,6 +50,7 @@ def run(options: argparse.Namespace) -> int:
         resolution=config.resolution,
         target=target_of(options),
         alone=options.alone,
+        settings=scene_config_of(options),
     )
     hand = load_hand(options.hand, candidates=config.problem.fine_candidates)
     for warning in scene.object.warnings:

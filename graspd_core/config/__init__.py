@@ -8,18 +8,24 @@ from typing import Literal
 from graspd_core.config.grasp_stages import GraspStagesConfig
 from graspd_core.config.mapping import from_mapping
 from graspd_core.config.problem import ProblemConfig
+from graspd_core.config.reconstruction import ReconstructionConfig
 from graspd_core.config.robust import RobustConfig
 from graspd_core.config.rounds import RoundsConfig
+from graspd_core.config.scene_config import ObstacleConfig, SceneConfig, load_scene_config
 from graspd_core.config.segmentation import SegmentationConfig
 
 __all__ = [
     "VERIFICATIONS",
     "GraspStagesConfig",
+    "ObstacleConfig",
     "ProblemConfig",
+    "ReconstructionConfig",
     "RobustConfig",
     "RoundsConfig",
+    "SceneConfig",
     "SegmentationConfig",
     "from_mapping",
+    "load_scene_config",
 ]
 
 Verify = Literal["standard", "hard", "none"]

@@ -7,6 +7,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from graspd_core.errors import ConfigError, shown
@@ -34,6 +35,19 @@ def coerced(hints: Mapping[str, Any], values: Any, where: str) -> dict[str, Any]
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]}; valid keys: {', '.join(sorted(hints))}")
     return {key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()}
+
+
+def read_yaml(path: Path) -> Any:
+    """Read the values of a YAML file, an empty mapping for an empty one. Raises ConfigError: missing or malformed."""
+    from graspd_core.config.yaml_text import YamlError, parse_yaml
+
+    try:
+        _, values = parse_yaml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except (YamlError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
+    return {} if values is None else values
 
 
 def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.config import GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
-from graspd_core.config.mapping import coerced
+from graspd_core.config.mapping import coerced, read_yaml
 from graspd_core.errors import ConfigError, shown
 from graspd_core.methods.registry import METHODS
 from graspd_core.paths import config_dir
@@ -116,15 +116,7 @@ def load_preset(name: str) -> PlanConfig:
     Raises:
         ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
     """
-    from graspd_core.config.yaml_text import YamlError, parse_yaml
-
     path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
         raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
-    try:
-        _, values = parse_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from None
-    except (YamlError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {error}") from None
-    return plan_config({} if values is None else values, where=path.name)
+    return plan_config(read_yaml(path), where=path.name)

@@ -20,10 +20,10 @@ DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 _Numbers = Sequence[float | int]
 
 # Newton's method on a smooth lens doubles its digits each round: five suffice, extreme lenses take a few more.
-_ROUNDS = 20
-_CLOSE = 1e-10
+_NEWTON_STEPS = 20
+_NEWTON_TOLERANCE = 1e-10
 # Of a focal length and of any other number of a calibration [pixels]: beyond them rays are no longer numbers.
-_SHORTEST, _LARGEST = 1e-2, 1e7
+_MIN_FOCAL_PX, _MAX_CALIBRATION_PX = 1e-2, 1e7
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,9 @@ class PinholeCamera:
         if self.width < 1 or self.height < 1:
             raise CloudError(f"camera: an image of {self.width} x {self.height} pixels; both must be 1 or more")
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not (all(abs(number) <= _LARGEST for number in numbers) and min(self.fx, self.fy) >= _SHORTEST):
+        if not (
+            all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers) and min(self.fx, self.fy) >= _MIN_FOCAL_PX
+        ):
             raise CloudError(f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration")
         if len(self.distortion) > 8:
             raise CloudError(f"camera: {len(self.distortion)} distortion coefficients; at most 8 are understood")
@@ -114,19 +116,19 @@ def undistort(seen: Float[np.ndarray, "*batch 2"], coefficients: _Numbers) -> Fl
     ideal = target.copy()
     # Beyond the lens's range the iteration runs off to infinity; such pixels are sorted out below.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for _ in range(_ROUNDS):
+        for _ in range(_NEWTON_STEPS):
             image, slope = _lens(ideal, coefficients)
             a, b, d = np.moveaxis(slope, -1, 0)
             off = target - image
             determinant = a * d - b * b
             step = np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - b * off[..., 0]], -1)
             ideal += step / determinant[..., None]
-            if np.abs(off[np.isfinite(off)]).max(initial=0.0) < 1e-3 * _CLOSE:
+            if np.abs(off[np.isfinite(off)]).max(initial=0.0) < 1e-3 * _NEWTON_TOLERANCE:
                 break
         image, slope = _lens(ideal, coefficients)
         a, b, d = np.moveaxis(slope, -1, 0)
         # A lens model folds back at its rim: there the determinant, or the stretch along the radius, is negative.
-        found = (np.abs(target - image).max(-1) < _CLOSE) & (a * d - b * b > 0) & (a + d > 0)
+        found = (np.abs(target - image).max(-1) < _NEWTON_TOLERANCE) & (a * d - b * b > 0) & (a + d > 0)
     return np.where(found[..., None], ideal, np.nan)
 
 

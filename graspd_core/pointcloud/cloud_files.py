@@ -16,11 +16,11 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
-_RIGID = 1e-4
+_ROTATION_TOLERANCE = 1e-4
 # What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
-_MOST_UNPACKED = 2**31
+_MAX_UNPACKED_BYTES = 2**31
 # The most points that a byte of a file can hold, compressed as densely as pcd's method can.
-_MOST_POINTS_A_BYTE = 10
+_MAX_POINTS_PER_BYTE = 10
 
 
 def is_cloud_file(path: str | Path) -> bool:
@@ -128,7 +128,7 @@ def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
 def _rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
     pose = _numbers({name: pose}, name)
     turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
-    square = np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
+    square = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
     if not (np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1))):
         raise CloudError(
             f"{name!r} is no rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
@@ -153,8 +153,8 @@ def _read_numpy(path: Path) -> dict[str, np.ndarray]:
             if isinstance(stored, np.ndarray):
                 return {"points": stored}
             unpacked = sum(entry.file_size for entry in stored.zip.infolist())
-            if unpacked > _MOST_UNPACKED:
-                raise ValueError(f"{unpacked} bytes when unpacked; at most {_MOST_UNPACKED} are taken")
+            if unpacked > _MAX_UNPACKED_BYTES:
+                raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are taken")
             return {name: stored[name] for name in stored.files}
     # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals;
     # one whose header promises more than there is as a lack of memory.
@@ -223,7 +223,7 @@ def _refuse_empty_promise(path: Path) -> None:
         words = line.split()
         if words[:1] in ([b"POINTS"], [b"WIDTH"], [b"HEIGHT"], [b"COUNT"], [b"SIZE"]):
             promised = max((abs(int(word)) for word in words[1:] if word.lstrip(b"+-").isdigit()), default=0)
-            if promised > _MOST_POINTS_A_BYTE * size:
+            if promised > _MAX_POINTS_PER_BYTE * size:
                 raise CloudError(f"{path}: its header promises {promised} points or bytes, in a file of {size} bytes")
 
 

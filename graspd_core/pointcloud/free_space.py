@@ -12,18 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from graspd_core.config import ReconstructionConfig
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.se3 import perpendicular
 
 # Depth images of more cells than this across the object tell no more.
-MOST_CELLS = 160
+MAX_IMAGE_CELLS = 160
 # Points, itself among them, that a point's spacing is taken from.
-SPACED = 5
+SPACING_NEIGHBOURS = 5
 
-# Outlines and surfaces are seen to within the first [m]; a point the second deeper in empty space is impossible.
-SLACK, CONTRADICTION = 0.003, 0.01
-# A guessed point this near to a seen surface [m] confirms the guess.
-TOLERANCE = 0.004
+# A point so much deeper in empty space than the slack is impossible.
+CONTRADICTION_DEPTH_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,15 @@ class FreeSpace:
         standing: the object stands on a support that fills z < 0.
         lowest: height of the lowest points seen [m]: segmentation cuts the rest off with the support, so that outlines
             end too high by up to this.
+        slack: outlines and surfaces are seen to within this [m].
+        tolerance: a guessed point this near to a seen surface confirms the guess [m].
     """
 
     view_depths: tuple[ViewDepth, ...]
     standing: bool
     lowest: float = 0.0
+    slack: float = ReconstructionConfig.outline_slack
+    tolerance: float = ReconstructionConfig.surface_tolerance
 
 
 def make_view_depths(views: Sequence[PointCloud]) -> tuple[ViewDepth, ...]:
@@ -80,11 +83,11 @@ def _make_view_depth(view: PointCloud) -> ViewDepth | None:
     frame = view_frame(view)
     local = (view.points - view.viewpoint) @ frame
     local = local[local[:, 2] > 1e-3]
-    if len(local) < SPACED:
+    if len(local) < SPACING_NEIGHBOURS:
         return None
     plane = local[:, :2] / local[:, 2:]
-    spacing = float(np.median(KDTree(plane).query(plane, k=SPACED)[0][:, -1]))
-    cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MOST_CELLS)
+    spacing = float(np.median(KDTree(plane).query(plane, k=SPACING_NEIGHBOURS)[0][:, -1]))
+    cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MAX_IMAGE_CELLS)
     if cell < 1e-9:
         return None
     margin = 6
@@ -112,7 +115,7 @@ def weigh(
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
     confirmed, deep = _judge(free_space, points, normals)
-    return confirmed, np.clip((deep - SLACK) / CONTRADICTION, 0.0, 1.0)
+    return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
 
 def on_seen(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
@@ -120,7 +123,8 @@ def on_seen(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Boo
     found = np.zeros(points.shape[:-1], dtype=bool)
     for view_depth in free_space.view_depths:
         empty, behind = _look(view_depth, points)
-        found |= (empty < 1.5 * TOLERANCE) & (np.where(np.isfinite(behind), np.abs(behind), 0.0) < 1.5 * TOLERANCE)
+        depth = np.where(np.isfinite(behind), np.abs(behind), 0.0)
+        found |= (empty < 1.5 * free_space.tolerance) & (depth < 1.5 * free_space.tolerance)
     return found
 
 
@@ -144,7 +148,7 @@ def _judge(
         empty, behind = _look(view_depth, points)
         deepest = np.maximum(deepest, empty)
         if normals is not None:
-            confirmed |= (np.abs(behind) < TOLERANCE) & (((view_depth.eye - points) * normals).sum(-1) > 0)
+            confirmed |= (np.abs(behind) < free_space.tolerance) & (((view_depth.eye - points) * normals).sum(-1) > 0)
     if free_space.standing:
         height = points[..., 2]
         deepest = np.maximum(deepest - np.clip(free_space.lowest - height, 0.0, free_space.lowest), -height)

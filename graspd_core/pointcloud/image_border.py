@@ -8,22 +8,23 @@ from jaxtyping import Bool, Float
 from graspd_core.pointcloud.free_space import view_frame
 from graspd_core.pointcloud.point_cloud import PointCloud
 
-# Directions this near to the hull of all directions are on the border [rad]: two or three pixels.
-REACH = 0.004
 # So many points on one side of the hull, of the object and of other things each: an object that stands out alone
 # against nothing makes a hull of its own.
-FEWEST = 8
+MIN_BORDER_POINTS = 8
 # Shorter sides than this share of the outline's size are no border of a picture.
-LONG = 0.1
+MIN_SIDE_SHARE = 0.1
 # A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
 # of a thing to the corner of the table behind it has none between.
-PARTS, FILLED = 20, 0.6
+SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
 
 
 def reaches_image_border(
-    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"]
+    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Whether the points of an object lie on a side of the view's outline on which other points lie too."""
+    """Whether the points of an object lie on a side of the view's outline on which other points lie too.
+
+    Directions within `width` [rad] of the hull of all directions are on the outline.
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     if not mine.any():
@@ -36,10 +37,13 @@ def reaches_image_border(
     except (QhullError, ValueError):
         return False
     ends = plane[hull.simplices]
-    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > LONG * np.ptp(plane, axis=0).max()
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * np.ptp(plane, axis=0).max()
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
-        near = plane @ np.array(normal) + offset > -REACH
-        if min((near & mine).sum(), (near & ~mine).sum()) >= FEWEST and _filled(plane[near], start, end) >= FILLED:
+        near = plane @ np.array(normal) + offset > -width
+        if (
+            min((near & mine).sum(), (near & ~mine).sum()) >= MIN_BORDER_POINTS
+            and _filled(plane[near], start, end) >= MIN_FILLED_SHARE
+        ):
             return True
     return False
 
@@ -47,5 +51,5 @@ def reaches_image_border(
 def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
     """Share of a side's parts in which points lie."""
     side = end - start
-    part = np.floor(PARTS * ((near - start) @ side) / (side @ side))
-    return len(np.unique(part[(part >= 0) & (part < PARTS)])) / PARTS
+    part = np.floor(SIDE_PARTS * ((near - start) @ side) / (side @ side))
+    return len(np.unique(part[(part >= 0) & (part < SIDE_PARTS)])) / SIDE_PARTS

@@ -10,12 +10,11 @@ from jaxtyping import Bool, Float
 from graspd_core.errors import CloudError
 from graspd_core.mesh.unique_rows import voxel_keys
 
-FEWEST_POINTS = 50
-MOST_POINTS = 20_000
+MIN_POINTS = 50
 # Points this many times the cloud's size away from its middle are no part of it.
-FARTHEST = 1e3
+MAX_DISTANCE_IN_SIZES = 1e3
 # No camera measures what is this near to itself [m]; drivers that have no depth send that.
-AT_CAMERA = 1e-5
+CAMERA_PLACE_TOLERANCE_M = 1e-5
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 def measured(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
     """Which points were measured: finite, and not what drivers fill gaps with: zeros, or the camera's place."""
-    filled = (points == 0).all(1) | (np.abs(points - viewpoint) < AT_CAMERA).all(1)
+    filled = (points == 0).all(1) | (np.abs(points - viewpoint) < CAMERA_PLACE_TOLERANCE_M).all(1)
     return np.isfinite(points).all(1) & ~filled
 
 
@@ -70,7 +69,7 @@ def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "
     with np.errstate(over="ignore", invalid="ignore"):
         spread = np.percentile(finite, 98, axis=0) - np.percentile(finite, 2, axis=0)
         size = float(np.linalg.norm(spread))
-        near = np.abs(finite - np.median(finite, axis=0)).max(1) <= FARTHEST * size
+        near = np.abs(finite - np.median(finite, axis=0)).max(1) <= MAX_DISTANCE_IN_SIZES * size
     if size <= 0:
         raise CloudError(f"cloud: all {len(finite)} points are in one place")
     if not np.isfinite(size):
@@ -88,5 +87,5 @@ def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "
 
 
 def _refuse_few(left: int, given: int, kind: str) -> None:
-    if left < FEWEST_POINTS:
-        raise CloudError(f"cloud: only {left} {kind} points of {given}; at least {FEWEST_POINTS} are needed")
+    if left < MIN_POINTS:
+        raise CloudError(f"cloud: only {left} {kind} points of {given}; at least {MIN_POINTS} are needed")

@@ -14,14 +14,12 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.unique_rows import packed_rows
-from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud, measured
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud, measured
 
 # Of more points than this, every second, or third, ... is taken.
-MOST_POINTS = 5_000_000
-# More voxels than this are thinned again by larger ones: the time of all that follows is bounded.
-MOST_VOXELS = 150_000
+MAX_SCENE_POINTS = 5_000_000
 # Units that clouds come in by mistake, how many of them a metre has, and the least distance that is told from them [m].
-UNITS, NEAREST = (("millimetres", 1000), ("centimetres", 100)), 0.1
+UNITS_PER_METRE, MIN_CAMERA_DISTANCE_M = (("millimetres", 1000), ("centimetres", 100)), 0.1
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
     given = sum(len(view.points) for view in views)
     if given == 0:
         raise CloudError("cloud: empty, no points at all" if len(views) else "cloud: no view at all")
-    stride = -(-given // MOST_POINTS)
+    stride = -(-given // MAX_SCENE_POINTS)
     kept = [_inside(view, stride, settings) for view in views]
     finite = sum(number for _, _, _, number in kept)
     if finite == 0:
@@ -77,13 +75,13 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
     _refuse_far_apart(views, rows, settings.max_range)
     points = np.concatenate([point for _, point, _, _ in kept])
     distance = np.concatenate([reach for _, _, reach, _ in kept])
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         few = f"only {len(points)} finite points of {given}"
         if len(points) < finite:
             roi = "" if settings.roi_low is None and settings.roi_high is None else " and in the region of interest"
             few = f"only {len(points)} of {finite} points are within {settings.max_range:g} m of the camera{roi}"
-        raise CloudError(f"cloud: {few}; at least {FEWEST_POINTS} are needed{_unit_hint(views, settings.max_range)}")
-    voxel, size = _voxels(points, settings.voxel)
+        raise CloudError(f"cloud: {few}; at least {MIN_POINTS} are needed{_unit_hint(views, settings.max_range)}")
+    voxel, size = _voxels(points, settings.voxel, settings.max_voxels)
     count = np.bincount(voxel)
     mean = np.column_stack([np.bincount(voxel, points[:, axis]) / count for axis in range(3)])
     if float(np.ptp(mean, axis=0).max()) <= 0:
@@ -130,20 +128,20 @@ def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
     """What unit the points would be near the camera in, if they are not in metres."""
     some = np.concatenate([view.points[:: 1 + len(view.points) // 10_000] - view.viewpoint for view in views])
     away = float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))
-    for name, per_metre in UNITS:
-        if farthest < away and NEAREST <= away / per_metre <= farthest:
+    for name, per_metre in UNITS_PER_METRE:
+        if farthest < away and MIN_CAMERA_DISTANCE_M <= away / per_metre <= farthest:
             return f"; half of them are beyond {away:.0f} m: if they are in {name}, divide them by {per_metre}"
     return ""
 
 
-def _voxels(points: Float[np.ndarray, "n 3"], size: float) -> tuple[Int[np.ndarray, "n"], float]:
+def _voxels(points: Float[np.ndarray, "n 3"], size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
     """Which voxel each point lies in, counted without gaps, and the side it came to."""
     low = points.min(0)
     # So many cells an axis have room in one number.
     size = max(size, float(np.ptp(points, axis=0).max()) / 2**20)
     cell, voxel = _distinct(((points - low) / size).astype(np.int64))
-    while len(cell) > MOST_VOXELS:
-        growth = max(1.2, (len(cell) / MOST_VOXELS) ** 0.5)
+    while len(cell) > most:
+        growth = max(1.2, (len(cell) / most) ** 0.5)
         size *= growth
         cell, coarser = _distinct(((cell + 0.5) / growth).astype(np.int64))
         voxel = coarser[voxel]

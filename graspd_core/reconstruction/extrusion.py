@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth, facing
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, facing
 from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
 
 # A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
-OUTWARDS = 0.008
+OUTLINE_STEP_M = 0.008
 # How level the surface must be there, and how much it must face a camera [cosines].
-LEVEL, FACING = 0.85, 0.3
+MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
 # Of the object's lowest points, the share that must be of walls for it to have a base; how steep [cosine] those are.
-WALLED, STEEP = 0.6, 0.25
+MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
 # The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
-LOW = 0.015
+MAX_FOOT_HEIGHT_M = 0.015
 # Share of the base's outline that walls must stand on.
-ENCLOSED = 0.6
+MIN_ENCLOSED_SHARE = 0.6
 
 
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
@@ -45,12 +45,14 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
     _, nearest = KDTree(seen.points).query(place)
     # A surface that turns away from the camera at the outline goes on behind it; one that is level there ends.
-    level = (seen.normals[nearest, 2] > LEVEL) & (facing(free_space, seen.points, seen.normals)[nearest] > FACING)
-    proven = (empty_depth(free_space, place + OUTWARDS * outward) > SLACK) & level
+    level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
+        facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
+    )
+    proven = (empty_depth(free_space, place + OUTLINE_STEP_M * outward) > free_space.slack) & level
     levels = np.arange(0.5 * step, max(float(height.max()), step), step)
     row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
     points = np.column_stack([place[row, :2], levels[level]])
-    wrong = empty_depth(free_space, points) > SLACK
+    wrong = empty_depth(free_space, points) > free_space.slack
     bad = np.bincount(row, wrong, len(place)) > 0.15 * np.bincount(row, minlength=len(place))
     return take(Surfels(points, outward[row]), ~bad[row])
 
@@ -59,8 +61,8 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """What joins walls that end just above the support to it, and the base between them."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
-    wall = np.abs(band.normals[:, 2]) < STEEP
-    if lowest > LOW or wall.mean() < WALLED or wall.sum() < 10:
+    wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
+    if lowest > MAX_FOOT_HEIGHT_M or wall.mean() < MIN_WALL_SHARE or wall.sum() < 10:
         return nothing()
     feet = take(band, wall)
     # Down along the wall, for each metre of height.
@@ -85,11 +87,11 @@ def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) ->
     along = np.linspace(0, 1, 40, endpoint=False)[:, None, None]
     rim = (corners + along * (np.roll(corners, -1, 0) - corners)).reshape(-1, 2)
     length = np.tile(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1), 40)
-    if length[KDTree(feet).query(rim)[0] < 3 * step].sum() < ENCLOSED * length.sum():
+    if length[KDTree(feet).query(rim)[0] < 3 * step].sum() < MIN_ENCLOSED_SHARE * length.sum():
         return nothing()
     axes = [np.arange(corners[:, k].min(), corners[:, k].max(), step) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     within = grid[(grid @ hull.equations[:, :2].T + hull.equations[:, 2] < -0.5 * step).all(1)]
     base = np.column_stack([within, np.zeros(len(within))])
-    base = base[empty_depth(free_space, base) < SLACK]
+    base = base[empty_depth(free_space, base) < free_space.slack]
     return Surfels(base, np.tile(np.array([0.0, 0.0, -1.0]), (len(base), 1)))

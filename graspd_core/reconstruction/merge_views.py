@@ -16,15 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.unique_rows import packed_rows, voxel_keys
-from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud
 from graspd_core.se3 import perpendicular
 
-# Points that a local plane is fitted to.
-NEIGHBOURS = 28
-# Points farther than this from their neighbours' plane [m], or seen flatter than this cosine, flew off an edge.
-STRAY, GRAZING = 0.006, 0.1
+# Points of a surface seen flatter than this flew off an edge.
+MIN_VIEW_COSINE = 0.1
 
 
 @dataclass(frozen=True)
@@ -61,30 +60,32 @@ def point_step(views: Sequence[PointCloud]) -> float:
     return max(float(np.linalg.norm(high - low)) / 80, 1e-3)
 
 
-def merge_views(views: Sequence[PointCloud], step: float | None = None) -> Surfels:
+def merge_views(
+    views: Sequence[PointCloud], step: float | None = None, settings: ReconstructionConfig | None = None
+) -> Surfels:
     """The oriented points of all views, strays dropped, noise smoothed, one per cube of side `step` and side of it.
 
     Raises:
         CloudError: fewer than 50 points are left.
     """
-    step = point_step(views) if step is None else step
-    together = join(*(orient_view(view, step) for view in views))
-    if len(together.points) < FEWEST_POINTS:
+    step, settings = point_step(views) if step is None else step, settings or ReconstructionConfig()
+    together = join(*(orient_view(view, step, settings) for view in views))
+    if len(together.points) < MIN_POINTS:
         raise CloudError(
             f"cloud: only {len(together.points)} of its {sum(len(view.points) for view in views)} points lie on a "
-            f"surface; at least {FEWEST_POINTS} are needed: it is too sparse, or shows no surface"
+            f"surface; at least {MIN_POINTS} are needed: it is too sparse, or shows no surface"
         )
     return thin(together, step) if len(views) > 1 else together
 
 
-def orient_view(view: PointCloud, step: float) -> Surfels:
+def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -> Surfels:
     """One view's surface points, about `step` [m] apart, with normals towards its camera."""
     from scipy.spatial import KDTree
 
     points = _thin_by_sight(view, step)
-    if len(points) <= NEIGHBOURS:
+    if len(points) <= settings.neighbours:
         return nothing()
-    distance, near = KDTree(points).query(points, k=NEIGHBOURS)
+    distance, near = KDTree(points).query(points, k=settings.neighbours)
     view_depth = points - view.viewpoint
     view_depth /= np.linalg.norm(view_depth, axis=1, keepdims=True)
     centre, normals = points[near].mean(1), np.zeros_like(points)
@@ -102,7 +103,7 @@ def orient_view(view: PointCloud, step: float) -> Surfels:
     slope = -np.einsum("nd,nd->n", normals, view_depth)
     shift = np.einsum("nd,nd->n", points - centre, normals) / np.maximum(slope, 1e-3)
     crowded = distance[:, -1] < 2.5 * np.median(distance[:, -1])
-    kept = (slope > GRAZING) & (np.abs(shift) < STRAY) & crowded
+    kept = (slope > MIN_VIEW_COSINE) & (np.abs(shift) < settings.stray_distance) & crowded
     smooth = points + shift[:, None] * view_depth
     return Surfels(smooth[kept], normals[kept])
 

@@ -14,26 +14,27 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError
 from graspd_core.mesh.surface_queries import closest_points, make_surface
-from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.types import TriangleMesh
 
-# Cells of the grid along the object's longest side, and the least width of one [m].
-CELLS, FINEST = 60, 0.0017
+# Cells of the grid along the object's longest side.
+GRID_CELLS = 60
 # Cells that a wall is made thick, if it is thinner.
-THINNEST = 2.2
-# Poisson's own finest cells are wider than this [m]: twice the noise.
-COARSEST = 0.0022
+MIN_WALL_CELLS = 2.2
 # Beyond so many cells from the Poisson surface a node's side is its region's.
-BAND = 2
+BAND_CELLS = 2
 # Distances that are kept at a time.
-MOST_DISTANCES = 2_000_000
+MAX_DISTANCES = 2_000_000
 
 
-def fit_poisson(surfels: Surfels) -> TriangleMesh:
-    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size."""
+def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
+    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size.
+
+    Its finest cells are wider than `finest` [m].
+    """
     size = float(np.ptp(surfels.points, axis=0).max())
-    depth = int(np.clip(np.ceil(np.log2(1.2 * size / COARSEST)), 5, 7))
+    depth = int(np.clip(np.ceil(np.log2(1.2 * size / finest)), 5, 7))
     vertices, faces = _fit(surfels.points, surfels.normals, depth)
     if len(faces) == 0:
         raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
@@ -52,17 +53,17 @@ def _fit(
     return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
 
 
-def grid_cell(surfels: Surfels) -> float:
-    """Width of the cells that a surface through these points is closed on [m]."""
-    return max(float(np.ptp(surfels.points, axis=0).max()) / CELLS, FINEST)
+def grid_cell(surfels: Surfels, least: float) -> float:
+    """Width of the cells that a surface through these points is closed on, at least `least` [m]."""
+    return max(float(np.ptp(surfels.points, axis=0).max()) / GRID_CELLS, least)
 
 
-def part_walls(surfels: Surfels) -> Surfels:
+def part_walls(surfels: Surfels, cell: float) -> Surfels:
     """The two sides of walls too thin for the grid moved apart, for they would cancel; by a millimetre or two."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
-    thinnest = THINNEST * grid_cell(surfels)
+    thinnest = MIN_WALL_CELLS * cell
     # Nearest in place and in opposite normal: the other side of a wall.
     tree = KDTree(np.hstack([points, thinnest * normals]))
     _, other = tree.query(np.hstack([points, -thinnest * normals]))
@@ -74,18 +75,18 @@ def part_walls(surfels: Surfels) -> Surfels:
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 
 
-def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace) -> TriangleMesh:
+def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace, cell: float) -> TriangleMesh:
     """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
     from scipy.ndimage import gaussian_filter
 
     low, high = surfels.points.min(0), surfels.points.max(0)
-    cell = grid_cell(surfels)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     value = _signed(surface, nodes, cell)
-    inner = value < BAND * cell
+    inner = value < BAND_CELLS * cell
     beyond = (
-        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell)) - SLACK
+        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell))
+        - free_space.slack
     )
     value[inner] = np.maximum(value[inner], beyond)
     value = gaussian_filter(value, 0.5)
@@ -113,7 +114,7 @@ def march(value: Float[np.ndarray, "x y z"], axes: Sequence[Float[np.ndarray, "_
 
 
 def _signed(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Float[np.ndarray, "x y z"]:
-    """Signed distance at the nodes near the surface, and a signed `BAND` of cells elsewhere.
+    """Signed distance at the nodes near the surface, and a signed `BAND_CELLS` of cells elsewhere.
 
     The surface has no border within the grid, so it parts it into regions; those away from it take the side that most
     of their nodes next to the surface are on, by the nearest face's normal.
@@ -124,7 +125,7 @@ def _signed(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: fl
     closest, normals = closest_points(make_surface(surface), nodes[near])
     offset = nodes[near] - closest
     side = np.where((offset * normals).sum(1) < 0, -1.0, 1.0)
-    value = np.full(near.shape, BAND * cell)
+    value = np.full(near.shape, BAND_CELLS * cell)
     value[near] = np.linalg.norm(offset, axis=1)
     signs = np.zeros(near.shape)
     signs[near] = side
@@ -143,7 +144,7 @@ def _touched(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: f
     index = index[((index >= 0) & (index < nodes.shape[:3])).all(1)]
     touched = np.zeros(nodes.shape[:3], dtype=bool)
     touched[tuple(index.T)] = True
-    return np.asarray(binary_dilation(touched, np.ones((3, 3, 3)), iterations=BAND), dtype=bool)
+    return np.asarray(binary_dilation(touched, np.ones((3, 3, 3)), iterations=BAND_CELLS), dtype=bool)
 
 
 def _outside_hull(
@@ -157,7 +158,7 @@ def _outside_hull(
     except QhullError:
         return np.zeros(len(nodes))
     # In parts: all nodes by all facets would take half a gigabyte.
-    parts = np.array_split(nodes, 1 + len(nodes) * len(hull.equations) // MOST_DISTANCES)
+    parts = np.array_split(nodes, 1 + len(nodes) * len(hull.equations) // MAX_DISTANCES)
     beyond = [(part @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1) for part in parts]
     return np.maximum(np.concatenate(beyond), 0.0)
 

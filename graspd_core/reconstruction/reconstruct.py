@@ -12,28 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import check_mesh, simplify
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
-from graspd_core.reconstruction.extrusion import LOW, stand
-from graspd_core.reconstruction.merge_views import NEIGHBOURS, Surfels, join, merge_views, point_step
-from graspd_core.reconstruction.poisson import close_surface, fit_poisson, part_walls
-from graspd_core.reconstruction.shape_completion import OPEN, complete_shape
+from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
+from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, point_step
+from graspd_core.reconstruction.poisson import close_surface, fit_poisson, grid_cell, part_walls
+from graspd_core.reconstruction.shape_completion import complete_shape
 from graspd_core.reconstruction.unposed_cloud import is_unposed, orient_unposed
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 
-# Seen surface is trusted fully to the first distance from a seen point [m], guessed surface not at all past the second.
-SEEN_CONFIDENCE, GUESSED = 0.004, 0.02
-# Faces of the result at most.
-MOST_FACES = 16_000
-# Share of the seen points that must lie within this [m] of the result.
-FITTED, FIT = 0.85, 0.004
-# Points of all views together that are looked at.
-MOST_POINTS = 160_000
+# Share of the seen points that must lie on the result.
+MIN_FITTED_SHARE = 0.85
 
 
 @dataclass(frozen=True)
@@ -42,7 +37,7 @@ class Reconstruction:
 
     Attributes:
         mesh: closed, in the frame of the views [m].
-        trust: of each vertex, 1 where the surface was seen, falling to 0 at 2 cm from it.
+        trust: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
         method: "poisson", and what completed it, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
     """
@@ -53,43 +48,54 @@ class Reconstruction:
     warnings: tuple[str, ...]
 
 
-def reconstruct(views: Sequence[PointCloud], *, support: Plane | None = None) -> Reconstruction:
+def reconstruct(
+    views: Sequence[PointCloud], *, support: Plane | None = None, settings: ReconstructionConfig | None = None
+) -> Reconstruction:
     """The closed surface of the object that the views show.
 
     Args:
         views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
             cloud that shows it from all round may stand for many views.
         support: what the object stands on, in the same frame.
+        settings: precision of the cameras, and sizes.
 
     Raises:
         CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
     """
-    views = _clean(views)
+    settings = settings or ReconstructionConfig()
+    views = _clean(views, settings)
     rotation, origin = _frame(views, support)
     local = [PointCloud((v.points - origin) @ rotation, (v.viewpoint - origin) @ rotation) for v in views]
     step = point_step(local)
     standing = support is not None
     method, warnings = "poisson", ()
     if len(local) == 1 and is_unposed(local[0]):
-        seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing)
+        seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing, 0.0, settings.outline_slack)
         known = seen
     else:
-        seen = merge_views(local, step)
-        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, LOW)) if standing else 0.0
-        free_space = FreeSpace(make_view_depths(local), standing, lowest)
-        guess = complete_shape(seen, free_space, step)
+        seen = merge_views(local, step, settings)
+        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, MAX_FOOT_HEIGHT_M)) if standing else 0.0
+        free_space = FreeSpace(
+            make_view_depths(local), standing, lowest, settings.outline_slack, settings.surface_tolerance
+        )
+        guess = complete_shape(seen, free_space, step, settings)
         known = join(seen, guess.surfels)
         known = join(known, stand(known, free_space, step)) if standing else known
         method += f", {guess.method}" if guess.method else ""
-        if guess.method or guess.openness > OPEN:
+        if guess.method or guess.openness > settings.open_share:
             warnings = (_sentence(len(views), guess.method),)
-    known = part_walls(known)
-    mesh = _finished(close_surface(fit_poisson(known), known, free_space), seen)
-    confidence = _confidence(mesh, np.concatenate([view.points for view in local]))
+    mesh = _finished(_surface(known, free_space, settings), seen, settings)
+    confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
     return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), confidence, method, warnings)
 
 
-def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
+def _surface(known: Surfels, free_space: FreeSpace, settings: ReconstructionConfig) -> TriangleMesh:
+    known = part_walls(known, grid_cell(known, settings.min_cell))
+    cell = grid_cell(known, settings.min_cell)
+    return close_surface(fit_poisson(known, settings.poisson_cell), known, free_space, cell)
+
+
+def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
     """Finite points, near where most are, of the views that have enough of them for a surface."""
     from scipy.spatial import KDTree
 
@@ -98,7 +104,7 @@ def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
     for view in views:
         if not np.isfinite(view.viewpoint).all():
             raise CloudError("cloud: the place of a view's camera (viewpoint) is not finite")
-    most = MOST_POINTS // len(views)
+    most = settings.max_points // len(views)
     kept = [_some(view, most) for view in views]
     clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
     tree = KDTree(clean.points)
@@ -107,10 +113,12 @@ def _clean(views: Sequence[PointCloud]) -> list[PointCloud]:
     for points, view in zip(kept, views, strict=True):
         points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
         # Among a thousand: one place sent often is no surface, and its sight would call all else empty.
-        if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > NEIGHBOURS:
+        if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > settings.neighbours:
             result.append(PointCloud(points, view.viewpoint.astype(float)))
     if not result:
-        raise CloudError(f"cloud: none of its {len(views)} views shows more than {NEIGHBOURS} points of the object")
+        raise CloudError(
+            f"cloud: none of its {len(views)} views shows more than {settings.neighbours} points of the object"
+        )
     return result
 
 
@@ -142,41 +150,44 @@ def _frame(
     return np.column_stack([level, np.cross(up, level), up]), centre
 
 
-def _finished(mesh: TriangleMesh, seen: Surfels) -> TriangleMesh:
+def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig) -> TriangleMesh:
     """Few faces, closed, and through the points that were seen."""
     try:
-        mesh = _fewer(check_mesh(mesh, "reconstruction")[0])
+        mesh = _fewer(check_mesh(mesh, "reconstruction")[0], settings.max_faces)
     except MeshError as error:
         raise CloudError(f"cloud: no usable surface fits its {len(seen.points)} points ({error})") from None
-    fitted = float((surface_distance(make_surface(mesh), seen.points) < FIT).mean())
-    if not is_closed(mesh) or fitted < FITTED:
+    fitted = float((surface_distance(make_surface(mesh), seen.points) < settings.fit_distance).mean())
+    if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
         raise CloudError(
             f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed"
         )
     return mesh
 
 
-def _fewer(mesh: TriangleMesh) -> TriangleMesh:
-    """At most `MOST_FACES`; the slower of two simplifiers where the quicker one tears the surface."""
+def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
+    """At most so many faces; the slower of two simplifiers where the quicker one tears the surface."""
     import open3d as o3d
 
-    quick, _ = check_mesh(simplify(mesh, MOST_FACES), "reconstruction")
+    quick, _ = check_mesh(simplify(mesh, most), "reconstruction")
     if is_closed(quick):
         return quick
     whole = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
-    ).simplify_quadric_decimation(MOST_FACES)
+    ).simplify_quadric_decimation(most)
     slow = TriangleMesh(np.asarray(whole.vertices), np.asarray(whole.triangles, dtype=np.int64))
     slow, _ = check_mesh(slow, "reconstruction")
     return slow if is_closed(slow) else mesh
 
 
-def _confidence(mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "vertices"]:
+def _confidence(
+    mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"], settings: ReconstructionConfig
+) -> Float[np.ndarray, "vertices"]:
     """1 near seen points, less the farther from them."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(seen).query(mesh.vertices)
-    return np.clip((GUESSED - distance) / (GUESSED - SEEN_CONFIDENCE), 0.0, 1.0)
+    far = settings.guessed_distance
+    return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
 
 
 def _sentence(views: int, method: str) -> str:

@@ -11,7 +11,7 @@ from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.pointcloud.free_space import FreeSpace, weigh
 from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.reconstruction.revolution_axis import (
-    FEWEST,
+    MIN_AXIS_POINTS,
     Axis,
     fit_axis,
     half_plane,
@@ -19,15 +19,15 @@ from graspd_core.reconstruction.revolution_axis import (
     settle_axis,
     turned,
 )
-from graspd_core.reconstruction.symmetry import UP, WEIGHT
+from graspd_core.reconstruction.symmetry import CONTRADICTION_WEIGHT, UP
 from graspd_core.se3 import perpendicular
 
 # Places around the axis that each ring of the profile is judged at, and the share of them that may contradict it.
-TURNS, BROKEN = 24, 0.15
+RING_SAMPLES, MAX_CONTRADICTED_SHARE = 24, 0.15
 # Cosine of the tilt below which a body that stands is upright.
-UPRIGHT = 0.985
+UPRIGHT_COSINE = 0.985
 # Without a support the first camera looks down on things: up is towards it.
-ACROSS = np.array([1.0, 0.0, 0.0])
+ACROSS_VIEW = np.array([1.0, 0.0, 0.0])
 
 
 # Height along the axis and distance from it [m], then the normal's part along and away from it.
@@ -55,33 +55,37 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
     """The revolution that shows most: about an upright axis, if the object stands, or one that all normals meet."""
     met = meeting_direction(surfels)
     # A ball has all axes: one across the view shows its back.
-    axes = [fit_axis(surfels, UP if free_space.standing else ACROSS)]
+    axes = [fit_axis(surfels, UP if free_space.standing else ACROSS_VIEW)]
     # What nearly stands upright does: the support is known better than any axis.
-    if not free_space.standing or abs(met @ UP) < UPRIGHT:
+    if not free_space.standing or abs(met @ UP) < UPRIGHT_COSINE:
         axes.append(settle_axis(surfels, fit_axis(surfels, met), step))
     found = [revolve(surfels, free_space, axis, step) for axis in axes]
     good = [f for f in found if f is not None]
-    return max(good, key=lambda f: f.share + 4 * f.agree * (1 - f.agree) - WEIGHT * f.wrong) if good else None
+    return (
+        max(good, key=lambda f: f.share + 4 * f.agree * (1 - f.agree) - CONTRADICTION_WEIGHT * f.wrong)
+        if good
+        else None
+    )
 
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
     """The seen profile turned about the axis; rings that the cameras contradict are left out."""
     _, rows = half_plane(surfels, axis)
     fits = turned(rows, step)
-    if fits.sum() < FEWEST:
+    if fits.sum() < MIN_AXIS_POINTS:
         return None
     profile = _profile(rows[fits], step)
     right = perpendicular(axis.direction)
     up = np.cross(axis.direction, right)
-    judged = _ring(profile, axis, right, up, np.full(len(profile), TURNS))
-    row = np.repeat(np.arange(len(profile)), TURNS)
+    judged = _ring(profile, axis, right, up, np.full(len(profile), RING_SAMPLES))
+    row = np.repeat(np.arange(len(profile)), RING_SAMPLES)
     confirmed, wrong = weigh(free_space, judged.points, judged.normals)
-    good = np.bincount(row, wrong) / TURNS < BROKEN
+    good = np.bincount(row, wrong) / RING_SAMPLES < MAX_CONTRADICTED_SHARE
     if good.sum() < 5:
         return None
     weight = profile[:, 1] / profile[good, 1].sum()
     kept = good[row]
-    mean = lambda x: float((x * weight[row] / TURNS)[kept].sum())  # noqa: E731
+    mean = lambda x: float((x * weight[row] / RING_SAMPLES)[kept].sum())  # noqa: E731
     explained = _explained(profile[good], rows[:, :2], step)
     closed = np.vstack([profile[good], *_ends(profile[good], axis, right, up, free_space, step)])
     counts = np.maximum(np.ceil(2 * np.pi * closed[:, 1] / step), 3).astype(int)
@@ -110,11 +114,14 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
             patch = np.column_stack([np.full((n := int(rim[1] / step)), way * end), np.linspace(0.3 * step, rim[1], n)])
             patch = np.column_stack([patch, np.full(n, way), np.zeros(n)])
             beyond = patch[-1:] + np.array([[0.008 * way, 0, 0, 0]])
-            if (weigh(free_space, *_both(_ring(beyond, axis, right, up, np.full(1, TURNS))))[1] > 0.1).mean() < 0.2:
+            if (
+                weigh(free_space, *_both(_ring(beyond, axis, right, up, np.full(1, RING_SAMPLES))))[1] > 0.1
+            ).mean() < 0.2:
                 continue
         if (
             len(patch)
-            and weigh(free_space, *_both(_ring(patch, axis, right, up, np.full(len(patch), TURNS))))[1].mean() < 0.1
+            and weigh(free_space, *_both(_ring(patch, axis, right, up, np.full(len(patch), RING_SAMPLES))))[1].mean()
+            < 0.1
         ):
             found.append(patch)
     return found

@@ -18,10 +18,10 @@ from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.se3 import perpendicular
 
 # Normals that pass the axis by more than this share of their direction are of something else: a handle, a spout.
-ASKEW = 0.3
+MAX_SKEW = 0.3
 # Gauss-Newton steps to settle an axis, points that it takes, and the share of the identity that holds what they leave
 # free: a ball any direction.
-SETTLED, FEWEST, HELD = 6, 30, 1e-3
+GAUSS_NEWTON_STEPS, MIN_AXIS_POINTS, DAMPING = 6, 30, 1e-3
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def half_plane(surfels: Surfels, axis: Axis) -> tuple[Float[np.ndarray, "n 3"], 
 
 def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]:
     """Which points, in the half-plane, may be of a body of revolution: their normals meet the axis."""
-    return (rows[:, 2] ** 2 + rows[:, 3] ** 2 > 1 - ASKEW**2) & (rows[:, 1] > 0.5 * step)
+    return (rows[:, 2] ** 2 + rows[:, 3] ** 2 > 1 - MAX_SKEW**2) & (rows[:, 1] > 0.5 * step)
 
 
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
@@ -94,12 +94,12 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     Gauss-Newton; points far from the profile, a handle, count less and less. The shifts that would go with a tilt are
     not taken: along the line of sight a half seen from one side does not tell its place, and its normals do.
     """
-    for round_ in range(SETTLED):
+    for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
         up = np.cross(axis.direction, right)
         outward, rows = half_plane(surfels, axis)
         fits = turned(rows, step)
-        if fits.sum() < FEWEST:
+        if fits.sum() < MIN_AXIS_POINTS:
             break
         offset = surfels.points[fits] - axis.point
         # How points move, seen from an axis that shifts or tilts.
@@ -139,7 +139,7 @@ def _thinner(
     residual, system = moves[0], moves[1:]
     # In metres at the object's radius, so that shifts and tilts are held alike.
     lever = np.array([1.0, 1.0, *[float(np.median(radius))] * 2])
-    held = np.diag(HELD * len(rows) * lever**2)
+    held = np.diag(DAMPING * len(rows) * lever**2)
     return -np.linalg.solve((system * weight) @ system.T + held, system @ (weight * residual))
 
 

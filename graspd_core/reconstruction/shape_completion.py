@@ -11,20 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graspd_core.pointcloud.free_space import SLACK, FreeSpace, empty_depth
+from graspd_core.config import ReconstructionConfig
+from graspd_core.pointcloud.free_space import FreeSpace, empty_depth
 from graspd_core.reconstruction.extrusion import extrude, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
 from graspd_core.reconstruction.revolution import find_revolution
 from graspd_core.reconstruction.symmetry import find_centre, find_mirrors, image
 
-# A body of revolution accounts for this share of what was seen (the rest is a handle), less so much of its faults.
-WHOLE, FAULTS = 0.8, 5.0
-# Symmetries that are worth less than this, or contradicted by more, are chance.
-WORTH, DOUBTED = 0.5, 0.02
+# Share of a body of revolution's surface that a contradicted share of it takes away.
+FAULT_WEIGHT = 5.0
+# Symmetries of which the cameras contradict more than this share are chance.
+MAX_SYMMETRY_FAULTS = 0.02
 # Two rules' guesses keep this far from each other [m].
-APART = 0.008
-# A surface that is open by no more than this share needs no further guess.
-OPEN = 0.12
+RULE_DISTANCE_M = 0.008
 
 
 @dataclass(frozen=True)
@@ -42,30 +41,33 @@ class Completion:
     openness: float
 
 
-def complete_shape(seen: Surfels, free_space: FreeSpace, step: float) -> Completion:
+def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig) -> Completion:
     """The guess that the evidence favours: of rules that explain what was seen, the one that says most."""
     from scipy.spatial import KDTree
 
     known = join(seen, stand(seen, free_space, step)) if free_space.standing else seen
     missing = openness(known, step)
     turned = find_revolution(seen, free_space, step)
-    if turned is not None and turned.share - FAULTS * turned.wrong > WHOLE:
+    if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > settings.revolution_share:
         guess = plausible(turned.surfels, seen, free_space, step)
         # What a handle hides of itself, and the like, is left to Poisson.
         return Completion("revolution" if _counts(guess, seen) else "", guess, missing)
     methods, guess = [], nothing()
-    if missing < OPEN:
+    if missing < settings.open_share:
         return Completion("", guess, missing)
     if free_space.standing:
         guess = plausible(extrude(seen, free_space, step), seen, free_space, step)
         methods = ["extrusion"] if _counts(guess, seen) else []
     known = join(seen, guess)
-    if openness(join(known, stand(known, free_space, step)) if free_space.standing else known, step) > OPEN:
-        name, raw = _symmetric(seen, free_space)
+    if (
+        openness(join(known, stand(known, free_space, step)) if free_space.standing else known, step)
+        > settings.open_share
+    ):
+        name, raw = _symmetric(seen, free_space, settings.symmetry_worth)
         images = plausible(raw, known, free_space, step)
         if len(guess.points):
             # Where both speak, walls beneath seen outlines are the surer.
-            apart = KDTree(guess.points).query(images.points)[0] > APART
+            apart = KDTree(guess.points).query(images.points)[0] > RULE_DISTANCE_M
             images = take(images, apart)
         methods += [name] if _counts(images, seen) else []
         guess = join(guess, images)
@@ -85,21 +87,21 @@ def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float
     """The guess, thinned, less what the cameras speak against and what lies where the surface is known."""
     from scipy.spatial import KDTree
 
-    guess = take(guess, empty_depth(free_space, guess.points) < SLACK)
+    guess = take(guess, empty_depth(free_space, guess.points) < free_space.slack)
     distance, nearest = KDTree(known.points).query(guess.points)
     alike = (guess.normals * known.normals[nearest]).sum(1) > 0
     return thin(take(guess, distance > np.where(alike, 2.5, 1.2) * step), step)
 
 
-def _symmetric(seen: Surfels, free_space: FreeSpace) -> tuple[str, Surfels]:
+def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str, Surfels]:
     mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
     value = {"mirror": 0.0, "point symmetry": 0.0}
-    if mirrors and mirrors[0].wrong < DOUBTED:
+    if mirrors and mirrors[0].wrong < MAX_SYMMETRY_FAULTS:
         value["mirror"] = mirrors[0].worth
-    if centre.wrong < DOUBTED:
+    if centre.wrong < MAX_SYMMETRY_FAULTS:
         value["point symmetry"] = centre.worth
     best = max(value, key=lambda name: value[name])
-    if value[best] < WORTH:
+    if value[best] < least:
         return "", nothing()
     if best == "point symmetry":
         return best, image(centre, seen)

@@ -18,11 +18,11 @@ from graspd_core.reconstruction.merge_views import Surfels
 from graspd_core.se3 import perpendicular
 
 # Points that a candidate is judged on, closely and at first.
-JUDGED, ROUGHLY = 240, 90
+FINE_SAMPLES, COARSE_SAMPLES = 240, 90
 # What a contradiction weighs against a confirmation.
-WEIGHT = 3.0
+CONTRADICTION_WEIGHT = 3.0
 # Directions of mirror planes that are tried of an object that stands, and of one that does not; places of each.
-UPRIGHT, ALL_ROUND, PLACES = 30, 70, 29
+UPRIGHT_DIRECTIONS, SPHERE_DIRECTIONS, PLANE_OFFSETS = 30, 70, 29
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -69,12 +69,12 @@ def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares
         meets: share of the rim of what was seen that the image goes on from.
         closes: share of the open side that the image turns its own to.
     """
-    return (4 * agree * (1 - agree - wrong) + closes) * (0.3 + meets) - WEIGHT * wrong
+    return (4 * agree * (1 - agree - wrong) + closes) * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
 
 
 def truth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
     """How well a symmetry is proven, useful or not."""
-    return agree * (0.3 + meets) - WEIGHT * wrong
+    return agree * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
 
 
 def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
@@ -118,8 +118,8 @@ def _best_plane(
     reach = (sample.few.points - pivot) @ normals.T
     low, high = reach.min(0), reach.max(0)
     size = float((high - low).max())
-    tried = np.repeat(normals, PLACES, 0)
-    place = (low[:, None] + (high - low)[:, None] * np.linspace(-0.1, 1.1, PLACES)).reshape(-1)
+    tried = np.repeat(normals, PLANE_OFFSETS, 0)
+    place = (low[:, None] + (high - low)[:, None] * np.linspace(-0.1, 1.1, PLANE_OFFSETS)).reshape(-1)
     judged = _rough(sample)
     for finer in (1, 3, 9):
         linear = np.eye(3) - 2 * np.einsum("ki,kj->kij", tried, tried)
@@ -170,12 +170,12 @@ def _sample(surfels: Surfels) -> _Sample:
     distance, near = answer
     aside = np.linalg.norm(surfels.points[near[:, 1:]].mean(1) - surfels.points, axis=1)
     rim = surfels.points[aside > 0.45 * distance[:, 1:].mean(1)]
-    spread = np.random.default_rng(1).permutation(len(rim))[: JUDGED // 3]
-    return _Sample(_some(surfels, JUDGED), rim[spread])
+    spread = np.random.default_rng(1).permutation(len(rim))[: FINE_SAMPLES // 3]
+    return _Sample(_some(surfels, FINE_SAMPLES), rim[spread])
 
 
 def _rough(sample: _Sample) -> _Sample:
-    return _Sample(_some(sample.few, ROUGHLY), sample.rim[: ROUGHLY // 3])
+    return _Sample(_some(sample.few, COARSE_SAMPLES), sample.rim[: COARSE_SAMPLES // 3])
 
 
 def _some(surfels: Surfels, count: int) -> Surfels:
@@ -187,10 +187,10 @@ def _some(surfels: Surfels, count: int) -> Surfels:
 def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
     """Level directions over half a turn, or directions over half a sphere (golden spiral)."""
     if standing:
-        turn = np.pi * np.arange(UPRIGHT) / UPRIGHT
-        return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT)])
-    height = (np.arange(ALL_ROUND) + 0.5) / ALL_ROUND
-    turn = np.pi * (1 + 5**0.5) * np.arange(ALL_ROUND)
+        turn = np.pi * np.arange(UPRIGHT_DIRECTIONS) / UPRIGHT_DIRECTIONS
+        return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT_DIRECTIONS)])
+    height = (np.arange(SPHERE_DIRECTIONS) + 0.5) / SPHERE_DIRECTIONS
+    turn = np.pi * (1 + 5**0.5) * np.arange(SPHERE_DIRECTIONS)
     across = np.sqrt(1 - height**2)
     return np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
 

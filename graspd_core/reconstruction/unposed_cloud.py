@@ -15,13 +15,13 @@ from graspd_core.reconstruction.merge_views import Surfels
 
 # A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
 # this share of exceptions, the cloud is taken to show the object from all round.
-STEEPEST = 4.0
+MAX_RISE_CELLS = 4.0
 LAYERED_SHARE = 0.15
 
 # Neighbours for a normal, and for passing its sense on.
-FITTED, PASSED = 24, 16
+NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
 # Points that are too regular for that are moved by up to this many steps.
-JITTER = 0.02
+JITTER_STEPS = 0.02
 
 
 def is_unposed(view: PointCloud) -> bool:
@@ -39,7 +39,7 @@ def is_unposed(view: PointCloud) -> bool:
     near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
     np.minimum.at(near, line, local[:, 2])
     np.maximum.at(far, line, local[:, 2])
-    return bool((far - near > STEEPEST * cell).mean() > LAYERED_SHARE)
+    return bool((far - near > MAX_RISE_CELLS * cell).mean() > LAYERED_SHARE)
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:
@@ -53,7 +53,7 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points)).voxel_down_sample(step)
     points = np.asarray(cloud.points)
     # The triangulation that passes the sense on fails on points exactly on a sphere, a plane or a line.
-    shaken = points + JITTER * step * np.random.default_rng(0).uniform(-1, 1, points.shape)
+    shaken = points + JITTER_STEPS * step * np.random.default_rng(0).uniform(-1, 1, points.shape)
     for tried in (points, shaken):
         with suppress(RuntimeError):
             return Surfels(points, _normals(tried))
@@ -64,6 +64,6 @@ def _normals(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FITTED))
-    cloud.orient_normals_consistent_tangent_plane(PASSED)
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
+    cloud.orient_normals_consistent_tangent_plane(ORIENTATION_NEIGHBOURS)
     return np.asarray(cloud.normals)

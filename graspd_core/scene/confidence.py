@@ -15,7 +15,7 @@ from torch.nn.functional import grid_sample
 from graspd_core.mesh.sdf import GridSDF
 
 # Cells from the surface within which a node looks for its vertex; every surface has nodes this near.
-_NEAR = 2.0
+_NEAR_SURFACE_CELLS = 2.0
 
 
 def confidence_grid(
@@ -23,7 +23,7 @@ def confidence_grid(
 ) -> Float[Tensor, "x y z"]:
     """The trust of the vertex nearest to each node by the surface; elsewhere, that of the nearest such node."""
     spacing = float(sdf.spacing)
-    near = sdf.field[0].abs().cpu().numpy() < _NEAR * spacing
+    near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
     grid = np.zeros(near.shape)
     grid[near] = confidence[KDTree(vertices).query(nodes)[1]]

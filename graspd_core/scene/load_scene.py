@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from graspd_core.config import SceneConfig
 from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
@@ -31,6 +32,7 @@ def load_scene(
     device: torch.device | str = "cpu",
     target: Target | None = None,
     alone: bool = False,
+    settings: SceneConfig | None = None,
 ) -> Scene:
     """Build the scene of one object.
 
@@ -42,6 +44,7 @@ def load_scene(
         resolution: the distance grid has at most the cube of it in nodes.
         target: which of the things in a cloud is meant.
         alone: a cloud shows the object and nothing else.
+        settings: how a cloud becomes a scene.
 
     Raises:
         MeshError: the mesh cannot be read or used, or a number is out of range.
@@ -55,7 +58,9 @@ def load_scene(
         views = [
             replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
         ]
-        scene = scene_from_views(views, target=target, alone=alone, source=given, device=device, **numbers)
+        scene = scene_from_views(
+            views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
+        )
         return replace(scene, object=replace(scene.object, scale=scale))
     mesh, warnings = _read_mesh(source, scale)
     # A distance grid that is remembered needs no Open3D, but the plan does.

@@ -21,10 +21,10 @@ from graspd_core.scene.far_objects import far_centre, moved_mesh, moved_sdf
 from graspd_core.types import Plane, TriangleMesh
 
 # Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.
-MOST_FACES = 25_000
+MAX_FACES = 25_000
 
 # Mean density of household things [kg/m³], for callers that know no mass: between wood-like solids and hollow ware.
-DENSITY = 300.0
+DEFAULT_DENSITY = 300.0
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def build_scene(
         )
     started = time.perf_counter() if started is None else started
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
-    clean, found = check_mesh(mesh, source, MOST_FACES, scale=scale, dusty=confidence is None)
+    clean, found = check_mesh(mesh, source, MAX_FACES, scale=scale, dusty=confidence is None)
     bodies, gap = bodies_apart(clean) if confidence is None else (1, 0.0)
     if bodies > 1:
         found += (f"{source}: {bodies} bodies, {1000 * gap:.0f} mm apart; they are grasped as one rigid thing",)
@@ -196,7 +196,7 @@ def moved_obstacle(neighbour: Obstacle, offset: Float[np.ndarray, "3"]) -> Obsta
 
 def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:
     volume, center, unit_inertia = mass_properties(mesh)
-    mass = DENSITY * volume if mass is None else mass
+    mass = DEFAULT_DENSITY * volume if mass is None else mass
     return ObjectModel(
         source=source,
         sha256=content_hash(mesh),

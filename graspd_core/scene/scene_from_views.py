@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from graspd_core.config import SegmentationConfig
+from graspd_core.config import SceneConfig
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.reconstruction.reconstruct import reconstruct
 from graspd_core.scene.obstacles import make_obstacles
@@ -21,7 +21,7 @@ def scene_from_views(
     *,
     target: Target | None = None,
     alone: bool = False,
-    settings: SegmentationConfig | None = None,
+    settings: SceneConfig | None = None,
     mass: float | None = 0.1,
     friction: float = 0.6,
     source: str = "cloud",
@@ -34,7 +34,7 @@ def scene_from_views(
         views: what each camera saw [m]; points may be NaN.
         target: which of the things seen is meant; without it, the one nearest the first view's axis.
         alone: the views show the object and nothing else, so that all they show is taken.
-        settings: of the segmentation.
+        settings: of segmentation, reconstruction and obstacles.
         mass: [kg]; None takes 300 kg/m³ times the volume.
         friction: Coulomb coefficient between hand and object.
         source: name of the views, for messages.
@@ -46,9 +46,13 @@ def scene_from_views(
     """
     started = time.perf_counter()
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
-    settings = settings or SegmentationConfig()
-    seen = Segmentation(tuple(views), None, (), ()) if alone else segment(views, target=target, settings=settings)
-    whole = reconstruct(seen.views, support=seen.support)
+    settings = settings or SceneConfig()
+    if alone:
+        seen = Segmentation(tuple(views), None, (), ())
+    else:
+        seen = segment(views, target=target, settings=settings.segmentation)
+    whole = reconstruct(seen.views, support=seen.support, settings=settings.reconstruction)
+    reach = settings.segmentation.obstacle_range
     return build_scene(
         whole.mesh,
         source=source,
@@ -59,6 +63,6 @@ def scene_from_views(
         warnings=seen.warnings + whole.warnings,
         started=started,
         support=seen.support,
-        obstacles=make_obstacles(seen.obstacles, seen.support, whole.mesh, settings.obstacle_range),
+        obstacles=make_obstacles(seen.obstacles, seen.support, whole.mesh, reach, settings.obstacles),
         confidence=whole.confidence,
     )

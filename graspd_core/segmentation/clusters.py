@@ -5,35 +5,36 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-# Of the neighbours that a usual point has, a point of a thing has at least this share: flying pixels, which are spread
-# along their lines of sight between two surfaces, have fewer. The second share is of the weight around a usual point:
-# it tells them where many views have filled the space around an edge with them.
-FEWEST_NEIGHBOURS = 0.3
-LEAST_WEIGHT = 0.04
+from graspd_core.config import SegmentationConfig
+
+# Flying pixels, which are spread along their lines of sight between two surfaces, have less than this share of the
+# weight around a usual point: it tells them where many views have filled the space around an edge with them.
+MIN_WEIGHT_SHARE = 0.04
 # Points are linked over this share of the gap between things; noise takes the rest.
-LINKED = 0.75
+LINK_SHARE_OF_GAP = 0.75
 # Points are dense if their fourth neighbours are so many times nearer than that.
-DENSE = 1.6
+DENSE_SPACING_RATIO = 1.6
 # Sparse ones are linked over this many times the distance to the fourth neighbour: surfaces seen at a small angle have
 # their points far apart along the line of sight.
-SPARSE = 2.5
-# But never over more than this [m]: a few points scattered over a room are no thing.
-LONGEST = 0.05
-SAMPLE = 2000
+SPARSE_LINK_RATIO = 2.5
+SPACING_SAMPLES = 2000
 
 
-def link_length(points: Float[np.ndarray, "n 3"], gap: float) -> float:
-    """Points this near belong together [m]: less than `gap`, unless the points are too sparse."""
+def link_length(points: Float[np.ndarray, "n 3"], settings: SegmentationConfig) -> float:
+    """Points this near belong together [m]: less than the gap, unless the points are too sparse."""
     from scipy.spatial import KDTree
 
     if len(points) < 5:
-        return gap
-    some = points[:: max(1, len(points) // SAMPLE)]
+        return settings.gap
+    some = points[:: max(1, len(points) // SPACING_SAMPLES)]
     spacing = float(np.median(KDTree(points).query(some, k=5)[0][:, -1]))
-    return LINKED * gap if DENSE * spacing <= LINKED * gap else min(SPARSE * spacing, LONGEST)
+    link = LINK_SHARE_OF_GAP * settings.gap
+    return link if DENSE_SPACING_RATIO * spacing <= link else min(SPARSE_LINK_RATIO * spacing, settings.max_link)
 
 
-def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float) -> Int[np.ndarray, "n"]:
+def link_points(
+    points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float, neighbour_share: float
+) -> Int[np.ndarray, "n"]:
     """Clusters of evenly dense points, numbered from the largest; -1: a stray.
 
     As in DBSCAN, only points with enough neighbours carry a cluster on; the others join the nearest that does.
@@ -42,6 +43,7 @@ def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"]
         points: one a voxel [m].
         weight: how well each was seen: full points in its voxel, those that any camera would see taken as equal.
         link: points this near are neighbours [m].
+        neighbour_share: points with a smaller share of the median number of neighbours are strays.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -57,8 +59,8 @@ def link_points(points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"]
         return label
     around = weight + sum(np.bincount(pairs[:, k], weight[pairs[:, 1 - k]], minlength=len(points)) for k in (0, 1))
     usual = degree > 0
-    core = degree >= max(2.0, FEWEST_NEIGHBOURS * float(np.median(degree[usual])))
-    seen = around >= LEAST_WEIGHT * float(np.median(around[usual]))
+    core = degree >= max(2.0, neighbour_share * float(np.median(degree[usual])))
+    seen = around >= MIN_WEIGHT_SHARE * float(np.median(around[usual]))
     core &= seen
     if not core.any():
         return label

@@ -11,25 +11,23 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.types import Plane
 
-RANSAC_TRIALS = 400
-# Within this of a candidate plane while it is looked for, more beyond a metre; the refinement tightens it [m].
-COARSE = 0.01
-# Residuals of a plane gather in the middle of that gate: their median is this share of it at most, and the tolerance
-# they ask for is not much wider. Those of a curved surface fill the gate, and the next, wider one again.
-GATHERED, WIDENED = 0.4, 1.5
-# A point is on the plane within so many standard deviations, and never farther than WIDEST [m].
-DEVIATIONS = 4.0
+# Residuals of a plane gather in the middle of the slab in which it is searched: their median is this share of it at
+# most, and the tolerance they need is not much wider. Those of a curved surface fill the slab, and the next again.
+MAX_MEDIAN_RESIDUAL_SHARE, MAX_GATE_GROWTH = 0.4, 1.5
+# A point is on the plane within so many standard deviations.
+INLIER_DEVIATIONS = 4.0
 # It is fitted to those within so many.
-FITTED = 3.0
-WIDEST = 0.02
+FIT_DEVIATIONS = 3.0
+MAX_PLANES = 4
 # Side of the cells by which a plane's visible part is measured; occlusion and holes of a few cells are bridged [m].
-CELL = 0.01
+RASTER_CELL_M = 0.01
 # Cells of that raster along a side at most; of larger parts the cells are wider.
-MOST_CELLS = 2000
-BRIDGED = 3
+MAX_RASTER_CELLS = 2000
+BRIDGED_CELLS = 3
 
 
 @dataclass(frozen=True)
@@ -41,6 +39,7 @@ class FlatPart:
         axes: two unit vectors in the plane, columns.
         noise: standard deviation of the points from it, over the square of their distance from the camera [1/m].
         least: tolerance where the noise is small [m].
+        most: tolerance where it is large [m].
         inliers: which of the scene's points lie on it.
         sides: length and width of the seen part [m].
         hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`; rows n, c.
@@ -52,6 +51,7 @@ class FlatPart:
     axes: Float[np.ndarray, "3 2"]
     noise: float
     least: float
+    most: float
     inliers: Bool[np.ndarray, "points"]
     sides: tuple[float, float]
     hull: Float[np.ndarray, "edges 3"]
@@ -64,7 +64,7 @@ class FlatPart:
 
     def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """How high a point may be and still belong to the plane, by its distance from the camera [m]."""
-        return np.clip(DEVIATIONS * self.noise * distance**2, self.least, WIDEST)
+        return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
     def beneath(self, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
         """Whether points lie over the seen part, or at most `margin` beside it [m]."""
@@ -76,10 +76,7 @@ def find_planes(
     points: Float[np.ndarray, "n 3"],
     distance: Float[np.ndarray, "n"],
     viewpoints: Float[np.ndarray, "views 3"],
-    *,
-    least: float,
-    smallest: float,
-    most: int = 4,
+    settings: SegmentationConfig,
 ) -> list[FlatPart]:
     """Flat parts in order of their number of points, each point in at most one.
 
@@ -87,27 +84,26 @@ def find_planes(
         points: evenly dense [m].
         distance: of each from its camera [m].
         viewpoints: where the cameras stood [m].
-        least: tolerance where the noise is small [m].
-        smallest: parts whose smaller side is less than this are left alone [m].
+        settings: sizes and tolerances; parts smaller than a support are left alone.
     """
     import open3d as o3d
 
-    left = np.arange(len(points))
+    left, wide = np.arange(len(points)), settings.plane_search_width
     parts: list[FlatPart] = []
-    for _ in range(most):
-        if len(left) < max(50, (smallest / 0.02) ** 2):
+    for _ in range(MAX_PLANES):
+        if len(left) < max(50, (settings.support_size / 0.02) ** 2):
             break
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
         part, close = None, []
         # A step in a table lies within the wide gate, which then takes both levels for one slope.
-        for gate in (COARSE, min(least, 0.5 * COARSE)):
+        for gate in (wide, min(settings.plane_tolerance, 0.5 * wide)):
             # All trials, whatever they find: threads that may stop early give another plane each time.
             o3d.utility.random.seed(0)
-            guess, close = cloud.segment_plane(gate, 3, RANSAC_TRIALS, 1.0)
-            part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), least, gate)
+            guess, close = cloud.segment_plane(gate, 3, settings.ransac_trials, 1.0)
+            part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), gate, settings)
             if part is not None:
                 break
-        if part is not None and part.sides[1] >= smallest:
+        if part is not None and part.sides[1] >= settings.support_size:
             parts.append(part)
             left = left[~part.inliers[left]]
         else:
@@ -121,10 +117,11 @@ def _refine(
     left: Int[np.ndarray, "left"],
     guess: Float[np.ndarray, "4"],
     viewpoint: Float[np.ndarray, "3"],
-    least: float,
     gate: float,
+    settings: SegmentationConfig,
 ) -> FlatPart | None:
     """Weighted least squares over points that the last fit calls near; None where too few are."""
+    least, most = settings.plane_tolerance, settings.max_plane_tolerance
     size = float(np.linalg.norm(guess[:3]))
     if not size > 0:
         return None
@@ -145,20 +142,24 @@ def _refine(
         offset = float(normal @ centre)
         residual = np.abs(near[inlier] @ normal - offset)
         noise = 1.4826 * float(np.median(residual / far[inlier].clip(1e-4)))
-        runs_away = DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > WIDENED
-        if runs_away or (step == 0 and np.median(residual / width[inlier]) > GATHERED):
+        runs_away = INLIER_DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > MAX_GATE_GROWTH
+        if runs_away or (step == 0 and np.median(residual / width[inlier]) > MAX_MEDIAN_RESIDUAL_SHARE):
             return None
         # Tighter than the tolerance: the feet of what stands on it would tilt it.
-        width = np.clip(FITTED * noise * far, 0.25 * least, WIDEST)
+        width = np.clip(FIT_DEVIATIONS * noise * far, 0.25 * least, most)
     if normal @ viewpoint < offset:
         normal, offset = -normal, -offset
     inliers = np.zeros(len(points), dtype=bool)
-    inliers[left] = np.abs(near @ normal - offset) < np.clip(DEVIATIONS * noise * far, least, WIDEST)
-    return _measure(points, inliers, Plane(normal, offset), noise, least)
+    inliers[left] = np.abs(near @ normal - offset) < np.clip(INLIER_DEVIATIONS * noise * far, least, most)
+    return _measure(points, inliers, Plane(normal, offset), noise, settings)
 
 
 def _measure(
-    points: Float[np.ndarray, "n 3"], inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, least: float
+    points: Float[np.ndarray, "n 3"],
+    inliers: Bool[np.ndarray, "n"],
+    plane: Plane,
+    noise: float,
+    settings: SegmentationConfig,
 ) -> FlatPart | None:
     """The largest connected part of the inliers, by a raster in the plane; the others are no inliers."""
     from scipy.ndimage import binary_dilation, label
@@ -168,11 +169,11 @@ def _measure(
     rows = np.flatnonzero(inliers)
     flat = points[rows] @ axes
     low = flat.min(0)
-    width = max(CELL, float(np.ptp(flat, axis=0).max()) / MOST_CELLS)
-    cell = np.round((flat - low) / width).astype(int) + BRIDGED
-    raster = np.zeros(cell.max(0) + 2 * BRIDGED, dtype=bool)
+    width = max(RASTER_CELL_M, float(np.ptp(flat, axis=0).max()) / MAX_RASTER_CELLS)
+    cell = np.round((flat - low) / width).astype(int) + BRIDGED_CELLS
+    raster = np.zeros(cell.max(0) + 2 * BRIDGED_CELLS, dtype=bool)
     raster[tuple(cell.T)] = True
-    names, _ = label(binary_dilation(raster, iterations=BRIDGED))  # pyright: ignore[reportGeneralTypeIssues]
+    names, _ = label(binary_dilation(raster, iterations=BRIDGED_CELLS))  # pyright: ignore[reportGeneralTypeIssues]
     name = names[tuple(cell.T)]
     largest = name == np.bincount(name)[1:].argmax() + 1
     flat = flat[largest]
@@ -186,6 +187,6 @@ def _measure(
     sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
     area = float(hull.volume)
     seen = len(np.unique(packed_rows(cell[largest]))) * width**2
-    return FlatPart(
-        plane, axes, noise, least, kept, (float(sides.max()), float(sides.min())), hull.equations, area, seen / area
-    )
+    least, most = settings.plane_tolerance, settings.max_plane_tolerance
+    length, width = float(sides.max()), float(sides.min())
+    return FlatPart(plane, axes, noise, least, most, kept, (length, width), hull.equations, area, seen / area)

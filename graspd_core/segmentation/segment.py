@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.image_border import reaches_image_border
-from graspd_core.pointcloud.point_cloud import FEWEST_POINTS, PointCloud
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud
 from graspd_core.pointcloud.voxel_downsample import VoxelScene, voxel_downsample
 from graspd_core.segmentation.clusters import extent, link_length, link_points, renumber
 from graspd_core.segmentation.occlusion_merge import merge_occluded
@@ -21,7 +21,7 @@ from graspd_core.segmentation.target_selection import Target, check_target, seen
 from graspd_core.types import Plane
 
 # Scenes nearer than this to their cameras are in another unit than metres [m].
-CLOSEST = 0.02
+MIN_SCENE_DISTANCE_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -60,20 +60,18 @@ def segment(
     scene = voxel_downsample(views, settings)
     check_target(target, views)
     eyes = np.array([view.viewpoint for view in views], dtype=float)
-    parts = find_planes(
-        scene.mean, scene.mean_distance, eyes, least=settings.plane_tolerance, smallest=settings.support_size
-    )
+    parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
     ground = find_ground(scene, parts, eyes, settings)
     label = _things(scene, ground, eyes, settings)
     free = _candidates(scene, label, ground, settings)
     marked = target.box is not None or target.mask is not None
     if not free and not (marked and label.max(initial=-1) >= 0):
         raise NoObjectError(_nothing(scene, label, ground, settings))
-    chosen = select_target(scene, label, free, target, views, reach=settings.target_reach)
+    chosen = select_target(scene, label, free, target, views, settings)
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found)
-    if total < FEWEST_POINTS:
-        raise CloudError(f"cloud: only {total} points show the object; at least {FEWEST_POINTS} are needed")
+    if total < MIN_POINTS:
+        raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     support = None if ground.support is None else ground.support.plane
     obstacles = _obstacles(scene, label, chosen, ground, settings)
     return Segmentation(found, support, obstacles, _doubts(scene, eyes, chosen, ground, bool(obstacles), settings))
@@ -84,15 +82,15 @@ def _things(
 ) -> Int[np.ndarray, "voxels"]:
     """The thing that each voxel is part of, numbered from the largest; -1: background or noise."""
     points = scene.mean[ground.left]
-    link = link_length(points, settings.gap)
-    label = link_points(points, scene.weight[ground.left], link)
+    link = link_length(points, settings)
+    label = link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
     label = merge_occluded(
         points,
         scene.mean_distance[ground.left],
         label,
         eyes,
         link=link,
-        largest=settings.largest_object,
+        settings=settings,
         support=ground.support,
     )
     label = voxels_of(label, ground.left)
@@ -181,7 +179,7 @@ def _doubts(
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
         part = scene.of_view(k)
-        if reaches_image_border(scene.points[part], eyes[k], chosen[scene.voxel[part]]):
+        if reaches_image_border(scene.points[part], eyes[k], chosen[scene.voxel[part]], settings.border_width):
             doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
@@ -211,7 +209,7 @@ def _nothing(scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground
         near = float(np.median(scene.mean_distance))
         told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
         unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
-        return told + unit if near < CLOSEST else told
+        return told + unit if near < MIN_SCENE_DISTANCE_M else told
     part = flat[0]
     away = float(np.median(scene.mean_distance[part.inliers]))
     return (

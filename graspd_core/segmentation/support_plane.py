@@ -18,23 +18,19 @@ from graspd_core.pointcloud.voxel_downsample import VoxelScene
 from graspd_core.segmentation.clusters import extent, link_length, link_points
 from graspd_core.segmentation.planes import FlatPart
 
-# A support's area is at least so many times that of the outline of what stands on it.
-ROOMIER = 2.0
 # Share of its width by which the lowest seen point of a thing may be above its support.
-HIDDEN = 0.5
+HIDDEN_HEIGHT_SHARE = 0.5
 # Less of a plane's hull seen than this share, it is a slice through several things.
-FILLED = 0.3
+MIN_SEEN_SHARE = 0.3
 # Points down to so many tolerances below a part, as many as this share of its own, are a body's other faces.
-BAND, FALLING = 4.0, 0.25
-# A part goes on so far beyond what was seen of it [m].
-BESIDE = 0.05
+EDGE_BAND_TOLERANCES, EDGE_BAND_SHARE = 4.0, 0.25
 # A point is on a flat part, and not where the part's plane cuts through a thing, if of the points within so many
 # tolerances at least this share is on the plane too: on a wall that it cuts squarely, four in ten are.
-AROUND, ON_PLANE = 3.0, 0.6
+NEIGHBOURHOOD_TOLERANCES, ON_PLANE_SHARE = 3.0, 0.6
 # Of so many points around it is asked; where there are more, as noise makes it wide, some of them stand for all.
-ASKED = 50
+NEIGHBOUR_SAMPLES = 50
 # Beyond so many clusters the rest is noise.
-MOST_THINGS = 20
+MAX_CLUSTERS = 20
 
 
 @dataclass(frozen=True)
@@ -56,13 +52,14 @@ def find_ground(
     scene: VoxelScene, parts: list[FlatPart], viewpoints: Float[np.ndarray, "views 3"], settings: SegmentationConfig
 ) -> Ground:
     """Sort the flat parts."""
-    parts = [part for part in parts if part.filled > FILLED and not _falls_off(scene, part)]
+    margin = settings.support_margin
+    parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
     # As they are asked for: of a table alone in view, which is the support, never.
     known: dict[int, Bool[np.ndarray, "voxels"]] = {}
 
     def covered(others: Sequence[FlatPart]) -> list[Bool[np.ndarray, "voxels"]]:
-        known.update({id(part): _covered(scene, part) for part in others if id(part) not in known})
+        known.update({id(part): _covered(scene, part, margin) for part in others if id(part) not in known})
         return [known[id(part)] for part in others]
 
     best, most = None, (0, 0)
@@ -89,35 +86,35 @@ def _left(
     return left
 
 
-def _covered(scene: VoxelScene, part: FlatPart) -> Bool[np.ndarray, "voxels"]:
+def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Bool[np.ndarray, "voxels"]:
     """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
     from scipy.spatial import KDTree
 
     height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
-    band = np.flatnonzero(height <= (1 + AROUND) * tolerance.max())
-    band = band[part.beneath(scene.mean[band], 2 * BESIDE)]
-    on = band[(height[band] <= tolerance[band]) & part.beneath(scene.mean[band], BESIDE)]
+    band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
+    band = band[part.beneath(scene.mean[band], 2 * margin)]
+    on = band[(height[band] <= tolerance[band]) & part.beneath(scene.mean[band], margin)]
     if len(on) == 0:
         return np.zeros(len(scene.mean), dtype=bool)
-    reach = AROUND * tolerance[on]
+    reach = NEIGHBOURHOOD_TOLERANCES * tolerance[on]
     # A flat part has so many voxels within reach.
-    share = ASKED * scene.size**2 / (np.pi * np.median(reach) ** 2)
+    share = NEIGHBOUR_SAMPLES * scene.size**2 / (np.pi * np.median(reach) ** 2)
     band = band[np.random.default_rng(0).random(len(band)) < share]
     around, alike = (
         KDTree(scene.mean[rows]).query_ball_point(scene.mean[on], r=reach, return_length=True)
         for rows in (band, np.intersect1d(band, on))
     )
     covered = np.zeros(len(scene.mean), dtype=bool)
-    covered[on[alike >= ON_PLANE * around]] = True
+    covered[on[alike >= ON_PLANE_SHARE * around]] = True
     return covered
 
 
-def _falls_off(scene: VoxelScene, part: FlatPart) -> bool:
+def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
     """Whether the surface goes on downwards from the part's edge: a face of a body, or a flat spot on a curved one."""
     height, tolerance = part.height(scene.mean), part.tolerance(scene.mean_distance)
-    below = (height < -tolerance) & (height > -BAND * tolerance)
-    below[below] = part.beneath(scene.mean[below], BESIDE)
-    return bool(below.sum() > FALLING * part.inliers.sum())
+    below = (height < -tolerance) & (height > -EDGE_BAND_TOLERANCES * tolerance)
+    below[below] = part.beneath(scene.mean[below], margin)
+    return bool(below.sum() > EDGE_BAND_SHARE * part.inliers.sum())
 
 
 def _standing(
@@ -125,9 +122,9 @@ def _standing(
 ) -> tuple[int, int]:
     """How many voxels belong to things that touch that part, and to things that may stand on it."""
     points, distance = scene.mean[left], scene.mean_distance[left]
-    label = link_points(points, scene.weight[left], link_length(points, settings.gap))
+    label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0
-    for k in range(min(int(label.max(initial=-1)) + 1, MOST_THINGS)):
+    for k in range(min(int(label.max(initial=-1)) + 1, MAX_CLUSTERS)):
         rows = np.flatnonzero(label == k)
         if stands_on(part, points[rows], distance[rows], settings):
             standing += len(rows)
@@ -143,11 +140,11 @@ def stands_on(
         return False
     flat = thing @ part.axes
     # From above, a round body hides as much of its height as half its width.
-    hidden = HIDDEN * float(np.ptp(flat, axis=0).max())
+    hidden = HIDDEN_HEIGHT_SHARE * float(np.ptp(flat, axis=0).max())
     if _clearance(part, thing, distance) > max(settings.contact, hidden):
         return False
     over = part.beneath(thing, settings.gap).mean() >= 0.5
-    return bool(over) and part.area >= ROOMIER * _outline_area(flat)
+    return bool(over) and part.area >= settings.support_area_ratio * _outline_area(flat)
 
 
 def _clearance(part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"]) -> float:

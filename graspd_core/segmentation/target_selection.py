@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.pointcloud.voxel_downsample import VoxelScene
 
-# A thing of which a box or mask covers this share is meant as a whole; of less, the part that is covered.
-WHOLE = 0.8
 # Errors list so many things.
-LISTED = 4
+MAX_LISTED_THINGS = 4
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,7 @@ def select_target(
     free: Sequence[int],
     target: Target,
     views: Sequence[PointCloud],
-    *,
-    reach: float,
+    settings: SegmentationConfig,
 ) -> Bool[np.ndarray, "voxels"]:
     """The voxels of the object.
 
@@ -75,14 +73,14 @@ def select_target(
         free: the things to choose from if no target says which.
         target: checked.
         views: as given.
-        reach: a target point is at most this far from its thing [m].
+        settings: how near a point, and how much of a thing a box or mask, must be.
 
     Raises:
         NoObjectError: nothing where the target says; it lists the things there are.
     """
     many = int(label.max(initial=-1)) + 1
     if target.point is not None:
-        return label == _nearest(scene, label, many, target.point, reach)
+        return label == _nearest(scene, label, many, target.point, settings.target_reach)
     if target.box is not None:
         low, high = np.minimum(*target.box) - scene.size, np.maximum(*target.box) + scene.size
         meant = np.asarray(((scene.mean >= low) & (scene.mean <= high)).all(1))
@@ -91,9 +89,10 @@ def select_target(
             raise NoObjectError(
                 f"target: nothing in the box from {_place(low)} to {_place(high)}; {seen(scene, label)}"
             )
-        return _covered(label, meant, [int(inside.argmax())], inside / np.bincount(label[label >= 0], minlength=many))
+        share = inside / np.bincount(label[label >= 0], minlength=many)
+        return _covered(label, meant, [int(inside.argmax())], share, settings.target_share)
     if target.mask is not None:
-        return _masked(scene, label, many, target.mask)
+        return _masked(scene, label, many, target.mask, settings.target_share)
     return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
 
 
@@ -102,7 +101,7 @@ def seen(scene: VoxelScene, label: Int[np.ndarray, "voxels"]) -> str:
     many = int(label.max(initial=-1)) + 1
     if many == 0:
         return "nothing stands anywhere in the scene"
-    places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, LISTED))]
+    places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, MAX_LISTED_THINGS))]
     told = f"{many} things are seen, the largest" if many > 1 else "one thing is seen,"
     return f"{told} about {', '.join(places)} m"
 
@@ -119,7 +118,7 @@ def _nearest(
 
 
 def _masked(
-    scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, mask: Bool[np.ndarray, "points"]
+    scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, mask: Bool[np.ndarray, "points"], least: float
 ) -> Bool[np.ndarray, "voxels"]:
     """A mask may cover several things, pieces of one that others hide in part; a few points of it may miss."""
     of_first = scene.voxel[scene.of_view(0)]
@@ -131,7 +130,7 @@ def _masked(
     meant = np.zeros(len(label), dtype=bool)
     meant[masked] = True
     main = int(covered.argmax())
-    return _covered(label, meant, [main, *(k for k in range(many) if k != main and share[k] >= 0.5)], share)
+    return _covered(label, meant, [main, *(k for k in range(many) if k != main and share[k] >= 0.5)], share, least)
 
 
 def _covered(
@@ -139,9 +138,10 @@ def _covered(
     meant: Bool[np.ndarray, "voxels"],
     things: list[int],
     share: Float[np.ndarray, "things"],
+    least: float,
 ) -> Bool[np.ndarray, "voxels"]:
-    """Things that are covered nearly all, and the covered part of the others."""
-    whole = [k for k in things if share[k] >= WHOLE]
+    """Things of which at least that share is covered, and the covered part of the others."""
+    whole = [k for k in things if share[k] >= least]
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 
 

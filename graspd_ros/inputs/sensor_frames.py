@@ -12,6 +12,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core import PointCloud, Scene, Target, cloud_from_depth, run_isolated, scene_from_views, transform_cloud
 from graspd_core.bags.messages import points_from_message
+from graspd_core.config import load_scene_config
 from graspd_ros.inputs.depth_stream import frame_of
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
@@ -110,12 +111,17 @@ class Views:
 def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None, resolution: int
 ) -> Scene:
-    """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m]."""
+    """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m].
+
+    Raises:
+        GraspdError: the clouds show no usable object, or the file of the settings has changed and cannot be used.
+    """
     return run_isolated(
         scene_from_views,
         views,
         target=None if target is None else Target(point=target),
         alone=not settings.segment,
+        settings=load_scene_config(settings.scene_config) if settings.scene_config else None,
         mass=settings.mass,
         friction=settings.friction,
         resolution=resolution,

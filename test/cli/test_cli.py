@@ -147,6 +147,19 @@ def test_a_cloud_is_reconstructed_to_a_mesh_file(tmp_path: Path, capsys: pytest.
     assert "none.npy" in the_line(capsys)
 
 
+def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    np.save(tmp_path / "ball.npy", surface_samples(make_shape("sphere"), 2000, 0)[0])
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("reconstruction: {max_faces: 300}")
+    command = ["reconstruct", str(tmp_path / "ball.npy"), "--out", str(tmp_path / "ball.ply"), "--scene", str(scene)]
+    assert main(command) == EXIT_OK
+    assert int(capsys.readouterr().out.split(": ")[1].split()[0]) <= 300
+    scene.write_text("reconstruction: {most_faces: 300}")
+    for bad in (command, ["synthesize", str(tmp_path / "ball.npy"), "--scene", str(scene)]):
+        assert main(bad) == EXIT_BAD_INPUT
+        assert "scene.yaml.reconstruction: unknown key 'most_faces'; valid keys: fit_distance" in the_line(capsys)
+
+
 def test_a_run_that_ends_with_too_few_says_so(capsys: pytest.CaptureFixture[str]):
     assert main(["synthesize", "shape:box", "-n", "2", "--preset", "fast", "--deadline", "0.01"]) == EXIT_TOO_FEW
     assert "0 of 2 grasps (verified, 0 tried): the deadline passed" in capsys.readouterr().out

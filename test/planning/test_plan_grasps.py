@@ -203,7 +203,7 @@ def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkey
     release = threading.Event()
     # They come only once the run has ended; who waited for them would wait for ever.
     monkeypatch.setattr(trials, "object_parts", lambda _: release.wait())
-    short = replace(load_preset("fast").closed_form, explore_steps=3, refine_steps=3, polish_steps=3)
+    short = replace(load_preset("fast").settings, explore_steps=3, refine_steps=3, polish_steps=3)
     try:
         late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=2.0)
     finally:

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from graspd_core.config import SegmentationConfig
 from graspd_core.pointcloud.image_border import reaches_image_border
 
 EYE = np.array([0.0, 0.0, 1.0])
+WIDTH = SegmentationConfig().border_width
 
 
 def picture(rows: int = 120) -> np.ndarray:
@@ -18,14 +20,14 @@ def picture(rows: int = 120) -> np.ndarray:
 def test_what_lies_on_the_border_reaches_it(middle: tuple[float, float], reaches: bool):
     points = picture()
     mine = np.hypot(points[:, 0] - middle[0], points[:, 1] - middle[1]) < 0.05
-    assert reaches_image_border(points, EYE, mine) is reaches
+    assert reaches_image_border(points, EYE, mine, WIDTH) is reaches
 
 
 def test_what_makes_the_outline_alone_does_not():
     points = picture()
     out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
     both = np.concatenate([points, out])
-    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points))
+    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
 
 
 def test_what_stands_out_over_the_end_of_the_table_does_not():
@@ -33,9 +35,9 @@ def test_what_stands_out_over_the_end_of_the_table_does_not():
     points = picture(rows=300)
     out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
     both = np.concatenate([points, out])
-    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points))
+    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
 
 
 def test_nothing_reaches_nothing():
-    assert not reaches_image_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool))
-    assert not reaches_image_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool))
+    assert not reaches_image_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool), WIDTH)
+    assert not reaches_image_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool), WIDTH)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_distance import inside, make_distance_query, unsigned_distance
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
@@ -16,7 +17,7 @@ from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.depth_image import cloud_from_depth
 from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.reconstruct import MOST_FACES, Reconstruction, reconstruct
+from graspd_core.reconstruction.reconstruct import Reconstruction, reconstruct
 from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
 from graspd_core.types import Plane, TriangleMesh
 
@@ -56,7 +57,7 @@ def test_one_view_gives_a_closed_sane_solid(name):
     scene, views = seen(name)
     whole = made(name)
     assert is_closed(whole.mesh)
-    assert len(whole.mesh.faces) <= MOST_FACES
+    assert len(whole.mesh.faces) <= ReconstructionConfig().max_faces
     assert whole.method.startswith("poisson")
     assert whole.mesh.vertices[:, 2].min() > -0.001, "nothing below the table"
     assert np.ptp(whole.mesh.vertices, axis=0).max() < 1.15 * np.ptp(scene.truth.vertices, axis=0).max()

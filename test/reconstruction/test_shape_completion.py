@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_core.config import ReconstructionConfig
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import BOX_HALF, CYLINDER_HALF, CYLINDER_RADIUS, SPHERE_RADIUS, make_shape
 from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths, weigh
@@ -134,7 +135,7 @@ def test_a_ball_has_no_base_and_is_not_extruded():
 
 @pytest.mark.parametrize(("view", "method"), [(BOX, "extrusion"), (CYLINDER, "revolution"), (BALL, "revolution")])
 def test_the_evidence_chooses(view, method):
-    guess = complete_shape(*looked_at(view))
+    guess = complete_shape(*looked_at(view), ReconstructionConfig())
     assert method in guess.method
     free_space = looked_at(view)[1]
     assert empty_depth(free_space, guess.surfels.points).max() < 0.004

@@ -8,13 +8,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_core.config import ObstacleConfig
 from graspd_core.mesh.mesh_files import mass_properties
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.obstacles import PADDING, make_obstacles, padded_hull
+from graspd_core.scene.obstacles import make_obstacles, padded_hull
 from graspd_core.types import Plane
 
 TARGET = make_shape("box")
+PADDING = ObstacleConfig().padding
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), -0.045)
 
 
@@ -30,7 +32,7 @@ def test_a_face_is_carried_down_to_the_table_and_stays_thin():
     # The skin reaches as far along every axis.
     assert low == pytest.approx([0.15 - PADDING, -0.05 - PADDING, -0.045 - PADDING])
     assert high == pytest.approx([0.15 + PADDING, 0.05 + PADDING, 0.1 + PADDING])
-    floating = padded_hull(face(0.15, 0.0), None)
+    floating = padded_hull(face(0.15, 0.0), None, PADDING)
     assert floating.vertices[:, 2].min() == pytest.approx(-PADDING)
 
 
@@ -77,7 +79,7 @@ def test_every_seen_point_and_its_shadow_lie_within(seed: int, flat: bool):
     if flat:
         points[:, 0] = 0.1
     support = Plane(normal, float((points @ normal).min()) - 0.03)
-    hull = padded_hull(points, support)
+    hull = padded_hull(points, support, PADDING)
     a, b, c = hull.vertices[hull.faces].transpose(1, 0, 2)
     outward = np.cross(b - a, c - a)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.segmentation.clusters import extent, link_length, link_points, renumber
@@ -27,7 +28,7 @@ def test_a_plane_is_found_however_it_is_turned(seed, noise):
     rng = np.random.default_rng(seed)
     points, distance = sheet(rng, noise)
     turn = Rotation.random(rng=rng).as_matrix()
-    (part,) = find_planes(points @ turn.T, distance, EYE, least=0.004, smallest=0.1)
+    (part,) = find_planes(points @ turn.T, distance, EYE, SegmentationConfig())
     # Weighted least squares over thousands of points: the tilt is far below noise over size.
     assert part.plane.normal @ turn == pytest.approx([0, 0, 1], abs=2e-3)
     assert part.plane.offset == pytest.approx(-0.4, abs=1e-3)
@@ -40,7 +41,7 @@ def test_a_plane_is_found_however_it_is_turned(seed, noise):
 
 def test_tolerance_grows_with_distance_within_bounds():
     points, distance = sheet(np.random.default_rng(0), 2e-3)
-    (part,) = find_planes(points, distance, EYE, least=0.004, smallest=0.1)
+    (part,) = find_planes(points, distance, EYE, SegmentationConfig())
     near, far, beyond = part.tolerance(np.array([0.3, 1.3, 9.0]))
     assert near == 0.004
     assert far == pytest.approx(4 * 2e-3 * 1.3**2, rel=0.15)
@@ -54,7 +55,7 @@ def test_parts_a_kilometre_apart_take_no_memory():
     rng = np.random.default_rng(0)
     table, _ = sheet(rng, 0.0)
     points = np.vstack([table, table[:2000] + np.array([1000.0, 1000.0, 0.0])])
-    (part, *_) = find_planes(points, np.linalg.norm(points, axis=1), EYE, least=0.004, smallest=0.1)
+    (part, *_) = find_planes(points, np.linalg.norm(points, axis=1), EYE, SegmentationConfig())
     # The two lie in one plane, 10^10 cells of a centimetre about both: the larger is the part.
     assert part.inliers[: len(table)].all()
     assert not part.inliers[len(table) :].any()
@@ -62,8 +63,8 @@ def test_parts_a_kilometre_apart_take_no_memory():
 
 def test_points_scattered_over_a_room_are_not_linked():
     points = np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3))
-    assert link_length(points, 0.008) == 0.05
-    assert link_length(points / 100, 0.008) < 0.05
+    assert link_length(points, SegmentationConfig()) == 0.05
+    assert link_length(points / 100, SegmentationConfig()) < 0.05
 
 
 def test_two_planes_are_two_parts():
@@ -71,7 +72,7 @@ def test_two_planes_are_two_parts():
     table, _ = sheet(rng, 0.0)
     wall = np.column_stack([np.full(4000, 1.4), rng.uniform(-0.3, 0.3, 4000), rng.uniform(-0.39, 0.1, 4000)])
     points = np.vstack([table, wall])
-    parts = find_planes(points, np.linalg.norm(points, axis=1), EYE, least=0.004, smallest=0.1)
+    parts = find_planes(points, np.linalg.norm(points, axis=1), EYE, SegmentationConfig())
     assert [part.plane.normal.round(2).tolist() for part in parts] == [[0, 0, 1], [-1, 0, 0]]
     assert not (parts[0].inliers & parts[1].inliers).any()
 
@@ -79,7 +80,7 @@ def test_two_planes_are_two_parts():
 @pytest.mark.parametrize("shape", ["sphere", "bowl", "torus", "bottle", "mug"])
 def test_small_and_curved_things_hold_no_plane(shape):
     points = surface_samples(make_shape(shape), 6000, 0)[0] - [0, 0, 0.6]
-    assert find_planes(points, np.linalg.norm(points, axis=1), EYE, least=0.004, smallest=0.1) == []
+    assert find_planes(points, np.linalg.norm(points, axis=1), EYE, SegmentationConfig()) == []
 
 
 def test_clusters_are_numbered_from_the_largest_and_strays_belong_to_none():
@@ -88,18 +89,18 @@ def test_clusters_are_numbered_from_the_largest_and_strays_belong_to_none():
     small = flat[flat[:, 0] < 0.02] + [0.08, 0, 0]
     stray = np.array([[0.03, 0.03, 0.1], [0.3, 0.0, 0.0]])
     points = np.vstack([small, stray, flat])
-    label = link_points(points, np.ones(len(points)), link_length(points, 0.008))
+    label = link_points(points, np.ones(len(points)), link_length(points, SegmentationConfig()), 0.3)
     assert (label[: len(small)] == 1).all()
     assert (label[len(small) : len(small) + 2] == -1).all()
     assert (label[len(small) + 2 :] == 0).all()
     # The same place, seen a hundred times less than the rest, is noise.
     weight = np.where(np.arange(len(points)) < len(small), 0.01, 1.0)
-    assert (link_points(points, weight, 0.006)[: len(small)] == -1).all()
+    assert (link_points(points, weight, 0.006, 0.3)[: len(small)] == -1).all()
 
 
 def test_clusters_of_nothing():
-    assert link_points(np.zeros((0, 3)), np.zeros(0), 0.01).tolist() == []
-    assert link_points(np.eye(3), np.ones(3), 0.01).tolist() == [-1, -1, -1]
+    assert link_points(np.zeros((0, 3)), np.zeros(0), 0.01, 0.3).tolist() == []
+    assert link_points(np.eye(3), np.ones(3), 0.01, 0.3).tolist() == [-1, -1, -1]
     assert renumber(np.array([4, 2, 2, -1])).tolist() == [1, 0, 0, -1]
 
 
@@ -118,5 +119,5 @@ def test_the_same_points_give_the_same_planes_every_time():
     table = np.column_stack([rng.uniform(-0.5, 0.5, (1500, 2)), rng.normal(0.0, 0.006, 1500)])
     points = np.vstack([table, rng.uniform(-0.5, 0.5, (3000, 3)) * [1, 1, 0.2]])
     away, eye = np.full(len(points), 1.5), np.array([[0.0, 0.0, 1.5]])
-    found = [find_planes(points, away, eye, least=0.004, smallest=0.1) for _ in range(8)]
+    found = [find_planes(points, away, eye, SegmentationConfig()) for _ in range(8)]
     assert len({tuple(part.plane.offset for part in parts) for parts in found}) == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from graspd_core.bench.stress.awkward_scenes import beside_a_step, half_out_of_view, zero_filled
-from graspd_core.config import SegmentationConfig
+from graspd_core.config import ReconstructionConfig, SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.point_cloud import PointCloud, measured
@@ -70,7 +70,7 @@ def test_an_object_alone_among_zeros_is_cleaned_as_without_them():
     view = view_of_box()
     mine = PointCloud(view.points[view.points[:, 2] > 0.005], view.viewpoint)
     filled = PointCloud(np.vstack([mine.points, np.zeros((len(mine.points), 3))]), view.viewpoint)
-    (bare,), (among,) = _clean([mine]), _clean([filled])
+    (bare,), (among,) = (_clean([view], ReconstructionConfig()) for view in (mine, filled))
     assert np.array_equal(among.points, bare.points)
 
 
@@ -105,9 +105,10 @@ def test_pieces_are_joined_no_further_than_the_largest_object():
     bars = [np.column_stack([start + step, 0 * step, 0 * step]) for start in (0.0, 0.104, 0.208)]
     points, label = np.vstack(bars), np.repeat([0, 1, 2], len(step))
     eyes, distance = np.array([[0.15, 0.0, 0.6]]), np.full(len(points), 0.6)
-    settings = {"link": 0.006, "support": None}
-    assert merge_occluded(points, distance, label, eyes, largest=0.4, **settings).max() == 0
-    assert merge_occluded(points, distance, label, eyes, largest=0.25, **settings).max() == 1
+    for largest, last in ((0.4, 0), (0.25, 1)):
+        settings = SegmentationConfig(largest_object=largest)
+        joined = merge_occluded(points, distance, label, eyes, link=0.006, settings=settings, support=None)
+        assert joined.max() == last
 
 
 def test_where_noise_makes_the_look_around_wide_some_points_stand_for_all(monkeypatch: pytest.MonkeyPatch):
@@ -119,10 +120,10 @@ def test_where_noise_makes_the_look_around_wide_some_points_stand_for_all(monkey
     rays = points - eye
     points += rays * rng.normal(0, 0.003, (len(points), 1)) / np.linalg.norm(rays, axis=1)[:, None]
     scene = voxel_downsample([PointCloud(points, eye)], SegmentationConfig())
-    part = find_planes(scene.mean, scene.mean_distance, eye[None], least=0.004, smallest=0.1)[0]
-    some = support._covered(scene, part)
-    monkeypatch.setattr(support, "ASKED", 1e9)
-    every = support._covered(scene, part)
+    part = find_planes(scene.mean, scene.mean_distance, eye[None], SegmentationConfig())[0]
+    some = support._covered(scene, part, 0.05)
+    monkeypatch.setattr(support, "NEIGHBOUR_SAMPLES", 1e9)
+    every = support._covered(scene, part, 0.05)
     assert part.tolerance(scene.mean_distance).max() > 0.012
     assert (some == every).mean() > 0.99
     assert some[part.inliers].mean() == pytest.approx(every[part.inliers].mean(), abs=0.002)
