@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "methods": UP_TO_CONTACT,
     "metrics": UP_TO_CONTACT,
     "trials": UP_TO_CONTACT,
-    "formats": BASE | {"scene", "hands"},
+    "formats": BASE | {"scene", "hands", "metrics"},
     "planning": ROOMS,
     "__init__": ROOMS | {"planning"},
     "bench": ROOMS | {"planning", "__init__"},
