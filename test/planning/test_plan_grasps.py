@@ -204,7 +204,7 @@ def test_what_held_in_an_earlier_round_stays_told(scene, hand):
 
 def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
-    monkeypatch.setattr(trials, "object_parts", lambda _: release.wait(30))
+    monkeypatch.setattr(verification, "object_parts", lambda _: release.wait(30))
     begun = time.perf_counter()
     late = plan_grasps(scene, hand, count=1, preset="fast", deadline=3.0)
     assert time.perf_counter() - begun < 3.0 + LATE
