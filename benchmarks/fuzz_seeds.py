@@ -69,18 +69,20 @@ _GRASP: dict[str, Any] = {
     **{"quaternion_wxyz": [1.0, 0.0, 0.0, 0.0], "joint_positions": [0.1, 0.2], "pregrasp_joint_positions": [0, 0]},
     **{"squeeze_joint_positions": [0.3, 0.4], "pregrasp_position": [0, 0, 1], "pregrasp_quaternion_wxyz": [0, 0, 1, 0]},
     "contacts": [{"link": "tip", "position": [0.0, 0.0, 0.1], "normal": [0.0, 0.0, 1.0]}],
-    "metrics": {
-        "epsilon": 0.1,
-        "hold": {"max_displacement_cm": 0.1, "max_rotation_deg": 1.0},
-        "lift": {"max_displacement_cm": None, "max_rotation_deg": 1.0, "reach_through_mm": 0.0},
-    },
+    "metrics": {"epsilon": 0.1, "penetration_mm": None},
+    "trials": [
+        {"name": "hold", "passed": True, "displacement": 0.001, "rotation": 0.25, "reason": ""},
+        {"name": "lift", "passed": True, "displacement": None, "rotation": 0.02, "reason": ""},
+    ],
 }
+_TRIED = {"max_displacement_cm": None, "max_rotation_deg": 1.0, "reach_through_mm": 0.0}
+_OLD_GRASP = {**_GRASP, "verdict": "failed", "metrics": {"epsilon": 0.1, "sd_cm": None, "hold": _TRIED, "lift": _TRIED}}
 DOCUMENT: dict[str, Any] = {
-    **{"format": "graspd/grasps", "version": 1, "units": "m, rad, N"},
+    **{"format": "graspd/grasps", "version": 2, "units": "m, rad, N"},
     "hand": {"name": "g", "joint_names": ["one", "two"], "mimic": [{"joint": "two", "of": "one"}]},
-    "grasps": [_GRASP, {**_GRASP, "verdict": "failed", "metrics": {"hold": None}}],
+    "grasps": [_GRASP, {**_GRASP, "verdict": "unverified", "trials": []}],
 }
-DOCUMENTS = [json.dumps(DOCUMENT).encode()]
+DOCUMENTS = [json.dumps(DOCUMENT).encode(), json.dumps({**DOCUMENT, "version": 1, "grasps": [_OLD_GRASP]}).encode()]
 DAES = [
     b"""<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"><asset><unit meter="0.01"/>
 </asset><library_geometries><geometry id="g"><mesh><source id="p"><float_array count="15">0 0 0 2 0 0 2 2 0 0 2 0 0 0 3

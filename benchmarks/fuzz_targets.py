@@ -132,7 +132,7 @@ def _preset(path: Path) -> Any:
 
 
 def _document(path: Path) -> Any:
-    from graspd_core.formats.grasps_json import grasps_of, load_document
+    from graspd_core.formats.read_grasps import grasps_of, load_document
 
     grasps = grasps_of(load_document(path))
     for grasp in grasps:

@@ -48,7 +48,7 @@ def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
     between = time.process_time()
     robust = plan_grasps(scene, hand, count=count, seed=seed, preset=ranked)
     ended = time.process_time()
-    shares = {g.score: g.metrics.robustness for g in robust.grasps if g.metrics and g.verdict is Verdict.VERIFIED}
+    shares = {g.score: g.metrics["robustness"] for g in robust.grasps if g.metrics and g.verdict is Verdict.VERIFIED}
     protocol = at_friction(PROTOCOLS["standard"], friction)
     world, errors = build_world(hand, scene.object, parts, protocol), pose_errors(JUDGE_SEED, JUDGED)
     verified = [g for g in plain.grasps if g.verdict is Verdict.VERIFIED]

@@ -102,7 +102,7 @@ def report(rows: list[dict]) -> str:
 
 
 def _said(hold: dict) -> str:
-    return hold["reason"] or f"holds ({hold['max_displacement'] * 100:.1f} cm, {hold['max_rotation'] * 57.3:.0f}°)"
+    return hold["reason"] or f"holds ({hold['displacement'] * 100:.1f} cm, {hold['rotation'] * 57.3:.0f}°)"
 
 
 def main() -> None:

@@ -129,10 +129,9 @@ def say(line: str) -> None:
 
 def describe(best: dict[str, Any]) -> str:
     parts = [best["verdict"], f"{len(best['links'])} links touch"]
-    if best["penetration_mm"] is not None:
-        parts.append(f"penetration {best['penetration_mm']:.1f} mm")
-    if best["hold_displacement_cm"] is not None:
-        parts.append(f"moved {best['hold_displacement_cm']:.2f} cm in the hold trial")
+    if best["metrics"]["penetration_mm"] is not None:
+        parts.append(f"penetration {best['metrics']['penetration_mm']:.1f} mm")
+    parts += [f"moved {trial['displacement'] * 100:.2f} cm in the {trial['name']} trial" for trial in best["trials"]]
     return ", ".join(parts)
 
 

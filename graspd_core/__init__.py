@@ -14,7 +14,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from graspd_core.formats.grasps_json import grasps_of, load_document, save_result
+    from graspd_core.formats.grasps_json import grasp_figures, save_result
+    from graspd_core.formats.read_grasps import grasps_of, load_document
     from graspd_core.hands.hand_mesh import hand_mesh
     from graspd_core.hands.kinematics import link_poses
     from graspd_core.hands.library import hand_names, load_hand
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "methods.plan_config": ("PlanConfig", "load_preset", "preset_names"),
-    "formats.grasps_json": ("grasps_of", "load_document", "save_result"),
+    "formats.grasps_json": ("grasp_figures", "save_result"),
+    "formats.read_grasps": ("grasps_of", "load_document"),
     "hands.hand_mesh": ("hand_mesh",),
     "hands.kinematics": ("link_poses",),
     "hands.library": ("hand_names", "load_hand"),

@@ -6,7 +6,7 @@ quaternions are wxyz. The object frame is the frame of the mesh as loaded (after
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
@@ -83,70 +83,41 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class HoldResult:
-    """What a hold trial measured (worst over its six directions).
+class TrialResult:
+    """What one trial of one grasp measured; `graspd_core.trials.registry` lists the trials that planning runs.
 
     Attributes:
-        passed: whether every direction stayed within the limits.
-        max_displacement: object travel from the start of the trial [m].
-        max_rotation: object turn from the start of the trial [rad].
-        reason: why it failed, empty when it passed.
+        name: of the trial.
+        passed: whether the object stayed within the limits.
+        displacement: greatest travel of the object's centre of mass from where the hand should have had it [m].
+        rotation: greatest turn of the object from its start [rad].
+        reason: why the trial failed, empty when it passed.
     """
 
+    name: str
     passed: bool
-    max_displacement: float
-    max_rotation: float
+    displacement: float
+    rotation: float
     reason: str = ""
 
 
 @dataclass(frozen=True)
-class LiftResult:
-    """What a lift trial measured.
+class GraspMetrics(Mapping[str, float | None]):
+    """Static quality of one grasp by metric name, in SI units; None where a metric was not measured.
 
-    Attributes:
-        passed: whether the hand came, closed and lifted without reaching through anything or losing the object.
-        max_displacement: how far the object's centre of mass was at most from where the hand should have had it [m].
-        max_rotation: object turn from how it stood [rad].
-        reach_through: greatest depth of the hand's postures in the support or a neighbour, zero where clear [m].
-        reason: why it failed, empty when it passed.
+    `graspd_core.metrics.registry` lists the metrics, docs/metrics.md defines them.
     """
 
-    passed: bool
-    max_displacement: float
-    max_rotation: float
-    reach_through: float
-    reason: str = ""
+    values_si: Mapping[str, float | None]
 
+    def __getitem__(self, name: str) -> float | None:
+        return self.values_si[name]
 
-@dataclass(frozen=True)
-class GraspMetrics:
-    """Static quality of one grasp, measured by `graspd_core.metrics` (definitions: docs/metrics.md).
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_si)
 
-    Attributes:
-        contact_area: hand surface within 2 mm of the object [m²].
-        contact_links: number of hand links within 2 mm of the object.
-        intersection_volume: hand volume inside the object [m³].
-        penetration: greatest depth of a dense hand sample inside the object [m].
-        self_penetration: greatest overlap of non-adjacent links [m].
-        epsilon: Ferrari-Canny radius, torque scaled by the object's largest radius.
-        volume: volume of the grasp wrench hull.
-        displacement: the papers' simulation displacement [m], None where it was not run.
-        contact_area_5mm: hand surface within 5 mm of the object [m²], None where nobody measured.
-        contact_area_10mm: hand surface within 10 mm of the object [m²], None where nobody measured.
-        robustness: share of hold trials held with the hand out of place, None where nobody asked.
-    """
-
-    contact_area: float
-    contact_links: int
-    intersection_volume: float
-    penetration: float
-    self_penetration: float
-    epsilon: float
-    volume: float
-    displacement: float | None = None
-    contact_area_5mm: float | None = None
-    contact_area_10mm: float | None = None
-    robustness: float | None = None
+    def __len__(self) -> int:
+        return len(self.values_si)
 
 
 @dataclass(frozen=True)
@@ -166,7 +137,7 @@ class Posture:
 
 @dataclass(frozen=True)
 class Grasp:
-    """One grasp: three postures, where it touches, how good it is, and what the trial said.
+    """One grasp: three postures, where it touches, how good it is, and what the trials measured.
 
     Attributes:
         pregrasp: open and clear of the object.
@@ -175,10 +146,7 @@ class Grasp:
         contacts: one per touching link.
         score: the optimiser's own measure, larger is better; ranks grasps before any trial.
         metrics: static quality, None until measured.
-        hold: the hold trial's figures, None until run.
-        verdict: verified, unverified (no trial asked) or failed.
-        reason: why it failed, empty otherwise.
-        lift: the lift trial's figures; None until run, and in scenes with nothing but the object.
+        trials: in the order that they were run; the first failure ends them.
     """
 
     pregrasp: Posture
@@ -187,10 +155,19 @@ class Grasp:
     contacts: tuple[Contact, ...]
     score: float
     metrics: GraspMetrics | None = None
-    hold: HoldResult | None = None
-    verdict: Verdict = Verdict.UNVERIFIED
-    reason: str = ""
-    lift: LiftResult | None = None
+    trials: tuple[TrialResult, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """Unverified without a trial, failed after a failed one, otherwise verified."""
+        if not self.trials:
+            return Verdict.UNVERIFIED
+        return Verdict.VERIFIED if all(trial.passed for trial in self.trials) else Verdict.FAILED
+
+    @property
+    def reason(self) -> str:
+        """Why the first failed trial failed; empty without one."""
+        return next((trial.reason for trial in self.trials if not trial.passed), "")
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ MAY_IMPORT = {
     "methods": UP_TO_CONTACT,
     "metrics": UP_TO_CONTACT,
     "trials": UP_TO_CONTACT,
-    "formats": BASE | {"scene", "hands", "methods"},
+    "formats": BASE | {"scene", "hands", "methods", "metrics"},
     "planning": ROOMS,
     "__init__": ROOMS | {"planning"},
     "bench": ROOMS | {"planning", "__init__"},

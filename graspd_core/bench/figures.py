@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -10,24 +10,12 @@ from typing import Any
 import numpy as np
 
 from graspd_core.bench.result_store import Record
+from graspd_core.metrics.registry import METRICS
 
-# Figures of one grasp, by name: where each is found in its record, in the unit of the name.
-GRASP_FIGURES: dict[str, Callable[[dict[str, Any]], float | None]] = {
-    "sd_cm": lambda grasp: _inner(grasp, "sd", "displacement_cm"),
-    "gravity_cm": lambda grasp: _inner(grasp, "gravity", "displacement_cm"),
-    "penetration_mm": lambda grasp: _metric(grasp, "penetration", 1e3),
-    "self_penetration_mm": lambda grasp: _metric(grasp, "self_penetration", 1e3),
-    "contact_area_cm2": lambda grasp: _metric(grasp, "contact_area", 1e4),
-    "contact_area_5mm_cm2": lambda grasp: _metric(grasp, "contact_area_5mm", 1e4),
-    "contact_area_10mm_cm2": lambda grasp: _metric(grasp, "contact_area_10mm", 1e4),
-    "area_per_volume": lambda grasp: _area_per_volume(grasp),
-    "intersection_cm3": lambda grasp: _metric(grasp, "intersection_volume", 1e6),
-    "links": lambda grasp: _metric(grasp, "contact_links", 1.0),
-    "epsilon": lambda grasp: _metric(grasp, "epsilon", 1.0),
-    "volume": lambda grasp: _metric(grasp, "volume", 1.0),
-}
 # Shares of grasps that passed a trial; a grasp that was not found did not pass.
 TRIAL_FIGURES = ("standard", "hard", "noisy")
+# Displacements that trials measured [cm], by figure: which trial.
+_DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +28,7 @@ class Row:
         held: grasps that passed the standard hold trial.
         spent: CPU seconds of the optimiser and of those trials.
 
-    `values` has the medians of `GRASP_FIGURES` over the grasps, the shares of `TRIAL_FIGURES` of the grasps asked for,
+    `values` has the medians of `_grasp_figures` over the grasps, the shares of `TRIAL_FIGURES` of the grasps asked for,
     and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`, `cpu_per_verified` (`spent` over `held`),
     `first_cpu` and `first_wall` until the first verified grasp.
     """
@@ -81,7 +69,9 @@ def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
 def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
     asked, held = sum(r["asked"] for r in group), sum(r["held"] for r in group)
     grasps = [grasp for r in group for grasp in r["grasps"]]
-    values: dict[str, float | None] = {name: _median(map(read, grasps)) for name, read in GRASP_FIGURES.items()}
+    figures = [_grasp_figures(grasp) for grasp in grasps]
+    names = _grasp_figures({})
+    values: dict[str, float | None] = {name: _median(figure[name] for figure in figures) for name in names}
     for trial in TRIAL_FIGURES:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
         tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
@@ -126,6 +116,14 @@ def by_name(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return groups
 
 
+def _grasp_figures(grasp: dict[str, Any]) -> dict[str, float | None]:
+    """Figures of one grasp's record by name, each in the unit of its name; None where there is none."""
+    measured = grasp.get("metrics") or {}
+    moved = {name: _inner(grasp, trial, "displacement_cm") for name, trial in _DISPLACEMENTS.items()}
+    metrics = {row.key: (measured.get(name), row.scale) for name, row in METRICS.items()}
+    return moved | {key: None if value is None else float(value) * scale for key, (value, scale) in metrics.items()}
+
+
 def _median(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return median(known) if known else None
@@ -134,14 +132,3 @@ def _median(values: Iterable[float | None]) -> float | None:
 def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
     value = (grasp.get(trial) or {}).get(figure)
     return None if value is None else float(value)
-
-
-def _metric(grasp: dict[str, Any], name: str, factor: float) -> float | None:
-    value = (grasp.get("metrics") or {}).get(name)
-    return None if value is None else float(value) * factor
-
-
-def _area_per_volume(grasp: dict[str, Any]) -> float | None:
-    """CA/IV [cm²/cm³]; None where nothing is shared."""
-    area, shared = _metric(grasp, "contact_area", 1e4), _metric(grasp, "intersection_volume", 1e6)
-    return area / shared if area is not None and shared else None

@@ -12,29 +12,24 @@ from graspd_core.bench.names import is_hand, is_preset
 from graspd_core.bench.result_store import Record
 from graspd_core.errors import ConfigError
 from graspd_core.formats.grasps_json import save_text
+from graspd_core.metrics.registry import METRICS
 
-# Columns of both tables: heading, figure, format; a summary takes means over objects.
-_COLUMNS = (
-    ("held", "standard", "{:.0%}"),
-    ("held, hard", "hard", "{:.0%}"),
-    ("held, noisy", "noisy", "{:.0%}"),
-    ("SD cm", "sd_cm", "{:.2f}"),
-    ("under gravity cm", "gravity_cm", "{:.2f}"),
-    ("penetration mm", "penetration_mm", "{:.2f}"),
-    ("self-penetration mm", "self_penetration_mm", "{:.2f}"),
-    ("contact area cm²", "contact_area_cm2", "{:.1f}"),
-    ("at 5 mm", "contact_area_5mm_cm2", "{:.1f}"),
-    ("at 10 mm", "contact_area_10mm_cm2", "{:.1f}"),
-    ("IV cm³", "intersection_cm3", "{:.2f}"),
-    ("CA/IV 1/cm", "area_per_volume", "{:.0f}"),
-    ("links", "links", "{:.0f}"),
-    ("ε", "epsilon", "{:.3f}"),
-    ("volume", "volume", "{:.3f}"),
-    ("CPU s per grasp", "cpu_per_grasp", "{:.3g}"),
-    ("CPU s per verified", "cpu_per_verified", "{:.3g}"),
-)
 _PLANNED = ("first_wall", "cpu_per_verified", "rounds")
 _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "cpu_per_grasp", "cpu_per_verified")
+
+
+def _columns() -> list[tuple[str, str, str]]:
+    """Columns of both tables: heading, figure, format; a summary takes means over objects."""
+    return [
+        ("held", "standard", "{:.0%}"),
+        ("held, hard", "hard", "{:.0%}"),
+        ("held, noisy", "noisy", "{:.0%}"),
+        ("SD cm", "sd_cm", "{:.2f}"),
+        ("under gravity cm", "gravity_cm", "{:.2f}"),
+        *((row.title, row.key, f"{{:.{row.digits}f}}") for row in METRICS.values()),
+        ("CPU s per grasp", "cpu_per_grasp", "{:.3g}"),
+        ("CPU s per verified", "cpu_per_verified", "{:.3g}"),
+    ]
 
 
 def summary_table(records: Sequence[Record]) -> str:
@@ -54,7 +49,7 @@ def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, lis
     """A row a name, with a last column if there is one to add; nothing where there are no names."""
     if not found:
         return ""
-    columns = [column for column in _COLUMNS if column[1] in _SUMMARY and _known(found, column[1])]
+    columns = [column for column in _columns() if column[1] in _SUMMARY and _known(found, column[1])]
     body = [
         [f"`{name}`", *(_mean(group, figure, form) for _, figure, form in columns)] for name, group in found.items()
     ]
@@ -69,7 +64,7 @@ def object_tables(records: Sequence[Record]) -> str:
     """A table a preset: medians over each object's grasps, and their means."""
     blocks = []
     for name, group in by_name(row for row in rows(records) if is_preset(row.name)).items():
-        columns = [column for column in _COLUMNS if _known({name: group}, column[1])]
+        columns = [column for column in _columns() if _known({name: group}, column[1])]
         body = [
             [row.object, *(_form(row.values[f], form) if f != "standard" else f"{row.held}/{row.asked}"
                            for _, f, form in columns)]
@@ -124,7 +119,16 @@ def sections(records: Sequence[Record], charts: Mapping[str, Path], document: Pa
         "bench-ladder": _picture(charts, "ladder", document),
         "bench-hands": hands_table(records),
         "bench-objects": object_tables(records),
+        "metrics": metrics_table(),
     }
+
+
+def metrics_table() -> str:
+    """A row a metric: its name, unit and definition."""
+    return markdown_table(
+        ["metric", "unit in files", "definition"],
+        [[f"`{name}`", row.unit, row.description] for name, row in METRICS.items()],
+    )
 
 
 def about(records: Sequence[Record]) -> str:

@@ -13,6 +13,9 @@ from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_name
 from graspd_core.methods.registry import METHODS
 from graspd_core.types import GraspResult, Outcome, Verdict
 
+# Metrics in the summary of a run.
+_SHOWN = ("penetration", "contact_area", "epsilon", "robustness")
+
 
 def add_planning_options(parser: argparse.ArgumentParser) -> None:
     """Hand, number, method and trial of the grasps, and what is known of the object."""
@@ -55,6 +58,8 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
     """A few lines for a person; so many of the good grasps are `different`."""
+    from graspd_core.metrics.registry import METRICS
+
     good = good_grasps(result)
     kind = "unverified" if any(g.verdict is Verdict.UNVERIFIED for g in result.grasps) else "verified"
     ending = result.message or result.outcome.value
@@ -67,12 +72,10 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
         + (f", first verified after {timing.first_verified:.2f} s" if timing.first_verified else "")
     )
     for rank, grasp in enumerate(result.grasps[: min(good, 3)]):
-        if grasp.metrics:
-            lines.append(
-                f"  #{rank}: {len(grasp.contacts)} contacts, penetration {grasp.metrics.penetration * 1e3:.1f} mm, "
-                f"contact area {grasp.metrics.contact_area * 1e4:.1f} cm², epsilon {grasp.metrics.epsilon:.3f}"
-                + ("" if grasp.metrics.robustness is None else f", holds {grasp.metrics.robustness:.0%} out of place")
-            )
+        figures = [
+            METRICS[name].text(value) for name in _SHOWN if (value := (grasp.metrics or {}).get(name)) is not None
+        ]
+        lines.append(f"  #{rank}: {', '.join([f'{len(grasp.contacts)} contacts', *figures])}")
     return "\n".join(lines)
 
 

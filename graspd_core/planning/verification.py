@@ -14,11 +14,10 @@ from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_context
 from graspd_core.planning.run_clock import Run
 from graspd_core.scene.scene import Scene, object_parts
-from graspd_core.trials.hold_trial import hold_trial, with_trials
-from graspd_core.trials.lift_trial import lift_trial
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
-from graspd_core.trials.world import PROTOCOLS, Protocol, World, at_friction, build_world
-from graspd_core.types import Grasp, Stage, TriangleMesh, Verdict
+from graspd_core.trials.registry import TrialContext, build_worlds, grasp_trials
+from graspd_core.trials.world import PROTOCOLS, at_friction
+from graspd_core.types import Grasp, GraspMetrics, Stage, TriangleMesh, Verdict
 
 Parts = Future[tuple[TriangleMesh, ...]]
 
@@ -36,22 +35,11 @@ _NOISE = 0x6E6F697365
 
 
 @dataclass(frozen=True)
-class TrialContext:
-    """What grasps are tried and measured with.
+class VerificationContext:
+    """What the grasps of a run are tried and measured with."""
 
-    Attributes:
-        hand: that grasps.
-        protocol: physics of the trials.
-        alone: the object and the hand.
-        around: these, and what stands about them; None where nothing does.
-        judge: of the static metrics.
-    """
-
-    hand: HandModel
-    protocol: Protocol
-    alone: World
-    around: World | None
-    with_trials: MetricsContext
+    trials: TrialContext
+    metrics: MetricsContext
 
 
 def parts_in_background(run: Run, scene: Scene) -> Parts:
@@ -71,23 +59,23 @@ def parts_in_background(run: Run, scene: Scene) -> Parts:
     return future
 
 
-def make_trial_context(run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str) -> TrialContext | None:
-    """The worlds, as soon as the parts are there; None where the run ended first."""
+def make_trial_context(
+    run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str
+) -> VerificationContext | None:
+    """The contexts, as soon as the parts are there; None where the run ended first."""
     while not run.over() and not wait([parts], timeout=_POLL).done:
         pass
     if run.over():
         return None
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-    alone, around = build_world(hand, scene.object, parts.result(), protocol), None
-    if scene.support is not None or scene.obstacles:
-        around = build_world(hand, scene.object, parts.result(), protocol, scene.support, scene.obstacles)
-    return TrialContext(hand, protocol, alone, around, make_metrics_context(scene.object, hand))
+    worlds = build_worlds(scene, hand, parts.result(), protocol)
+    return VerificationContext(worlds, make_metrics_context(scene.object, hand))
 
 
 def run_trials(
-    run: Run, trial_context: TrialContext, candidates: tuple[Grasp, ...], count: int, before: int
+    run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> tuple[tuple[Grasp, ...], float | None]:
-    """Try candidates in rank order until `count` held; `before` did already.
+    """Try candidates in rank order until `count` are verified; `before` are already.
 
     Returns:
         The grasps that were tried, verified ones first, and when the first of them had passed.
@@ -98,15 +86,12 @@ def run_trials(
     for index, grasp in enumerate(candidates):
         if len(verified) == count or run.over():
             break
-        hold = hold_trial(trial_context.alone, grasp, trial_context.protocol, stop=run.over)
-        lift = None
-        if trial_context.around is not None and hold.passed:
-            lift = lift_trial(trial_context.around, trial_context.hand, grasp, trial_context.protocol, stop=run.over)
-        passed = hold.passed and (lift is None or lift.passed)
+        tried = replace(grasp, trials=grasp_trials(context.trials, grasp, run.over))
+        passed = tried.verdict is Verdict.VERIFIED
         if run.over() and not passed:
             # A trial that was cut short says nothing of the grasp.
             break
-        tried = with_trials(replace(grasp, metrics=measure(trial_context.with_trials, grasp.grasp)), hold, lift)
+        tried = replace(tried, metrics=measure(context.metrics, grasp.grasp))
         if passed:
             first = first or time.perf_counter()
             verified.append(tried)
@@ -117,7 +102,7 @@ def run_trials(
 
 
 def rank_by_robustness(
-    run: Run, trial_context: TrialContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
+    run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
     """The grasps with those first that still hold when the object is not quite where it was thought to be.
 
@@ -128,12 +113,11 @@ def rank_by_robustness(
     measured: list[Grasp] = []
     # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
     errors = pose_errors((_NOISE, seed), config.trials)
-    protocol = replace(trial_context.protocol, hold_time=config.hold_time)
+    protocol = replace(context.trials.protocol, hold_time=config.hold_time)
     for index, grasp in enumerate(verified):
-        share = None if run.over() else noisy_share(trial_context.alone, grasp, protocol, errors, stop=run.over)
-        if grasp.metrics is not None:
-            grasp = replace(grasp, metrics=replace(grasp.metrics, robustness=share))
-        measured.append(grasp)
+        share = None if run.over() else noisy_share(context.trials.alone, grasp, protocol, errors, stop=run.over)
+        metrics = GraspMetrics({**(grasp.metrics or {}), "robustness": share})
+        measured.append(replace(grasp, metrics=metrics))
         run.report(Stage.VERIFY, index + 1, len(verified), 0.0, len(verified))
     return (*most_robust_first(measured), *grasps[len(verified) :])
 
@@ -142,7 +126,7 @@ def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
     """Grasps by the share that they held out of place; where it is the same, or nobody measured it, in their order."""
 
     def share(grasp: Grasp) -> float:
-        known = grasp.metrics.robustness if grasp.metrics else None
+        known = grasp.metrics.get("robustness") if grasp.metrics else None
         return _UNKNOWN if known is None else known
 
     return sorted(verified, key=share, reverse=True)

@@ -10,14 +10,13 @@ from its pose at the start of the trial, so that what the closing fingers do to 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.trials.world import Protocol, World
-from graspd_core.types import Grasp, HoldResult, LiftResult, Posture, Verdict
+from graspd_core.types import Grasp, Posture, TrialResult
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 _CHECK_EVERY = 25
@@ -25,7 +24,7 @@ _CHECK_EVERY = 25
 
 def hold_trial(
     world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
-) -> HoldResult:
+) -> TrialResult:
     """Run one hold trial of `protocol`; ends at the first breach.
 
     Returns:
@@ -78,15 +77,8 @@ def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst:
     return ""
 
 
-def _result(worst: np.ndarray, reason: str) -> HoldResult:
-    return HoldResult(not reason, float(worst[0]), float(worst[1]), reason)
-
-
-def with_trials(grasp: Grasp, hold: HoldResult, lift: LiftResult | None = None) -> Grasp:
-    """The grasp with its verdict written down: verified when it passed every trial that was run."""
-    failed = [trial.reason for trial in (hold, lift) if trial is not None and not trial.passed]
-    verdict = Verdict.FAILED if failed else Verdict.VERIFIED
-    return replace(grasp, hold=hold, lift=lift, verdict=verdict, reason=failed[0] if failed else "")
+def _result(worst: np.ndarray, reason: str) -> TrialResult:
+    return TrialResult("hold", not reason, float(worst[0]), float(worst[1]), reason)
 
 
 def start_penetration(world: World, data: Any) -> float:

@@ -27,7 +27,7 @@ from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.trials.hold_trial import breach, set_hand_pose, set_joints, set_targets
 from graspd_core.trials.world import Protocol, World
-from graspd_core.types import Grasp, LiftResult, Posture
+from graspd_core.types import Grasp, Posture, TrialResult
 
 _CHECK_EVERY = 25
 _COMING, _CLOSING, _LIFTING = "while the hand came", "while closing", "while lifting"
@@ -70,7 +70,7 @@ def lift_trial(
     *,
     settings: LiftSettings = LiftSettings(),
     stop: Callable[[], bool] = lambda: False,
-) -> LiftResult:
+) -> TrialResult:
     """Run one lift trial in a world built with a support or neighbours; ends at the first breach.
 
     While the hand comes and closes, and until it first touches the object, that rests as it was seen, because a
@@ -84,9 +84,9 @@ def lift_trial(
     grasp = moved_grasp(grasp, -world.origin)
     data = mujoco.MjData(world.model)
     begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
-    through, reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
+    reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
     if reason:
-        return LiftResult(False, 0.0, 0.0, through, reason)
+        return TrialResult("lift", False, 0.0, 0.0, reason)
     away = (begin.position - grasp.pregrasp.position) / settings.retreat
     stages = (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
@@ -111,8 +111,8 @@ def lift_trial(
                 reason = breach(world, data, protocol, worst)
                 if reason or stop():
                     said = f"{reason} {name}" if reason else "stopped before the trial ended"
-                    return LiftResult(False, float(worst[0]), float(worst[1]), through, said)
-    return LiftResult(True, float(worst[0]), float(worst[1]), through)
+                    return TrialResult("lift", False, float(worst[0]), float(worst[1]), said)
+    return TrialResult("lift", True, float(worst[0]), float(worst[1]))
 
 
 def _touches(world: World, data: Any) -> bool:
@@ -136,8 +136,8 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
     data.xfrc_applied[world.object_body, :3] = -acceleration * world.model.body_mass[world.object_body] * up
 
 
-def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> tuple[float, str]:
-    """Greatest depth [m] of the hand in any obstacle along the straight ways between postures; why that is too much."""
+def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
+    """Where the hand is deepest in an obstacle on the straight ways between postures; empty up to `limit` [m]."""
     import mujoco
 
     worst, reason = 0.0, ""
@@ -152,4 +152,4 @@ def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit:
                 if depth > worst:
                     worst = depth
                     reason = f"the hand reaches {depth * 1e3:.1f} mm into {said} {name}" if depth > limit else ""
-    return worst, reason
+    return reason

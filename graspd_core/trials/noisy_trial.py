@@ -12,7 +12,7 @@ from jaxtyping import Float
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle, rotation_from_quaternion
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import Protocol, World
-from graspd_core.types import Grasp, HoldResult, Posture
+from graspd_core.types import Grasp, Posture, TrialResult
 
 TRIALS = 8
 # A turn and an offset [m] of the hand.
@@ -30,7 +30,7 @@ def noisy_trial(
 
 def noisy_holds(
     world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
-) -> tuple[HoldResult, ...]:
+) -> tuple[TrialResult, ...]:
     """The 8 hold trials of a noisy trial.
 
     The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same

@@ -1,4 +1,7 @@
-"""Progress and answers as messages of graspd_msgs. No message carries a NaN: what was not measured is -1."""
+"""Progress and answers as messages of graspd_msgs. No message carries a NaN.
+
+Metrics that were not measured are left out; other figures that are not finite are -1.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,12 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Vector3
 from graspd_msgs.msg import Contact as ContactMessage
 from graspd_msgs.msg import Grasp as GraspMessage
-from graspd_msgs.msg import GraspArray, GraspProgress
+from graspd_msgs.msg import GraspArray, GraspProgress, Metric
+from graspd_msgs.msg import TrialResult as TrialMessage
 from std_msgs.msg import Header
 
 from graspd_core import HandModel
-from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Progress, Stage, Verdict
+from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Progress, Stage, TrialResult, Verdict
 from graspd_ros.outputs import status_json as convert
 from graspd_ros.outputs.error_codes import ErrorCode
 from graspd_ros.outputs.mount import parent_pose
@@ -107,6 +111,12 @@ def grasp_message(
         grasp_joints=joints[1],
         squeeze_joints=joints[2],
         score=_number(grasp.score),
+        metrics=[
+            Metric(name=name, value=value)
+            for name, value in (grasp.metrics or {}).items()
+            if value is not None and math.isfinite(value)
+        ],
+        trials=[_trial(trial) for trial in grasp.trials],
         contacts=[_contact(contact) for contact in grasp.contacts],
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
@@ -115,13 +125,6 @@ def grasp_message(
         message.mount_link = hand.mount.parent
         message.mount_pregrasp_pose = parent_pose(message.pregrasp_pose, hand.mount)
         message.mount_grasp_pose = parent_pose(message.grasp_pose, hand.mount)
-    if grasp.metrics is not None:
-        message.epsilon = _number(grasp.metrics.epsilon)
-        message.penetration = _number(grasp.metrics.penetration)
-        message.contact_area = _number(grasp.metrics.contact_area)
-    if grasp.hold is not None:
-        message.hold_displacement = _number(grasp.hold.max_displacement)
-        message.hold_rotation = _number(grasp.hold.max_rotation)
     return message
 
 
@@ -178,6 +181,16 @@ def _contact(contact: Contact) -> ContactMessage:
     x, y, z = map(float, contact.position)
     nx, ny, nz = map(float, contact.normal)
     return ContactMessage(link=contact.link, position=Point(x=x, y=y, z=z), normal=Vector3(x=nx, y=ny, z=nz))
+
+
+def _trial(trial: TrialResult) -> TrialMessage:
+    return TrialMessage(
+        name=trial.name,
+        passed=trial.passed,
+        displacement=_number(trial.displacement),
+        rotation=_number(trial.rotation),
+        reason=trial.reason,
+    )
 
 
 def _number(value: float, otherwise: float = UNMEASURED) -> float:

@@ -65,7 +65,7 @@ def moveit_grasp(
     if T_parent_base is not None:
         pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ np.linalg.inv(T_parent_base))
     first, *closing = deepcopy(grasp.trajectory.points)
-    quality = grasp.epsilon if grasp.epsilon >= 0 else 0.0
+    quality = next((metric.value for metric in grasp.metrics if metric.name == "epsilon"), 0.0)
     return messages.Grasp(
         id=grasp.id,
         pre_grasp_posture=_posture(grasp, [first]),

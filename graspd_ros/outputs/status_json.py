@@ -16,7 +16,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from graspd_core import HandModel, all_joint_names, all_joint_positions
+from graspd_core import HandModel, all_joint_names, all_joint_positions, grasp_figures
 from graspd_core.types import Grasp, GraspResult, Posture, Progress, Verdict
 
 
@@ -79,9 +79,7 @@ def _summary(grasp: Grasp) -> dict[str, Any]:
         "position": [float(value) for value in pose.position],
         "quaternion_wxyz": [float(value) for value in pose.quaternion_wxyz],
         "links": [contact.link for contact in grasp.contacts],
-        "epsilon": grasp.metrics and grasp.metrics.epsilon,
-        "penetration_mm": grasp.metrics and grasp.metrics.penetration * 1e3,
-        "hold_displacement_cm": grasp.hold and grasp.hold.max_displacement * 1e2,
+        **grasp_figures(grasp),
     }
 
 

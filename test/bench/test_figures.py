@@ -16,6 +16,7 @@ from graspd_core.bench.figures import by_name, per_verified, rows, spread
 from graspd_core.bench.names import parent_of, short_name
 from graspd_core.bench.pareto import pareto_front
 from graspd_core.errors import ConfigError
+from graspd_core.metrics.registry import METRICS, Metric
 
 # Small whole numbers, so that points are often equal on an axis.
 POINTS = arrays(np.float64, st.tuples(st.integers(1, 12), st.integers(1, 3)), elements=st.integers(0, 5).map(float))
@@ -106,13 +107,21 @@ def test_the_tables_are_these(record, planned):
 
 
 def test_area_over_volume_is_none_where_nothing_is_shared(record):
-    def shared(volume: float) -> list[dict]:
-        return [{"metrics": {"contact_area": 2e-3, "contact_area_5mm": 4e-3, "intersection_volume": volume}}]
+    def shared(ratio: float | None) -> list[dict]:
+        return [{"metrics": {"contact_area": 2e-3, "contact_area_5mm": 4e-3, "contact_per_volume": ratio}}]
 
-    some, none = rows([record(grasps=shared(4e-7)), record(thing="mug", grasps=shared(0.0))])
-    assert some.values["area_per_volume"] == pytest.approx(50.0)
+    some, none = rows([record(grasps=shared(5000.0)), record(thing="mug", grasps=shared(None))])
+    assert some.values["contact_per_volume_per_cm"] == pytest.approx(50.0)
     assert some.values["contact_area_5mm_cm2"] == pytest.approx(40.0)
-    assert none.values["area_per_volume"] is None
+    assert none.values["contact_per_volume_per_cm"] is None
+
+
+def test_a_metric_of_the_registry_has_a_column(record, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(METRICS, "height", Metric("height", "mm", 1e3, None, "z of the base link", 1))
+    grasps = [{"standard": {"passed": True}, "metrics": {"height": 0.25}}]
+    table = tables.object_tables([record(asked=1, given=1, held=1, grasps=grasps)])
+    assert "| object | held | height mm | CPU s per grasp |" in table
+    assert "| box | 1/1 | 250.0 |" in table
 
 
 def test_hands_have_a_table_of_their_own_and_the_worst_object_of_each(record):

@@ -14,7 +14,7 @@ import pytest
 
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
-from graspd_core.formats.grasps_json import load_document
+from graspd_core.formats.read_grasps import load_document
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import preset_names

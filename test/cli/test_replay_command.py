@@ -20,7 +20,7 @@ from graspd_core.bags.writer import (
 from graspd_core.cli import cloud_options as clouds
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
-from graspd_core.formats.grasps_json import load_document
+from graspd_core.formats.read_grasps import load_document
 from graspd_core.mesh.mesh_files import load_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.pointcloud.camera import PinholeCamera

@@ -14,7 +14,7 @@ import trimesh
 from graspd_core.formats.grasp_page import placed_hand, save_view
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.types import Grasp, Posture, Verdict
+from graspd_core.types import Grasp, Posture, TrialResult, Verdict
 
 # Half a turn about z: x and y change sign.
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])
@@ -27,7 +27,8 @@ def hand():
 
 def grasp_at(hand, verdict: Verdict) -> Grasp:
     posture = Posture(np.array([0.1, 0.2, 0.3]), HALF_TURN, hand.open_posture)
-    return Grasp(posture, posture, posture, (), 0.0, verdict=verdict)
+    trials = () if verdict is Verdict.UNVERIFIED else (TrialResult("hold", verdict is Verdict.VERIFIED, 0.0, 0.0),)
+    return Grasp(posture, posture, posture, (), 0.0, trials=trials)
 
 
 def shown(path: Path) -> dict[str, np.ndarray]:

@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.formats.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
+from graspd_core.formats.grasps_json import check_writable, result_document, save_result
+from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mount
 from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.metrics.registry import METRICS
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import (
     Contact,
     Grasp,
     GraspMetrics,
     GraspResult,
-    HoldResult,
-    LiftResult,
     Outcome,
     Plane,
     Posture,
     Timing,
+    TrialResult,
     Verdict,
 )
 
@@ -50,12 +54,14 @@ OBJECT = {"source", "sha256", "center_of_mass", "mass", "friction", "scale", "su
 TIMING = {"load", "sdf", "compile", "optimise", "verify", "first_verified", "total"}
 GRASP = {
     "rank", "verdict", "reason", "score", "position", "quaternion_wxyz", "joint_positions", "pregrasp_joint_positions",
-    "squeeze_joint_positions", "pregrasp_position", "pregrasp_quaternion_wxyz", "contacts", "metrics",
+    "squeeze_joint_positions", "pregrasp_position", "pregrasp_quaternion_wxyz", "contacts", "metrics", "trials",
 }  # fmt: skip
-METRICS = {
-    "contact_area_cm2", "intersection_volume_cm3", "penetration_mm", "self_penetration_mm", "epsilon", "volume",
-    "sd_cm", "robustness", "hold", "lift",
+METRIC_KEYS = {
+    "contact_area_cm2", "contact_area_5mm_cm2", "contact_area_10mm_cm2", "contact_links", "penetration_mm",
+    "self_penetration_mm", "intersection_volume_cm3", "contact_per_volume_per_cm", "epsilon", "volume", "robustness",
 }  # fmt: skip
+TRIAL = {"name", "passed", "displacement", "rotation", "reason"}
+VERSION_1 = Path(__file__).parent / "data" / "grasps_v1.json"
 
 
 @pytest.fixture(scope="module")
@@ -83,16 +89,13 @@ def result() -> GraspResult:
         squeeze=replace(posture(2), position=grip.position, quaternion_wxyz=grip.quaternion_wxyz),
         contacts=(Contact("link_3.0_tip", (0.1, 0.2, 0.3), (0.0, 0.6, 0.8)),),
         score=-1.5,
-        metrics=GraspMetrics(2e-4, 3, 1e-6, 0.0015, 0.0, 0.25, 1.5),
-        hold=HoldResult(True, 0.01, 0.1),
-        verdict=Verdict.VERIFIED,
+        metrics=GraspMetrics({"contact_area": 2e-4, "intersection_volume": 1e-6, "penetration": 0.0015}),
+        trials=(TrialResult("hold", True, 0.01, 0.1),),
     )
     lost = replace(
         held,
         metrics=None,
-        hold=HoldResult(False, float("inf"), float("inf"), "the simulation diverged"),
-        verdict=Verdict.FAILED,
-        reason="the simulation diverged",
+        trials=(TrialResult("hold", False, float("inf"), float("inf"), "the simulation diverged"),),
     )
     timing = Timing(load=0.5, first_verified=2.5, total=3.0)
     return GraspResult(Outcome.TOO_FEW, (held, lost), timing, 7, "closed_form", warnings=("open mesh",))
@@ -110,8 +113,8 @@ def test_keys_are_those_of_the_format(document):
     assert set(document["timing"]) == TIMING
     for grasp in document["grasps"]:
         assert set(grasp) == GRASP
-        assert set(grasp["metrics"]) == METRICS
-        assert set(grasp["metrics"]["hold"]) == {"max_displacement_cm", "max_rotation_deg"}
+        assert set(grasp["metrics"]) == METRIC_KEYS
+        assert [set(trial) for trial in grasp["trials"]] == [TRIAL]
         assert set(grasp["contacts"][0]) == {"link", "position", "normal"}
     assert {"graspd", "torch", "mujoco"} <= set(document["versions"])
 
@@ -121,8 +124,6 @@ def test_units_are_converted_where_a_key_names_one(document):
     assert metrics["contact_area_cm2"] == pytest.approx(2.0)
     assert metrics["intersection_volume_cm3"] == pytest.approx(1.0)
     assert metrics["penetration_mm"] == pytest.approx(1.5)
-    assert metrics["hold"]["max_displacement_cm"] == pytest.approx(1.0)
-    assert metrics["hold"]["max_rotation_deg"] == pytest.approx(np.rad2deg(0.1))
 
 
 def test_a_saved_result_is_read_back_bit_by_bit(tmp_path: Path, result, target, hand, document):
@@ -137,64 +138,96 @@ def test_a_saved_result_is_read_back_bit_by_bit(tmp_path: Path, result, target, 
                 assert np.array_equal(getattr(getattr(before, name), field), getattr(getattr(after, name), field))
         assert after.contacts == before.contacts
         assert (after.score, after.verdict, after.reason) == (before.score, before.verdict, before.reason)
-        assert after.hold is not None
-        assert before.hold is not None
-        assert after.hold.passed == before.hold.passed
-        assert after.hold.max_displacement == pytest.approx(before.hold.max_displacement)
-        assert after.hold.max_rotation == pytest.approx(before.hold.max_rotation)
+        assert after.trials == before.trials
+
+
+figures = st.floats(0.0, 1e3)
+measured = st.fixed_dictionaries({name: st.none() | figures for name in METRICS})
+moved = figures | st.just(float("inf"))
+tried = st.lists(st.tuples(st.text(), st.booleans(), moved, moved, st.text()), max_size=3)
+
+
+@pytest.fixture
+def read_back(result, target, hand) -> Callable[..., tuple[Grasp, Grasp]]:
+    """Gives a grasp with changes, and what is read of it when it has been written."""
+
+    def write_and_read(**changes: Any) -> tuple[Grasp, Grasp]:
+        before = replace(result.grasps[0], **changes)
+        written = result_document(replace(result, grasps=(before,)), target, hand, PlanConfig())
+        return before, grasps_of(json.loads(json.dumps(written, allow_nan=False)))[0]
+
+    return write_and_read
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(values=measured, trials=tried)
+def test_all_metrics_and_trials_are_read_back(read_back, values, trials):
+    run = tuple(TrialResult(*trial) for trial in trials)
+    before, after = read_back(metrics=GraspMetrics(values), trials=run)
+    assert (after.trials, after.verdict, after.reason) == (run, before.verdict, before.reason)
+    # A scale is multiplied and divided: the last bits may differ.
+    read, expected = ({n: v for n, v in m.items() if v is not None} for m in (after.metrics or {}, values))
+    assert read == pytest.approx(expected, rel=1e-14, abs=1e-300)
+    assert after.metrics is None or set(after.metrics) == set(METRICS)
 
 
 def test_what_is_not_finite_is_written_as_null(document):
-    text = json.dumps(document, allow_nan=False)
-    hold = json.loads(text)["grasps"][1]["metrics"]["hold"]
-    assert hold == {"max_displacement_cm": None, "max_rotation_deg": None}
-    assert json.loads(text)["grasps"][1]["metrics"]["epsilon"] is None
+    lost = json.loads(json.dumps(document, allow_nan=False))["grasps"][1]
+    (hold,) = lost["trials"]
+    assert (hold["displacement"], hold["rotation"]) == (None, None)
+    assert set(lost["metrics"].values()) == {None}
 
 
-def test_a_grasp_that_was_never_tried_has_no_hold(result, target, hand):
-    untried = replace(result, grasps=(replace(result.grasps[0], hold=None, verdict=Verdict.UNVERIFIED),))
-    written = result_document(untried, target, hand, PlanConfig())
-    assert written["grasps"][0]["metrics"]["hold"] is None
-    assert grasps_of(written)[0].hold is None
-
-
-def test_lift_and_support_are_written_and_read_back(result, target, hand):
-    held = result.grasps[0]
-    lifted = replace(held, lift=LiftResult(True, 0.02, 0.2, 0.0004))
-    dropped = replace(
-        held, lift=LiftResult(False, 0.06, 0.1, 0.0, "dropped"), verdict=Verdict.FAILED, reason="dropped"
-    )  # fmt: skip
+def test_the_support_is_written(result, target, hand):
     table = Plane(np.array([0.0, 0.0, 1.0]), -0.05)
-    written = result_document(replace(result, grasps=(lifted, dropped), support=table), target, hand, PlanConfig())
+    written = result_document(replace(result, support=table), target, hand, PlanConfig())
     assert json.loads(json.dumps(written, allow_nan=False)) == written
     assert written["object"]["support"] == {"normal": [0.0, 0.0, 1.0], "offset": -0.05}
-    assert written["grasps"][0]["metrics"]["lift"] == {
-        "max_displacement_cm": pytest.approx(2.0),
-        "max_rotation_deg": pytest.approx(np.rad2deg(0.2)),
-        "reach_through_mm": pytest.approx(0.4),
-    }
-    for before, after in zip((lifted, dropped), grasps_of(written), strict=True):
-        assert after.hold is not None
-        assert after.hold.passed
-        assert after.hold.reason == ""
-        assert before.lift is not None
-        assert after.lift is not None
-        assert (after.lift.passed, after.lift.reason) == (before.lift.passed, before.lift.reason)
-        assert after.lift.reach_through == pytest.approx(before.lift.reach_through)
 
 
-def test_without_a_lift_there_is_none_and_files_from_before_there_was_one_are_read(document):
-    assert document["object"]["support"] is None
-    assert document["grasps"][0]["metrics"]["lift"] is None
-    assert grasps_of(document)[0].lift is None
+def test_files_of_version_1_are_read():
+    held, lifted, untried, lost, wild = grasps_of(load_document(VERSION_1))
+    fell, wrong = "the object moved 6.0 cm while lifting", "the simulation diverged while closing"
+    hold = ["hold", True, pytest.approx(0.01), pytest.approx(0.25), ""]
+    expected = [
+        (held, Verdict.VERIFIED, "", [hold]),
+        (lifted, Verdict.VERIFIED, "", [hold, ["lift", True, pytest.approx(0.02), pytest.approx(0.125), ""]]),
+        (untried, Verdict.UNVERIFIED, "", []),
+        (lost, Verdict.FAILED, fell, [hold, ["lift", False, pytest.approx(0.06), pytest.approx(0.125), fell]]),
+        (wild, Verdict.FAILED, wrong, [["hold", False, float("inf"), float("inf"), wrong]]),
+    ]
+    for grasp, *found in expected:
+        trials = [[t.name, t.passed, t.displacement, t.rotation, t.reason] for t in grasp.trials]
+        assert [grasp.verdict, grasp.reason, trials] == found
+    assert wild.metrics is None
+    assert held.metrics is not None
+    assert {name: value for name, value in held.metrics.items() if value is not None} == pytest.approx({
+        "contact_area": 2e-4, "intersection_volume": 1e-6, "penetration": 0.0015, "self_penetration": 0.0005,
+        "epsilon": 0.25, "volume": 1.5, "robustness": 0.75,
+    })  # fmt: skip
+    assert held.grasp.joint_positions.tolist() == [0.03]
+
+
+def test_a_file_of_version_1_from_before_there_was_a_lift_trial_is_read():
+    document = load_document(VERSION_1)
+    document["grasps"] = document["grasps"][:1]
     del document["grasps"][0]["metrics"]["lift"]
-    assert grasps_of(document)[0].lift is None
+    assert grasps_of(document)[0].verdict is Verdict.VERIFIED
+
+
+def test_a_verdict_that_its_trials_do_not_support_is_refused(document):
+    document["grasps"][1]["verdict"] = "verified"
+    with pytest.raises(FormatError, match="verdict: 'verified'; by its trials the grasp is failed"):
+        grasps_of(document)
+    document["grasps"][1]["trials"][0]["passed"] = "yes"
+    with pytest.raises(FormatError, match="passed: 'yes'; expected true or false"):
+        grasps_of(document)
 
 
 @pytest.mark.parametrize(
     ("text", "culprit"),
     [
-        ('{"format": "graspd/grasps", "version": 2}', "version 2 is unknown; this reader knows 1"),
+        ('{"format": "graspd/grasps", "version": 3}', "version 3 is unknown; this reader knows 1 and 2"),
         ('{"format": "graspd/grasps"}', "version None"),
         ('{"format": "other", "version": 1}', "not a graspd/grasps file"),
         ("[]", "not a graspd/grasps file"),
@@ -216,7 +249,7 @@ def test_a_missing_file_is_refused(tmp_path: Path):
         load_document(tmp_path / "nowhere.json")
 
 
-@pytest.mark.parametrize("key", ["position", "verdict", "squeeze_joint_positions"])
+@pytest.mark.parametrize("key", ["position", "verdict", "squeeze_joint_positions", "metrics", "trials"])
 def test_a_grasp_without_a_key_is_refused(document, key: str):
     del document["grasps"][0][key]
     with pytest.raises(FormatError, match=key):

@@ -118,7 +118,7 @@ def test_points_are_read_in_every_order_and_beside_other_things(tmp_path: Path) 
         ("[1.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0]", "quaternion_wxyz is no unit quaternion"),
         ("[1.0, 0.0, 0.0, 0.0]", "[1e308, 0.0, 0.0, 0.0]", "quaternion_wxyz is no unit quaternion"),
         ("-1.5", '"good"', "could not convert string to float"),
-        ('"max_rotation_deg": 1.0', '"max_rotation_deg": "far"', "could not convert string to float"),
+        ('"rotation": 0.25', '"rotation": "far"', "could not convert string to float"),
         ("{", "[" * 2000, "not JSON"),
     ],
     ids=lambda value: value[:20],

@@ -11,11 +11,12 @@ import pytest
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning import verification as trials
+from graspd_core.planning import verification
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.types import Grasp, GraspResult, LiftResult, Outcome, Plane, Progress, Stage, Verdict
+from graspd_core.trials.registry import TRIALS
+from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +51,8 @@ def test_grasps_called_verified_have_passed_and_come_first(result):
     assert verdicts == sorted(verdicts, key=[Verdict.VERIFIED, Verdict.FAILED].index)
     assert verdicts.count(Verdict.VERIFIED) == 2
     for grasp in result.grasps:
-        assert grasp.hold is not None
-        assert grasp.hold.passed == (grasp.verdict is Verdict.VERIFIED) == (grasp.reason == "")
+        (hold,) = grasp.trials
+        assert hold.passed == (grasp.verdict is Verdict.VERIFIED) == (grasp.reason == "")
         assert grasp.metrics is not None
         assert grasp.contacts
 
@@ -63,17 +64,14 @@ def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result)
     assert on_table.support is table
     best = on_table.grasps[0]
     assert best.verdict is Verdict.VERIFIED
-    assert best.hold is not None
-    assert best.lift is not None
-    assert best.hold.passed
-    assert best.lift.passed
+    assert [(trial.name, trial.passed) for trial in best.trials] == [("hold", True), ("lift", True)]
     assert result.support is None
-    assert all(grasp.lift is None for grasp in result.grasps)
+    assert {trial.name for grasp in result.grasps for trial in grasp.trials} == {"hold"}
 
 
 def test_a_grasp_that_holds_but_cannot_be_lifted_is_not_verified(scene, hand, result, monkeypatch: pytest.MonkeyPatch):
-    lost = LiftResult(False, 0.06, 0.0, 0.0, "the object moved 6.0 cm while lifting")
-    monkeypatch.setattr(trials, "lift_trial", lambda *_, **__: lost)
+    lost = TrialResult("lift", False, 0.06, 0.0, "the object moved 6.0 cm while lifting")
+    monkeypatch.setitem(TRIALS, "lift", replace(TRIALS["lift"], run=lambda *_: lost))
     table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()))
     tried: list[Progress] = []
     short = plan_grasps(
@@ -81,10 +79,10 @@ def test_a_grasp_that_holds_but_cannot_be_lifted_is_not_verified(scene, hand, re
         progress=lambda p: tried.append(p) if p.stage is Stage.VERIFY else None, stop=lambda: len(tried) == 4,
     )  # fmt: skip
     assert short.outcome is Outcome.CANCELLED
-    held = [grasp for grasp in short.grasps if grasp.hold and grasp.hold.passed]
+    held = [grasp for grasp in short.grasps if grasp.trials[0].passed]
     assert held
-    assert all((g.verdict, g.reason, g.lift) == (Verdict.FAILED, lost.reason, lost) for g in held)
-    assert not any(grasp.lift for grasp in short.grasps if grasp.hold and not grasp.hold.passed)
+    assert all((g.verdict, g.reason, g.trials[1]) == (Verdict.FAILED, lost.reason, lost) for g in held)
+    assert all(len(grasp.trials) == 1 for grasp in short.grasps if not grasp.trials[0].passed)
 
 
 def test_joint_limits_hold_exactly_and_quaternions_are_unit(result, hand):
@@ -120,11 +118,11 @@ def test_the_same_seed_gives_the_same_grasps_and_another_others(scene, hand, res
     assert len(again.grasps) == len(result.grasps)
     for one, other in zip(again.grasps, result.grasps, strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(arrays(one), arrays(other), strict=True))
-        assert (one.score, one.metrics, one.hold) == (other.score, other.metrics, other.hold)
+        assert (one.score, one.metrics, one.trials) == (other.score, other.metrics, other.trials)
     different = plan_grasps(scene, hand, count=2, seed=4, preset="fast", verify="none")
     assert not np.array_equal(different.grasps[0].grasp.position, result.grasps[0].grasp.position)
     assert len(different.grasps) == 2
-    assert all(g.verdict is Verdict.UNVERIFIED and g.hold is None and g.metrics for g in different.grasps)
+    assert all(g.verdict is Verdict.UNVERIFIED and not g.trials and g.metrics for g in different.grasps)
 
 
 def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
@@ -179,7 +177,7 @@ def test_collision_parts_of_cancelled_runs_do_not_pile_up(scene, hand, result):
     fresh = replace(scene, object=replace(scene.object, sha256="of nobody else"))
     stop = threading.Event()
     before = set(threading.enumerate())
-    with trials._CUTTING:
+    with verification._CUTTING:
         cancelled = plan_grasps(fresh, hand, count=1, progress=lambda _: stop.set(), stop=stop.is_set)
     assert cancelled.outcome is Outcome.CANCELLED
     # The thread that waited for its turn ends at once, and nothing was cut.
@@ -202,7 +200,7 @@ def test_what_held_in_an_earlier_round_stays_told(scene, hand):
 def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
     # They come only once the run has ended; who waited for them would wait for ever.
-    monkeypatch.setattr(trials, "object_parts", lambda _: release.wait())
+    monkeypatch.setattr(verification, "object_parts", lambda _: release.wait())
     short = replace(load_preset("fast").settings, explore_steps=3, refine_steps=3, polish_steps=3)
     try:
         late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=2.0)

@@ -107,8 +107,7 @@ def test_the_defaults_ask_for_the_nodes_own_settings():
     assert (request.source, request.seed, request.num_grasps, request.time_budget) == (GraspRequest.CLOUD, -1, 0, 0.0)
     assert (request.mesh_scale, request.hand, request.preset, request.use_target_point) == (1.0, "", "", False)
     assert grasp.verdict == Grasp.UNVERIFIED
-    figures = grasp.epsilon, grasp.penetration, grasp.contact_area, grasp.hold_displacement, grasp.hold_rotation
-    assert figures == (-1.0,) * 5
+    assert (grasp.metrics, grasp.trials) == ([], [])
 
 
 def test_what_is_installed_is_what_the_definitions_say(monkeypatch: pytest.MonkeyPatch):

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
 
 from graspd_core.bags.writer import Record, camera_info_message, depth_message, transforms_message, write_bag
-from graspd_core.formats.grasps_json import grasps_of, load_document
+from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.rendering.depth_noise import DEFAULT
 from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop

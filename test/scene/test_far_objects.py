@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graspd_core.formats.grasps_json import grasps_of, load_document, save_result
+from graspd_core.formats.grasps_json import save_result
+from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape, shape_volume

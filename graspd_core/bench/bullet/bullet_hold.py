@@ -19,11 +19,12 @@ from graspd_core.bench.bullet.bullet_world import BulletWorld, add_object, simul
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.trials.hold_trial import DIRECTIONS, axis_name, broken_limit
 from graspd_core.trials.world import Protocol
-from graspd_core.types import Grasp, HoldResult, Posture
+from graspd_core.types import Grasp, Posture, TrialResult
 
 # [s]. At MuJoCo's 4 ms, Bullet's sequential impulses let an object creep out of fingers this light, by 10° in 2 s.
 TIMESTEP = 0.001
 SOLVER_ITERATIONS = 50
+_NAME = "bullet_hold"
 # Steps between looks at the limits: as often as MuJoCo's trial looks, every 0.1 s.
 _CHECK_EVERY = 100
 
@@ -51,7 +52,7 @@ class _Run:
     worst: Float[np.ndarray, "2"]
 
 
-def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> HoldResult:
+def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> TrialResult:
     """Run one hold trial of `protocol` in PyBullet; ends at the first breach.
 
     Returns:
@@ -67,7 +68,7 @@ def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> H
         run = _start(client, world, grasp.pregrasp, protocol)
         depth = _start_penetration(run)
         if depth > protocol.max_start_penetration:
-            return HoldResult(False, 0.0, 0.0, f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm")
+            return TrialResult(_NAME, False, 0.0, 0.0, f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm")
         for stage, start, end in (
             ("closing", grasp.pregrasp, grasp.grasp),
             ("squeezing", grasp.grasp, grasp.squeeze),
@@ -84,8 +85,8 @@ def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> H
         return _result(run, "")
 
 
-def _result(run: _Run, reason: str) -> HoldResult:
-    return HoldResult(not reason, float(run.worst[0]), float(run.worst[1]), reason)
+def _result(run: _Run, reason: str) -> TrialResult:
+    return TrialResult(_NAME, not reason, float(run.worst[0]), float(run.worst[1]), reason)
 
 
 def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol) -> _Run:

@@ -21,7 +21,7 @@ from graspd_core.trials.gravity_trial import gravity_trial
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.noisy_trial import noisy_trial
 from graspd_core.trials.world import PROTOCOLS, build_world
-from graspd_core.types import Grasp, HoldResult, TriangleMesh
+from graspd_core.types import Grasp, TrialResult, TriangleMesh
 
 # One trial of one grasp: figures by name.
 Trial = Callable[[Grasp], dict[str, Any]]
@@ -73,12 +73,12 @@ def _nothing(grasp: Grasp) -> dict[str, Any]:
     return {}
 
 
-def _figures(hold: HoldResult) -> dict[str, Any]:
+def _figures(result: TrialResult) -> dict[str, Any]:
     return {
-        "passed": hold.passed,
-        "displacement_cm": hold.max_displacement * 100,
-        "rotation_deg": float(np.rad2deg(hold.max_rotation)),
-        "reason": hold.reason,
+        "passed": result.passed,
+        "displacement_cm": result.displacement * 100,
+        "rotation_deg": float(np.rad2deg(result.rotation)),
+        "reason": result.reason,
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from graspd_core.bench.measurements.benchmark_trials import TRIALS, Tried
@@ -43,7 +42,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     judge = make_metrics_context(scene.object, hand)
     for grasp, result in zip(grasps, results, strict=True):
         with laps("metrics"):
-            result["metrics"] = dataclasses.asdict(measure(judge, grasp.grasp))
+            result["metrics"] = dict(measure(judge, grasp.grasp))
     return {
         "given": len(grasps),
         "held": sum(bool(r.get("standard", {}).get("passed")) for r in results),

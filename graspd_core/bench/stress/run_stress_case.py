@@ -124,7 +124,8 @@ def _told(result: GraspResult, folder: str) -> str:
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
     """How many verified grasps hold again: read back from a file, on the object loaded and cut into parts anew."""
-    from graspd_core.formats.grasps_json import grasps_of, load_document, save_result
+    from graspd_core.formats.grasps_json import save_result
+    from graspd_core.formats.read_grasps import grasps_of, load_document
     from graspd_core.methods.plan_config import load_preset
     from graspd_core.runtime import disk_cache as cache
 

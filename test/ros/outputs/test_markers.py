@@ -15,7 +15,7 @@ from visualization_msgs.msg import Marker
 
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.library import load_hand
-from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, Verdict
+from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose
 from graspd_ros.outputs.markers import COLOURS, IDS_OF_A_GRASP, result_markers
 
@@ -27,9 +27,10 @@ def grasp(verdict: Verdict = Verdict.VERIFIED, seed: int = 0) -> Grasp:
     joints = HAND.lower + random.random(HAND.num_joints) * (HAND.upper - HAND.lower)
     posture = Posture(random.normal(size=3), np.roll(Rotation.random(rng=random).as_quat(), 1), joints)
     contact = Contact("link_3.0", (0.1, 0.2, 0.3), (0.0, 0.0, 1.0))
-    metrics = GraspMetrics(1e-3, 4, 0.0, 0.0, 0.0, epsilon=0.1234, volume=0.1)
+    metrics = GraspMetrics({"epsilon": 0.1234})
     reason = "the object turned 40°" if verdict is Verdict.FAILED else ""
-    return Grasp(posture, posture, posture, (contact,), 1.0, metrics, verdict=verdict, reason=reason)
+    trials = () if verdict is Verdict.UNVERIFIED else (TrialResult("hold", not reason, 0.0, 0.7, reason),)
+    return Grasp(posture, posture, posture, (contact,), 1.0, metrics, trials)
 
 
 def markers(*grasps: Grasp, shown: int = 1) -> list[Marker]:

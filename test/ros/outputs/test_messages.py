@@ -64,8 +64,12 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
         assert len(joints.name) == len(joints.position) == 16
     assert list(best.trajectory.joint_names) == list(best.grasp_joints.name)
     assert len(best.trajectory.points) == len(best.trajectory_base_poses) == 3
-    assert best.epsilon > 0
-    assert 0 <= best.hold_displacement < 0.02
+    metrics = {metric.name: metric.value for metric in best.metrics}
+    assert metrics["epsilon"] > 0
+    assert "robustness" not in metrics, "what was not measured is left out"
+    (hold,) = best.trials
+    assert (hold.name, hold.passed, hold.reason) == ("hold", True, "")
+    assert 0 <= hold.displacement < 0.02
     assert {p.request_id for p in client.progress} == {"mine-1"}
     assert {p.stage for p in client.progress} >= {"load", "optimise", "verify"}
     assert all(0 <= p.fraction <= 1 and p.message for p in client.progress)

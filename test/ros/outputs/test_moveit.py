@@ -22,7 +22,7 @@ from std_msgs.msg import Header
 
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
-from graspd_core.types import Grasp, GraspMetrics, Posture, Verdict
+from graspd_core.types import Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
 from graspd_ros.outputs.messages import grasp_message
 from graspd_ros.outputs.moveit import MoveItMissing, moveit_grasp
@@ -72,8 +72,9 @@ def message(verdict: Verdict = Verdict.VERIFIED) -> Any:
     far = Posture(np.array([0.0, 0.0, 0.30]), turned, HAND.open_posture)
     near = Posture(np.array([0.0, 0.0, 0.22]), turned, (HAND.open_posture + HAND.closed_posture) / 2)
     tight = Posture(np.array([0.0, 0.0, 0.22]), turned, HAND.closed_posture)
-    metrics = GraspMetrics(1e-3, 4, 0.0, 0.0, 0.0, epsilon=0.25, volume=0.1)
-    grasp = Grasp(far, near, tight, (), 1.0, metrics, verdict=verdict, reason="lost the object")
+    metrics = GraspMetrics({"penetration": 1e-3, "epsilon": 0.25})
+    trial = TrialResult("hold", verdict is Verdict.VERIFIED, 0.0, 0.0, "lost the object")
+    grasp = Grasp(far, near, tight, (), 1.0, metrics, (trial,))
     return grasp_message(grasp, 0, "mesh-1", Header(frame_id="camera", stamp=Time(sec=3)), HAND, Pace())
 
 

@@ -19,7 +19,17 @@ from visualization_msgs.msg import MarkerArray
 from graspd_core.errors import MeshError
 from graspd_core.hands.library import load_hand
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Progress, Stage, Timing, Verdict
+from graspd_core.types import (
+    Contact,
+    Grasp,
+    GraspResult,
+    Outcome,
+    Posture,
+    Progress,
+    Stage,
+    Timing,
+    TrialResult,
+)
 from graspd_ros.inputs.requests import Request
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings
@@ -28,7 +38,7 @@ from graspd_ros.worker import Ending, Report
 
 HAND = load_hand("allegro_right", candidates=200)
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), HAND.open_posture)
-GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 1.0, verdict=Verdict.VERIFIED)
+GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 1.0, trials=(TrialResult("hold", True, 0.0, 0.0),))
 NOT_A_NUMBER = {
     "grasp's position": {"grasp": replace(POSTURE, position=np.array([0.0, np.nan, 0.0]))},
     "squeeze's joint_positions": {"squeeze": replace(POSTURE, joint_positions=np.full(16, np.inf))},

@@ -13,13 +13,14 @@ from graspd_core.hands.library import load_hand
 from graspd_core.paths import config_dir
 from graspd_core.types import (
     Grasp,
+    GraspMetrics,
     GraspResult,
-    HoldResult,
     Outcome,
     Posture,
     Progress,
     Stage,
     Timing,
+    TrialResult,
     Verdict,
 )
 from graspd_ros.outputs import status_json as convert
@@ -28,8 +29,9 @@ from graspd_ros.parameters import Settings
 
 def grasp(verdict: Verdict) -> Grasp:
     posture = Posture(np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.1, -0.7, 0.5]), np.array([0.25, -1.0]))
-    hold = HoldResult(verdict is Verdict.VERIFIED, 0.002, 0.01)
-    return Grasp(posture, posture, posture, (), score=1.5, hold=hold, verdict=verdict)
+    hold = TrialResult("hold", verdict is Verdict.VERIFIED, 0.002, 0.01)
+    trials = () if verdict is Verdict.UNVERIFIED else (hold,)
+    return Grasp(posture, posture, posture, (), score=1.5, metrics=GraspMetrics({"penetration": 0.001}), trials=trials)
 
 
 def result(*grasps: Grasp) -> GraspResult:
@@ -81,7 +83,11 @@ def test_every_event_is_one_line_of_json_without_nan():
     progress = Progress(Stage.OPTIMISE, 5, 10, float("inf"), 0, 0.5)
     assert json.loads(convert.status_line(convert.progress_event(progress)))["fraction"] == 0.5
     summary = json.loads(convert.status_line(convert.result_event(result(grasp(Verdict.VERIFIED)))))
-    assert summary["best"]["hold_displacement_cm"] == 0.2
+    assert summary["best"]["metrics"]["penetration_mm"] == 1.0
+    assert summary["best"]["metrics"]["epsilon"] is None
+    assert summary["best"]["trials"] == [
+        {"name": "hold", "passed": True, "displacement": 0.002, "rotation": 0.01, "reason": ""}
+    ]
     assert summary["outcome"] == "too_few"
 
 

@@ -1,0 +1,81 @@
+"""The trials that planning runs, one row each, in this order. A grasp is verified when it passes all that apply."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from graspd_core.hands.model import HandModel
+from graspd_core.scene.scene import Scene
+from graspd_core.trials.hold_trial import hold_trial
+from graspd_core.trials.lift_trial import lift_trial
+from graspd_core.trials.world import Protocol, World, build_world
+from graspd_core.types import Grasp, StopHook, TrialResult, TriangleMesh
+
+
+@dataclass(frozen=True)
+class TrialContext:
+    """What the grasps of one scene are tried with.
+
+    Attributes:
+        hand: the hand that grasps.
+        protocol: physics of the trials.
+        alone: world of the object and the hand.
+        around: world with support and obstacles too; None where there are none.
+    """
+
+    hand: HandModel
+    protocol: Protocol
+    alone: World
+    around: World | None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial.
+
+    Attributes:
+        name: of its results.
+        applies: whether the trial runs in a context.
+        run: tries one grasp; polls the hook, and fails where it ends the trial.
+    """
+
+    name: str
+    applies: Callable[[TrialContext], bool]
+    run: Callable[[TrialContext, Grasp, StopHook], TrialResult]
+
+
+def _hold(context: TrialContext, grasp: Grasp, stop: StopHook) -> TrialResult:
+    return hold_trial(context.alone, grasp, context.protocol, stop=stop)
+
+
+def _lift(context: TrialContext, grasp: Grasp, stop: StopHook) -> TrialResult:
+    if context.around is None:
+        raise ValueError("the lift trial needs a support or obstacles")
+    return lift_trial(context.around, context.hand, grasp, context.protocol, stop=stop)
+
+
+_ROWS = (
+    Trial("hold", lambda context: True, _hold),
+    Trial("lift", lambda context: context.around is not None, _lift),
+)
+TRIALS: dict[str, Trial] = {row.name: row for row in _ROWS}
+
+
+def build_worlds(scene: Scene, hand: HandModel, parts: Sequence[TriangleMesh], protocol: Protocol) -> TrialContext:
+    """Build the worlds; `parts` are the object's convex parts, object frame [m]."""
+    around = None
+    if scene.support is not None or scene.obstacles:
+        around = build_world(hand, scene.object, parts, protocol, scene.support, scene.obstacles)
+    return TrialContext(hand, protocol, build_world(hand, scene.object, parts, protocol), around)
+
+
+def grasp_trials(context: TrialContext, grasp: Grasp, stop: StopHook = lambda: False) -> tuple[TrialResult, ...]:
+    """Run the trials that apply, in order, up to the first that the grasp fails."""
+    results: list[TrialResult] = []
+    for trial in TRIALS.values():
+        if trial.applies(context):
+            results.append(trial.run(context, grasp, stop))
+            if not results[-1].passed:
+                break
+    return tuple(results)
