@@ -16,9 +16,6 @@ STILL_TO_SPLIT = {
     "graspd_core/hands/mano/mano_hand.py: _bare_hand",
     "graspd_core/hands/readers/build_model.py: assemble",
     "graspd_core/hands/readers/description.py: read_description",
-    "graspd_core/methods/problem.py: build_problem",
-    "graspd_core/methods/problem.py: evaluate",
-    "graspd_core/planning/plan_grasps.py: plan_grasps",
 }
 
 BASE = {"types", "errors", "se3", "config", "paths", "runtime"}

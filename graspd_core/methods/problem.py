@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -130,6 +131,29 @@ def _nearest_of_group(
     return start.scatter_reduce(1, groups, distance, "amin")
 
 
+def _wrench_resistance(
+    problem: Problem,
+    points: Float[Tensor, "batch points 3"],
+    distance: Float[Tensor, "batch points"],
+    normal: Float[Tensor, "batch points 3"],
+    *,
+    radius: Float[Tensor, "batch"],
+    activate: Callable[..., Tensor],
+) -> Float[Tensor, "batch"]:
+    """The loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
+    near = (
+        (distance.detach() - radius[:, None]).abs().topk(min(_TASK_POINTS, distance.shape[-1]), largest=False).indices
+    )
+    rows = torch.arange(len(near), device=near.device)[:, None]
+    target, position = problem.object, points[rows, near]
+    activation = activate(distance[rows, near], radius)
+    if target.confidence is not None:
+        activation = activation * sample_confidence(target.confidence, target.sdf, position)
+    arms = (position - target.center) / target.length
+    support = wrench_support(arms, normal[rows, near], activation, problem.directions, problem.friction)
+    return losses.wrench_resistance(support, problem.friction)
+
+
 def evaluate(
     problem: Problem,
     translation: Float[Tensor, "batch 3"],
@@ -137,6 +161,7 @@ def evaluate(
     joints: Float[Tensor, "batch joints"],
     radius: Float[Tensor, "batch"],
     delta: float,
+    *,
     fine: bool = False,
     activate: Callable[..., Tensor] = losses.soft_contact,
 ) -> Terms:
@@ -156,30 +181,15 @@ def evaluate(
         sharp, solids = feature_distance(problem, features, placed)
         sunk = sunk + losses.penetration(sharp, torch.zeros_like(radius))
         gap = torch.minimum(gap, _nearest_of_group(sharp, problem.hand.group_of_solid[solids], gap.shape[-1]))
-    # Only what is near the padded surface can push; the rest costs time and adds nothing.
-    near = (
-        (distance.detach() - radius[:, None]).abs().topk(min(_TASK_POINTS, distance.shape[-1]), largest=False).indices
-    )
-    rows = torch.arange(len(near), device=near.device)[:, None]
-    activation = activate(distance[rows, near], radius, delta)
-    if problem.object.confidence is not None:
-        activation = activation * sample_confidence(
-            problem.object.confidence, problem.object.sdf, placed.points[rows, near]
-        )
-    support = wrench_support(
-        (placed.points[rows, near] - problem.object.center) / problem.object.length,
-        normal[rows, near],
-        activation,
-        problem.directions,
-        problem.friction,
-    )
     spheres = place_points(problem.hand.spheres.matrix, placed.links)
     obstacle = None
     if problem.obstacles is not None:
         gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
         obstacle = losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
     return Terms(
-        wrench_resistance=losses.wrench_resistance(support, problem.friction),
+        wrench_resistance=_wrench_resistance(
+            problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)
+        ),
         distance=losses.touch(
             gap, torch.full_like(problem.hand.reach, _REACH_WHEN_FINE) if fine else problem.hand.reach
         ),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,26 +12,18 @@ from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig, load_preset
-from graspd_core.metrics.measure import measure
-from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.planning.feasibility import out_of_reach
-from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.planning_scene import planning_scene
-from graspd_core.planning.rounds import rounds_of
+from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.planning.run_clock import Run
-from graspd_core.planning.verification import make_trial_context, parts_in_background, rank_by_robustness, run_trials
+from graspd_core.planning.verification import parts_in_background, rank_by_robustness
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated, start_worker_process
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
 from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
-
-# How far apart the seeds of two rounds are.
-_SEED_STEP = 1_000_003
+from graspd_core.types import GraspResult, ProgressHook, Stage, StopHook, Timing
 
 
 def plan_grasps(
@@ -81,49 +72,29 @@ def plan_grasps(
         message = out_of_reach(scene, hand)
     rounds = [] if run.over() or message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    hooks = Hooks(
-        report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
-        # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its postures.
-        stop=run.over,
-    )
-    grasps: tuple[Grasp, ...] = ()
-    trial_context = first = None
-    good, optimising = 0, time.perf_counter() - run.began
-    # Most objects need one round; where too few grasps held, what is missing is sought again from other starts.
-    for attempt, settings in enumerate(rounds):
-        began, seeded = time.perf_counter(), seed + _SEED_STEP * attempt
-        wanted = count - good
-        with enough_memory(f"{wanted} grasps at once"):
-            found = find_candidates(scene, hand, count=wanted, seed=seeded, config=settings, hooks=hooks, device=device)
-        optimising += time.perf_counter() - began
-        if parts is None:
-            metrics_context = make_metrics_context(scene.object, hand)
-            new = tuple(replace(g, metrics=measure(metrics_context, g.grasp)) for g in found.grasps[:wanted])
-        else:
-            if trial_context is None and found.grasps:
-                trial_context = make_trial_context(run, scene, hand, parts, verify)
-            new, passed_at = run_trials(run, trial_context, found.grasps, wanted, good) if trial_context else ((), None)
-            first = first or passed_at
-        grasps = tuple(sorted((*grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
-        good = sum(g.verdict is not Verdict.FAILED for g in grasps)
-        if good >= count or run.over():
-            break
-    if trial_context and config.robust.rank:
-        grasps = rank_by_robustness(run, trial_context, grasps, config.robust, seed)
-    finished = time.perf_counter()
-    load, sdf = scene.timing
-    timing = Timing(
-        load=load,
-        sdf=sdf,
-        optimise=optimising,
-        verify=finished - run.began - optimising,
-        first_verified=None if first is None else first - run.began + load + sdf,
-        total=finished - run.began + load + sdf,
-    )
-    outcome = run.outcome(bool(grasps), good, count)
-    run.report(Stage.DONE, 1, 1, 0.0, good)
+    found = run_rounds(run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device)
+    grasps = found.grasps
+    if found.context and config.robust.rank:
+        grasps = rank_by_robustness(run, found.context, grasps, config.robust, seed)
+    timing = _timing(run, scene, found)
+    outcome = run.outcome(bool(grasps), found.good, count)
+    run.report(Stage.DONE, 1, 1, 0.0, found.good)
     grasps = tuple(moved_grasp(grasp, far) for grasp in grasps)
     return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, support)
+
+
+def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
+    """Seconds of each stage; those of loading were spent before the run began."""
+    elapsed, (load, sdf) = time.perf_counter() - run.began, scene.timing
+    optimise = found.began - run.began + found.optimise_time
+    return Timing(
+        load=load,
+        sdf=sdf,
+        optimise=optimise,
+        verify=elapsed - optimise,
+        first_verified=None if found.first is None else found.first - run.began + load + sdf,
+        total=elapsed + load + sdf,
+    )
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:

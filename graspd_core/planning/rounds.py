@@ -1,9 +1,19 @@
-"""How much effort each round of optimiser and trial takes."""
+"""Rounds of optimiser and trials: how much effort each takes, and what they find."""
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass, replace
+
+from graspd_core.hands.model import HandModel
+from graspd_core.methods.candidates import find_candidates
+from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.planning.memory_errors import enough_memory
+from graspd_core.planning.run_clock import Run
+from graspd_core.planning.verification import Parts, VerificationContext, make_trial_context, measured, run_trials
 from graspd_core.scene.scene import Scene
+from graspd_core.types import Grasp, Stage, Verdict
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
@@ -18,3 +28,75 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     most = rounds.first_budget * rounds.growth ** (rounds.most - 1)
     efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
     return [config.at_budget(effort) for effort in efforts]
+
+
+# How far apart the seeds of two rounds are.
+_SEED_STEP = 1_000_003
+
+
+@dataclass(frozen=True)
+class RoundsResult:
+    """What the rounds of a run found.
+
+    Attributes:
+        began: when the first round began, a `time.perf_counter()` value.
+        grasps: verified (or untried) ones first, then those that failed.
+        context: what grasps are tried with; None where none was tried.
+        optimise_time: spent in the method [s].
+        first: when the first grasp was verified, a `time.perf_counter()` value.
+    """
+
+    began: float
+    grasps: tuple[Grasp, ...] = ()
+    context: VerificationContext | None = None
+    optimise_time: float = 0.0
+    first: float | None = None
+
+    @property
+    def good(self) -> int:
+        """How many grasps did not fail."""
+        return sum(grasp.verdict is not Verdict.FAILED for grasp in self.grasps)
+
+
+def run_rounds(
+    run: Run,
+    scene: Scene,
+    hand: HandModel,
+    rounds: list[PlanConfig],
+    parts: Parts | None,
+    *,
+    count: int,
+    seed: int,
+    verify: str,
+    device: str,
+) -> RoundsResult:
+    """Find candidates and try them, round by round, until `count` of them are good.
+
+    Most objects need one round. Where too few grasps held, what is missing is sought again from other initial poses.
+    Without `parts`, the object's convex parts, no trial is run.
+    """
+    state = RoundsResult(time.perf_counter())
+    for attempt, config in enumerate(rounds):
+        wanted, good, began = count - state.good, state.good, time.perf_counter()
+        hooks = Hooks(
+            report=lambda step, of, loss, good=good: run.report(Stage.OPTIMISE, step, of, loss, good),
+            # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.
+            stop=run.over,
+        )
+        seeded = seed + _SEED_STEP * attempt
+        with enough_memory(f"{wanted} grasps at once"):
+            found = find_candidates(scene, hand, count=wanted, seed=seeded, config=config, hooks=hooks, device=device)
+        state = replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
+        new, first = (), None
+        if parts is None:
+            new = measured(scene, hand, found.grasps[:wanted])
+        elif found.grasps:
+            if state.context is None:
+                state = replace(state, context=make_trial_context(run, scene, hand, parts, verify))
+            if state.context is not None:
+                new, first = run_trials(run, state.context, found.grasps, wanted, good)
+        grasps = tuple(sorted((*state.grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
+        state = replace(state, grasps=grasps, first=state.first or first)
+        if state.good >= count or run.over():
+            break
+    return state

@@ -72,6 +72,12 @@ def make_trial_context(
     return VerificationContext(worlds, make_metrics_context(scene.object, hand))
 
 
+def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
+    """Candidates with their metrics, none of them tried."""
+    context = make_metrics_context(scene.object, hand)
+    return tuple(replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in candidates)
+
+
 def run_trials(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> tuple[tuple[Grasp, ...], float | None]:

@@ -124,7 +124,9 @@ class ClosedForm:
         radius = torch.cat([radius, radius[:1].expand(short)])
         poses = moved_along(unpack(x), -problem.hand.pivot)
         activate = soft_contact if self.config.activation == "soft" else hard_contact
-        terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, polish, activate)
+        terms = evaluate(
+            problem, poses.translation, poses.quaternion, poses.joints, radius, delta, fine=polish, activate=activate
+        )
         loss = weighted(terms, self.config.polish_weights if polish else self.config.weights)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         finite = torch.isfinite(gradient).all(-1) & torch.isfinite(loss)
