@@ -42,9 +42,9 @@ def run_node(file: Path, arguments: list[str]) -> int:
             # From this tick on: one long stall is one late tick, as the timer skips those that it missed.
             self._due = now + TIMER_PERIOD
 
-        def _see(self, sighting: SensorFrame) -> None:
-            self.ages.append((sighting.arrived - nanoseconds(sighting.stamp)) * 1e-9)
-            super()._see(sighting)
+        def _see(self, sensor_frame: SensorFrame) -> None:
+            self.ages.append((sensor_frame.arrived - nanoseconds(sensor_frame.stamp)) * 1e-9)
+            super()._see(sensor_frame)
 
         def _flush(self) -> None:
             with file.open("a") as stream:

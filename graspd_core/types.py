@@ -84,7 +84,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What one trial of one grasp measured; `graspd_core.trials.registry` lists the trials that planning runs.
+    """What one trial of one grasp measured; `graspd_core.trials.trial_registry` lists the trials that planning runs.
 
     Attributes:
         name: of the trial.
@@ -105,7 +105,7 @@ class TrialResult:
 class GraspMetrics(Mapping[str, float | None]):
     """Static quality of one grasp by metric name, in SI units; None where a metric was not measured.
 
-    `graspd_core.metrics.registry` lists the metrics, docs/metrics.md defines them.
+    `graspd_core.metrics.metric_registry` lists the metrics, docs/metrics.md defines them.
     """
 
     values_si: Mapping[str, float | None]

@@ -71,11 +71,11 @@ class GraspNode(Node):
         self._transforms = TransformBuffer()
         self._listener = TransformListener(self, self._transforms)
         self._pairs = ImagePairs()
-        self._intake = RequestBuilder(self._hand.name, self._now, self._transform)
-        self._answers = Responses(self, self._hand)
+        self._request_builder = RequestBuilder(self._hand.name, self._now, self._transform)
+        self._responses = Responses(self, self._hand)
         self._planner = Planner(self._hand, self._transform_in_time)
         self._worker: Worker[Request, Planned] = Worker(
-            work=self._work, finish=self._answers.finished, prepare=self._prepare, queue_size=settings.queue_size
+            work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )
         self._create_inlets()
         self._goals = GoalServer(self, self._on_goal, lambda request_id: self._worker.cancel(request_id) > 0)
@@ -112,14 +112,16 @@ class GraspNode(Node):
             while not self._goals.idle() and time.monotonic() < end:
                 time.sleep(0.01)
         time.sleep(RESULT_PATIENCE)
-        self._answers.outlets.close()
+        self._responses.publishers.close()
         return ended
 
     # Callbacks: short, in the executor's thread.
 
     def _on_mesh(self, message: String) -> None:
         self._take(
-            "mesh", self._intake.new_id("mesh"), lambda name, given: self._intake.from_mesh(name, given, message.data)
+            "mesh",
+            self._request_builder.new_id("mesh"),
+            lambda name, given: self._request_builder.from_mesh(name, given, message.data),
         )
 
     def _on_request(self, message: GraspRequest) -> None:
@@ -132,7 +134,7 @@ class GraspNode(Node):
         try:
             self._see(cloud_frame(message, nanoseconds(self._now())))
         except RequestError as error:  # too large to keep
-            self._answers.cloud_not_taken(self._intake.new_id("cloud"), error)
+            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
 
     def _on_image(self, message: Image) -> None:
         if pair := self._pairs.add_image(message):
@@ -145,7 +147,7 @@ class GraspNode(Node):
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
             culprit = GraspdError(f"cancel: no request {message.data!r} is waiting or running")
-            self._answers.tell_error(message.data, "cancel", culprit)
+            self._responses.tell_error(message.data, "cancel", culprit)
 
     def _on_list_hands(self, _: ListHands.Request, response: ListHands.Response) -> ListHands.Response:
         response.names, response.current = list(hand_names()), self._hand.name
@@ -153,29 +155,29 @@ class GraspNode(Node):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        cancelled, views = self._worker.cancel(""), len(self._intake.views.clouds)
-        self._intake.forget()
-        self._answers.forget()
+        cancelled, views = self._worker.cancel(""), len(self._request_builder.views.clouds)
+        self._request_builder.forget()
+        self._responses.forget()
         response.success, response.message = True, f"cancelled {cancelled} requests, dropped {views} views"
         return response
 
     def _on_add_view(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            self._intake.add_view(read_settings(self))
-            views = self._intake.views
+            self._request_builder.add_view(read_settings(self))
+            views = self._request_builder.views
             response.success, response.message = True, f"{len(views.clouds)} views in {views.frame!r}"
         except Exception as error:  # whatever the cloud holds, the executor goes on
             response.success, response.message = False, sentence_of(error)
         return response
 
     def _on_reset_views(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = True, f"dropped {len(self._intake.views.clouds)} views"
-        self._intake.forget_views()
+        response.success, response.message = True, f"dropped {len(self._request_builder.views.clouds)} views"
+        self._request_builder.forget_views()
         return response
 
     def _on_diagnostics_due(self) -> None:
         running, waiting = self._worker.state()
-        health = self._answers.tally.health(
+        health = self._responses.counters.health(
             name=self.get_fully_qualified_name(),
             hand=self._hand.name,
             ready=self._ready,
@@ -193,11 +195,11 @@ class GraspNode(Node):
     # From messages to the worker.
 
     def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None) -> str:
-        request_id = message.id or self._intake.new_id(kind)
+        request_id = message.id or self._request_builder.new_id(kind)
         self._take(
             SOURCES.get(message.source, "request"),
             request_id,
-            lambda name, settings: self._intake.from_message(name, settings, message, listener),
+            lambda name, settings: self._request_builder.from_message(name, settings, message, listener),
             listener,
         )
         return request_id
@@ -208,27 +210,27 @@ class GraspNode(Node):
         try:
             request = make(request_id, read_settings(self))
         except Exception as error:  # whatever a message holds, the executor goes on
-            self._answers.not_made(request_id, source, error, listener)
+            self._responses.not_made(request_id, source, error, listener)
         else:
             self._submit(request)
 
-    def _see(self, sighting: SensorFrame) -> None:
-        self._answers.tally.count("clouds_received")
-        self._intake.newest, settings = sighting, read_settings(self)
+    def _see(self, sensor_frame: SensorFrame) -> None:
+        self._responses.counters.count("clouds_received")
+        self._request_builder.newest, settings = sensor_frame, read_settings(self)
         if settings.cloud_policy == "off":
             return
-        request_id = self._intake.new_id("cloud")
+        request_id = self._request_builder.new_id("cloud")
         try:
-            request = self._intake.from_sighting(request_id, settings, sighting)
+            request = self._request_builder.from_sensor_frame(request_id, settings, sensor_frame)
         except GraspdError as error:
-            self._answers.cloud_not_taken(request_id, error)
+            self._responses.cloud_not_taken(request_id, error)
         else:
             self._submit(request)
 
     def _submit(self, request: Request) -> None:
         with self._announcing:  # the worker starts only once the answer is out
             admission = self._worker.submit(request, BusyPolicy(request.settings.busy_policy))
-            self._answers.admitted(request, admission)
+            self._responses.admitted(request, admission)
 
     def _now(self) -> Time:
         return self.get_clock().now().to_msg()
@@ -247,7 +249,7 @@ class GraspNode(Node):
         try:
             warm_up(self._hand, stop=self._worker.stopping)
         except BaseException as error:  # without this the node would stand there deaf
-            self._answers.tell_error("", "node", error)
+            self._responses.tell_error("", "node", error)
             self._on_failure()
             return
         if self._worker.stopping():
@@ -258,12 +260,12 @@ class GraspNode(Node):
         # The first line of the log takes 0.1 s of looking through all modules for its place.
         self.get_logger().info(f"ready: {self._hand.name} waits for objects")
         self._ready = True
-        self._answers.outlets.tell("ready", "", "node", hand=self._hand.name, base_link=self._hand.base_link)
+        self._responses.publishers.tell("ready", "", "node", hand=self._hand.name, base_link=self._hand.base_link)
 
     def _work(self, request: Request, stop: StopHook) -> Planned:
         with self._announcing:
-            self._answers.started(request)
+            self._responses.started(request)
         try:
-            return self._planner.plan(request, stop, self._answers.progress_hook(request))
+            return self._planner.plan(request, stop, self._responses.progress_hook(request))
         finally:
             trim_heap()

@@ -17,7 +17,7 @@ from graspd_core import HandModel, load_preset, plan_grasps, save_result
 from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
 from graspd_ros.inputs.frames import moved_result
 from graspd_ros.inputs.requests import Request
-from graspd_ros.worker import Ending, Report
+from graspd_ros.worker import Report, WorkerEnding
 
 PATIENCE = 0.15  # seconds that work gets to end by itself when its request is over
 _POLL = 0.02  # seconds between two looks at stop and deadline
@@ -156,7 +156,7 @@ def _empty(request: Request, stop: StopHook) -> Planned:
 
 def overdue() -> Report[Planned]:
     """The end of a request whose deadline passed before its turn came."""
-    return Report(Ending.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, ""), worked_on=False))
+    return Report(WorkerEnding.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, ""), worked_on=False))
 
 
 def limited(tell: ProgressHook, rate: float, since: float = -float("inf")) -> ProgressHook:

@@ -22,7 +22,7 @@ class BusyPolicy(StrEnum):
     REPLACE = "replace"
 
 
-class Ending(StrEnum):
+class WorkerEnding(StrEnum):
     """How a request ended."""
 
     DONE = "done"
@@ -39,7 +39,7 @@ class Refusal(StrEnum):
     STOPPING = "stopping"
 
 
-class Request(Protocol):
+class WorkerRequest(Protocol):
     """What the worker needs to know of a request.
 
     `only_newest` requests wait in a place of their own, where a newer one takes the place of an older.
@@ -51,7 +51,7 @@ class Request(Protocol):
     def only_newest(self) -> bool: ...
 
 
-R = TypeVar("R", bound=Request)
+R = TypeVar("R", bound=WorkerRequest)
 V = TypeVar("V")
 StopHook = Callable[[], bool]
 
@@ -73,7 +73,7 @@ class Admission:
 class Report(Generic[V]):
     """The end of a request: `error` when failed; `value` when done, and what there was when it was told to end."""
 
-    ending: Ending
+    ending: WorkerEnding
     value: V | None = None
     error: BaseException | None = None
 
@@ -106,7 +106,7 @@ class Worker(Generic[R, V]):
         self._newest: R | None = None
         self._running: R | None = None
         self._live: set[str] = set()  # ids of those accepted and not yet told to have ended
-        self._ending: Ending | None = None  # what the running request was told to end as
+        self._ending: WorkerEnding | None = None  # what the running request was told to end as
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="graspd_worker", daemon=True)
 
@@ -129,12 +129,12 @@ class Worker(Generic[R, V]):
                 if policy is BusyPolicy.REPLACE:
                     superseded = list(self._waiting)
                     self._waiting.clear()
-                    self._ending = self._ending or (Ending.SUPERSEDED if self._running else None)
+                    self._ending = self._ending or (WorkerEnding.SUPERSEDED if self._running else None)
                     ahead = int(self._running is not None)
                 self._waiting.append(request)
             self._live.add(request.id)
             self._condition.notify()
-        self._end_all(superseded, Report(Ending.SUPERSEDED))
+        self._end_all(superseded, Report(WorkerEnding.SUPERSEDED))
         return Admission(ahead=ahead)
 
     def _refusal(self, request: R, policy: BusyPolicy, ahead: int) -> Admission | None:
@@ -157,8 +157,8 @@ class Worker(Generic[R, V]):
             dropped = self._take_out(lambda request: request_id in ("", request.id))
             running = self._running is not None and request_id in ("", self._running.id)
             if running:
-                self._ending = Ending.CANCELLED
-        self._end_all(dropped, Report(Ending.CANCELLED))
+                self._ending = WorkerEnding.CANCELLED
+        self._end_all(dropped, Report(WorkerEnding.CANCELLED))
         return len(dropped) + running
 
     def end_waiting(self, which: Callable[[R], bool], report: Report[V]) -> int:
@@ -217,9 +217,9 @@ class Worker(Generic[R, V]):
 
     def _done(self, request: R) -> Report[V]:
         try:
-            return Report(Ending.DONE, value=self._work(request, self._should_stop))
+            return Report(WorkerEnding.DONE, value=self._work(request, self._should_stop))
         except BaseException as error:  # SystemExit too: whatever one request does, the next one is still served
-            return Report(Ending.FAILED, error=error)
+            return Report(WorkerEnding.FAILED, error=error)
 
     def _next(self) -> R | None:
         with self._condition:

@@ -1,15 +1,25 @@
-"""The import rules of docs/architecture.md, read off the sources."""
+"""The rules of docs/architecture.md, read off the sources: imports, sizes, names."""
 
 from __future__ import annotations
 
 import ast
+import io
+import re
+import tokenize
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-MAX_LINES, MAX_FUNCTION_LINES, MAX_POSITIONAL = 350, 50, 7
+MAX_LINES, MAX_FUNCTION_LINES, MAX_POSITIONAL, MAX_FILES = 350, 50, 7, 15
+# Private metaphors of earlier code: none may be part of a name again, nor of a file's.
+METAPHORS = set(
+    "allround atlas court dust elsewhere intake judge judged laps outlets perceive rival rivals rung rungs shelf sighting "
+    "specks synthesise tally trust".split()
+)
 # Functions beyond that which are still to be split; the list may only shrink.
 STILL_TO_SPLIT = {
     "graspd_core/hands/default_postures.py: _around_ball",
@@ -150,6 +160,23 @@ def large_functions(path: str, source: str) -> dict[str, str]:
     return found
 
 
+def crowded_folders(paths: Iterable[str]) -> list[str]:
+    """Folders with too many modules, and basenames that occur twice in a package; an `__init__` counts for neither."""
+    modules = [Path(path) for path in paths if Path(path).stem not in ("__init__", "__main__")]
+    folders = Counter(path.parent.as_posix() for path in modules)
+    names = Counter((path.parts[0], path.name) for path in modules)
+    wrong = [f"{folder}: {n} files, more than {MAX_FILES}" for folder, n in sorted(folders.items()) if n > MAX_FILES]
+    return wrong + [f"{package}: {name} occurs {n} times" for (package, name), n in sorted(names.items()) if n > 1]
+
+
+def metaphors(path: str, source: str) -> list[str]:
+    """Names in a file, its own included, that hold a word which only this project would understand."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    names = {Path(path).stem} | {token.string for token in tokens if token.type == tokenize.NAME}
+    split = {name: re.findall("[a-z]+", re.sub("([A-Z])", r"_\1", name).lower()) for name in names}
+    return sorted(f"{path}: {name}" for name, words in split.items() if METAPHORS & set(words))
+
+
 def sources() -> list[Path]:
     return sorted(path for package in ("graspd_core", "graspd_ros") for path in (ROOT / package).rglob("*.py"))
 
@@ -157,6 +184,30 @@ def sources() -> list[Path]:
 def test_the_house_keeps_its_rules():
     found = [line for path in sources() for line in breaches(str(path.relative_to(ROOT)), path.read_text())]
     assert not found, "\n".join(found)
+
+
+def test_folders_stay_small_and_names_are_the_fields():
+    paths = {str(path.relative_to(ROOT)): path.read_text() for path in sources()}
+    assert crowded_folders(paths) == []
+    assert [line for path, source in paths.items() for line in metaphors(path, source)] == []
+
+
+def test_the_checker_sees_a_crowded_folder_and_a_name_that_occurs_twice():
+    assert crowded_folders([f"graspd_core/mesh/m{i}.py" for i in range(16)]) == [
+        "graspd_core/mesh: 16 files, more than 15"
+    ]
+    assert crowded_folders(["graspd_core/mesh/run.py", "graspd_core/bench/a/run.py"]) == [
+        "graspd_core: run.py occurs 2 times"
+    ]
+    fine = [f"graspd_core/mesh/m{i}.py" for i in range(15)] + ["graspd_core/mesh/__init__.py", "graspd_ros/m1.py"]
+    assert crowded_folders(fine) == []
+
+
+def test_the_checker_sees_a_metaphor():
+    assert metaphors("graspd_core/a.py", "def make_judge(): ...") == ["graspd_core/a.py: make_judge"]
+    assert metaphors("graspd_core/a.py", "class ResultShelf: ...") == ["graspd_core/a.py: ResultShelf"]
+    assert metaphors("graspd_core/atlas.py", "") == ["graspd_core/atlas.py: atlas"]
+    assert metaphors("graspd_core/a.py", "def adjudge(trustee): ...  # a judge") == []
 
 
 def test_functions_stay_small():

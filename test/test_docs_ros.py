@@ -35,7 +35,7 @@ from graspd_ros.inputs.requests import check_request
 from graspd_ros.outputs.error_codes import ErrorCode
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings, check_parameters
-from graspd_ros.worker import Ending
+from graspd_ros.worker import WorkerEnding
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "ros.md").read_text()
@@ -295,7 +295,7 @@ def test_events_are_those_that_the_node_tells():
     told = set()
     for path in (ROOT / "graspd_ros").rglob("*.py"):
         told |= set(re.findall(r"\.tell\(\s*\"(\w+)\"", path.read_text()))
-    told |= {Ending.CANCELLED.value, Ending.SUPERSEDED.value}
+    told |= {WorkerEnding.CANCELLED.value, WorkerEnding.SUPERSEDED.value}
     assert {quoted(row[0])[0] for row in tables("Requests and answers")[3]} == told
 
 

@@ -17,10 +17,10 @@ from graspd_core.formats.read_grasps import grasps_of
 from graspd_core.hands.library import load_hand
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.metrics.measure import measure
+from graspd_core.metrics.metric_registry import METRICS, Metric
 from graspd_core.metrics.metrics_context import make_metrics_context
-from graspd_core.metrics.registry import METRICS, Metric
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.trials.registry import TRIALS, Trial, TrialContext, grasp_trials
+from graspd_core.trials.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
 from graspd_core.trials.world import PROTOCOLS, build_world
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
 from graspd_ros.outputs.messages import grasp_message

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from graspd_core.bench.result_store import Record
-from graspd_core.metrics.registry import METRICS
+from graspd_core.metrics.metric_registry import METRICS
 
 # Shares of grasps that passed a trial; a grasp that was not found did not pass.
 TRIAL_FIGURES = ("standard", "hard", "noisy")

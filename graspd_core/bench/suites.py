@@ -18,8 +18,8 @@ from graspd_core.errors import ConfigError, MeshError
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
 from graspd_core.mesh.shapes import SHAPES, make_shape
+from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset, override, preset_names
-from graspd_core.methods.registry import METHODS
 from graspd_core.paths import config_dir
 
 # Grasps of a raw cell by method: the slow ones are asked for fewer.
@@ -54,7 +54,7 @@ LADDER: Mapping[str, Sequence[Mapping[str, int]]] = {
 
 
 @dataclass(frozen=True)
-class Request:
+class SuiteRequest:
     """What a caller wants run; empty and None mean the suite's own choice.
 
     Attributes:
@@ -84,7 +84,7 @@ class Object:
     sha256: str = field(repr=False)
 
 
-def cells_of(suites: Sequence[str], request: Request) -> tuple[Cell, ...]:
+def cells_of(suites: Sequence[str], request: SuiteRequest) -> tuple[Cell, ...]:
     """All cells of some suites, those of one object next to each other.
 
     Raises:
@@ -105,7 +105,7 @@ def cells_of(suites: Sequence[str], request: Request) -> tuple[Cell, ...]:
     return tuple(dict.fromkeys(cell for name in suites for cell in SUITES[name](request)))
 
 
-def main_suite(request: Request) -> tuple[Cell, ...]:
+def main_suite(request: SuiteRequest) -> tuple[Cell, ...]:
     """Every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
     make = _Maker(request)
     defaults = [name for name in preset_names() if not request.quick or name in _QUICK_PRESETS]
@@ -130,7 +130,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     return tuple(cells)
 
 
-def ladder_suite(request: Request) -> tuple[Cell, ...]:
+def ladder_suite(request: SuiteRequest) -> tuple[Cell, ...]:
     """Each of four settings from poor to rich, one at a time."""
     make = _Maker(request)
     base = load_preset(_LADDER_PRESET)
@@ -138,14 +138,14 @@ def ladder_suite(request: Request) -> tuple[Cell, ...]:
     count = request.count or (_QUICK_COUNT if request.quick else METHODS[base.method].benchmark_count)
     cells: list[Cell] = []
     for thing in objects:
-        for ladder, rungs in LADDER.items():
-            for changes in rungs:
-                name = rung_name(ladder, changes)
+        for ladder, sweep_values in LADDER.items():
+            for changes in sweep_values:
+                name = sweep_name(ladder, changes)
                 cells += make("raw", name, override(base, changes), thing, count, request.trials or _LADDER_TRIALS)
     return tuple(cells)
 
 
-def hands_suite(request: Request) -> tuple[Cell, ...]:
+def hands_suite(request: SuiteRequest) -> tuple[Cell, ...]:
     """Every hand in the box with one preset."""
     objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
     base, count = load_preset(_LADDER_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
@@ -157,14 +157,14 @@ def hands_suite(request: Request) -> tuple[Cell, ...]:
     return tuple(cells)
 
 
-SUITES: dict[str, Callable[[Request], tuple[Cell, ...]]] = {
+SUITES: dict[str, Callable[[SuiteRequest], tuple[Cell, ...]]] = {
     "main": main_suite,
     "ladder": ladder_suite,
     "hands": hands_suite,
 }
 
 
-def rung_name(ladder: str, changes: Mapping[str, int]) -> str:
+def sweep_name(ladder: str, changes: Mapping[str, int]) -> str:
     """Name of a rung's cells: the ladder and its value (steps: all of them together)."""
     return f"{ladder}={sum(changes.values()):g}"
 
@@ -202,14 +202,14 @@ def _file(path: Path) -> Object:
     return Object(str(path), hashlib.sha256(path.read_bytes()).hexdigest())
 
 
-def _count(request: Request, config: PlanConfig) -> int:
+def _count(request: SuiteRequest, config: PlanConfig) -> int:
     return request.count or (_QUICK_COUNT if request.quick else METHODS[config.method].benchmark_count)
 
 
 class _Maker:
     """Makes cells of one request's hand and seeds."""
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: SuiteRequest) -> None:
         self.request = request
         self.hand_hash = hand_hash(request.hand)
 

@@ -12,7 +12,7 @@ from graspd_core.bench.names import is_hand, is_preset
 from graspd_core.bench.result_store import Record
 from graspd_core.errors import ConfigError
 from graspd_core.formats.grasps_json import save_text
-from graspd_core.metrics.registry import METRICS
+from graspd_core.metrics.metric_registry import METRICS
 
 _PLANNED = ("first_wall", "cpu_per_verified", "rounds")
 _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "cpu_per_grasp", "cpu_per_verified")

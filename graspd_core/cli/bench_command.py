@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.bench.benchmark_workers import run_cells
     from graspd_core.bench.measurements.measurement import code_version
     from graspd_core.bench.result_store import read_cells, read_results, write_results
-    from graspd_core.bench.suites import Request, cells_of
+    from graspd_core.bench.suites import SuiteRequest, cells_of
     from graspd_core.formats.grasps_json import check_writable
 
     if options.processes < 1:
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
         return stress.run(options)
     if options.cases or "stress" in (options.suite or ()):
         raise ConfigError("suite: stress is run by itself, and it alone has cases; valid: --suite stress [--cases …]")
-    request = Request(
+    request = SuiteRequest(
         presets=tuple(options.presets),
         objects=tuple(options.objects),
         seeds=tuple(options.seeds),

@@ -9,8 +9,8 @@ from typing import Any
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
+from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
-from graspd_core.methods.registry import METHODS
 from graspd_core.types import GraspResult, Outcome, Verdict
 
 # Metrics in the summary of a run.
@@ -58,7 +58,7 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
     """A few lines for a person; so many of the good grasps are `different`."""
-    from graspd_core.metrics.registry import METRICS
+    from graspd_core.metrics.metric_registry import METRICS
 
     good = good_grasps(result)
     kind = "unverified" if any(g.verdict is Verdict.UNVERIFIED for g in result.grasps) else "verified"

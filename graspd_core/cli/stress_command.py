@@ -15,7 +15,7 @@ def run(options: argparse.Namespace) -> int:
     """Returns the exit status: 0, 1 where an ending was wrong, 130 after Ctrl-C; endings are kept either way."""
     from graspd_core.bench.measurements.measurement import code_version
     from graspd_core.bench.stress.run_stress_case import faults
-    from graspd_core.bench.stress.stress_suite import Shelf, cases_of, run_cases
+    from graspd_core.bench.stress.stress_suite import EndingStore, cases_of, run_cases
     from graspd_core.bench.stress.stress_table import stress_table, summary
     from graspd_core.bench.tables import fill
     from graspd_core.methods.plan_config import load_preset
@@ -25,15 +25,15 @@ def run(options: argparse.Namespace) -> int:
     preset = (options.presets or ["balanced"])[0]
     load_preset(preset)
     cases = cases_of(options.cases)
-    shelf = Shelf(options.out, preset, code_version("stress"), any_code=options.any_code or options.no_run)
-    kept = {case: found for case in cases if (found := shelf.read(case)) is not None}
+    store = EndingStore(options.out, preset, code_version("stress"), any_code=options.any_code or options.no_run)
+    kept = {case: found for case in cases if (found := store.read(case)) is not None}
     endings = {case: ending for case, (ending, _) in kept.items()}
     codes = {code for _, code in kept.values()}
     todo = [] if options.no_run else [case for case in cases if case not in endings]
     with Interrupt() as interrupt:
-        for case, ending in run_cases(todo, shelf, options.processes, interrupt.came):
+        for case, ending in run_cases(todo, store, options.processes, interrupt.came):
             endings[case] = ending
-            codes.add(shelf.code)
+            codes.add(store.code)
             wrong = "".join(f"\n  {fault}" for fault in faults(case, ending))
             took = f"{ending.loading + ending.planning:.1f} s"
             print(f"graspd: {len(endings)}/{len(cases)} {case.name}: {ending.ending}, {took}{wrong}", file=sys.stderr)

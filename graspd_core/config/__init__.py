@@ -5,14 +5,14 @@ from __future__ import annotations
 import typing
 from typing import Literal
 
-from graspd_core.config.grasp_stages import GraspStagesConfig
+from graspd_core.config.grasp_stages_config import GraspStagesConfig
 from graspd_core.config.mapping import from_mapping
-from graspd_core.config.problem import ProblemConfig
-from graspd_core.config.reconstruction import ReconstructionConfig
-from graspd_core.config.robust import RobustConfig
-from graspd_core.config.rounds import RoundsConfig
+from graspd_core.config.problem_config import ProblemConfig
+from graspd_core.config.reconstruction_config import ReconstructionConfig
+from graspd_core.config.robust_config import RobustConfig
+from graspd_core.config.rounds_config import RoundsConfig
 from graspd_core.config.scene_config import ObstacleConfig, SceneConfig, load_scene_config
-from graspd_core.config.segmentation import SegmentationConfig
+from graspd_core.config.segmentation_config import SegmentationConfig
 
 __all__ = [
     "VERIFICATIONS",

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.config.mapping import from_mapping, read_yaml
-from graspd_core.config.reconstruction import ReconstructionConfig
-from graspd_core.config.segmentation import SegmentationConfig
+from graspd_core.config.reconstruction_config import ReconstructionConfig
+from graspd_core.config.segmentation_config import SegmentationConfig
 from graspd_core.errors import ConfigError
 
 # Below these nothing is left to work with; every other number is above zero.

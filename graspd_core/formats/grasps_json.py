@@ -15,7 +15,7 @@ import numpy as np
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.methods.plan_config import PlanConfig, to_mapping
-from graspd_core.metrics.registry import METRICS
+from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.scene.scene import ObjectModel
 from graspd_core.types import Grasp, GraspResult, Posture
 

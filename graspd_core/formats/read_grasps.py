@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from graspd_core.errors import FormatError, shown
 from graspd_core.formats.grasps_json import FORMAT, VERSION
-from graspd_core.metrics.registry import METRICS
+from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
 
 

@@ -107,9 +107,9 @@ def check_mesh(
         mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
     if dusty:
         # Before all else that is said of the mesh: its size and its holes could be the dust's.
-        mesh, specks = drop_small_components(mesh)
-        if specks:
-            warnings.append(f"{source}: dropped {specks} tiny pieces that float clear of the rest")
+        mesh, small = drop_small_components(mesh)
+        if small:
+            warnings.append(f"{source}: dropped {small} tiny pieces that float clear of the rest")
     faces = mesh.faces
     if not is_oriented(faces):
         faces = orient(mesh.vertices, faces)

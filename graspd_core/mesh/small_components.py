@@ -37,9 +37,9 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     asked = tiny[piece]
     distance = surface_distance(rest, corners[asked].reshape(-1, 3)).reshape(-1, 3).min(1)
     np.minimum.at(gap, piece[asked], distance)
-    dust = tiny & (gap > extent)
-    used, compact = np.unique(mesh.faces[~dust[piece]], return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(dust.sum())
+    small = tiny & (gap > extent)
+    used, compact = np.unique(mesh.faces[~small[piece]], return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(small.sum())
 
 
 def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:

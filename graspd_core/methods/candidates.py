@@ -22,12 +22,12 @@ from graspd_core.methods.grasp_stages import (
     squeeze,
 )
 from graspd_core.methods.loop import Hooks
+from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.obstacle_distance import intrusion
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-from graspd_core.methods.registry import METHODS
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 

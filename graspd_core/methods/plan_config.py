@@ -11,7 +11,7 @@ from typing import Any
 from graspd_core.config import GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
 from graspd_core.config.mapping import coerced, read_yaml
 from graspd_core.errors import ConfigError, shown
-from graspd_core.methods.registry import METHODS
+from graspd_core.methods.method_registry import METHODS
 from graspd_core.paths import config_dir
 
 _DEFAULT_METHOD = "closed_form"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.metrics.metrics_context import MetricsContext
 from graspd_core.metrics.prepared_grasp import MAX_CONTACTS, prepare_grasp
-from graspd_core.metrics.registry import METRICS
 from graspd_core.types import GraspMetrics, Posture
 
 

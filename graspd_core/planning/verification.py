@@ -15,7 +15,7 @@ from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_con
 from graspd_core.planning.run_clock import Run
 from graspd_core.scene.scene import Scene, object_parts
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
-from graspd_core.trials.registry import TrialContext, build_worlds, grasp_trials
+from graspd_core.trials.trial_registry import TrialContext, build_worlds, grasp_trials
 from graspd_core.trials.world import PROTOCOLS, at_friction
 from graspd_core.types import Grasp, GraspMetrics, Stage, TriangleMesh, Verdict
 

@@ -107,14 +107,14 @@ def _make_view_depth(view: PointCloud) -> ViewDepth | None:
 
 def empty_depth(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
     """How deep points lie in the support, or in space that a camera saw to be empty [m]; 0: nothing is against them."""
-    return _judge(free_space, points, None)[1]
+    return _classify(free_space, points, None)[1]
 
 
 def weigh(
     free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
-    confirmed, deep = _judge(free_space, points, normals)
+    confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
 
@@ -139,7 +139,7 @@ def facing(
     return most
 
 
-def _judge(
+def _classify(
     free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"] | None
 ) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     confirmed = np.zeros(points.shape[:-1], dtype=bool)

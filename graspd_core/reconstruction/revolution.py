@@ -77,9 +77,9 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
     profile = _profile(rows[fits], step)
     right = perpendicular(axis.direction)
     up = np.cross(axis.direction, right)
-    judged = _ring(profile, axis, right, up, np.full(len(profile), RING_SAMPLES))
+    scored = _ring(profile, axis, right, up, np.full(len(profile), RING_SAMPLES))
     row = np.repeat(np.arange(len(profile)), RING_SAMPLES)
-    confirmed, wrong = weigh(free_space, judged.points, judged.normals)
+    confirmed, wrong = weigh(free_space, scored.points, scored.normals)
     good = np.bincount(row, wrong) / RING_SAMPLES < MAX_CONTRADICTED_SHARE
     if good.sum() < 5:
         return None

@@ -120,17 +120,17 @@ def _best_plane(
     size = float((high - low).max())
     tried = np.repeat(normals, PLANE_OFFSETS, 0)
     place = (low[:, None] + (high - low)[:, None] * np.linspace(-0.1, 1.1, PLANE_OFFSETS)).reshape(-1)
-    judged = _rough(sample)
+    scored = _rough(sample)
     for finer in (1, 3, 9):
         linear = np.eye(3) - 2 * np.einsum("ki,kj->kij", tried, tried)
         shift = 2 * (place + tried @ pivot)[:, None] * tried
-        which, best = _pick(linear, shift, judged, free_space, score)
+        which, best = _pick(linear, shift, scored, free_space, score)
         normal, at = tried[which], place[which]
         # Around the best: turned a little, moved a little.
         turned = _around(normal, 0.1 / finer, free_space.standing)
         moves = np.linspace(-0.02, 0.02, 9) * size / finer
         tried, place = np.repeat(turned, len(moves), 0), at + np.tile(moves, len(turned))
-        judged = sample
+        scored = sample
     return best, normal  # pyright: ignore[reportPossiblyUnboundVariable]
 
 

@@ -68,12 +68,12 @@ class RequestBuilder:
         load = self._mesh_loader(uri, settings)
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True)
 
-    def from_sighting(self, request_id: str, settings: Settings, sighting: SensorFrame) -> Request:
+    def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
         """What a camera showed unasked. Raises RequestError: it is too old."""
-        sighting.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        load = _loader(lambda: (trimmed(sighting.read(), settings),), settings, None)
+        sensor_frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
+        load = _loader(lambda: (trimmed(sensor_frame.read(), settings),), settings, None)
         newest = settings.cloud_policy == "newest"
-        return Request(request_id, "cloud", sighting.frame, sighting.stamp, settings, load, only_newest=newest)
+        return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
 
     def from_message(
         self, request_id: str, settings: Settings, message: GraspRequest, listener: Listener | None = None
@@ -97,9 +97,11 @@ class RequestBuilder:
                 frame, stamp = views.frame, views.stamp
                 load = _loader(lambda: views.clouds, settings, self._target(message, frame))
             case _:
-                sighting = self._sighting(message, settings)
-                frame, stamp = sighting.frame, sighting.stamp
-                load = _loader(lambda: (trimmed(sighting.read(), settings),), settings, self._target(message, frame))
+                sensor_frame = self._sensor_frame(message, settings)
+                frame, stamp = sensor_frame.frame, sensor_frame.stamp
+                load = _loader(
+                    lambda: (trimmed(sensor_frame.read(), settings),), settings, self._target(message, frame)
+                )
         timeless = nanoseconds(stamp) == 0
         return Request(
             request_id,
@@ -113,12 +115,12 @@ class RequestBuilder:
             timeless=timeless,
         )
 
-    def _sighting(self, message: GraspRequest, settings: Settings) -> SensorFrame:
+    def _sensor_frame(self, message: GraspRequest, settings: Settings) -> SensorFrame:
         if message.source == GraspRequest.LATEST_CLOUD:
             return self._newest(settings)
-        sighting = cloud_frame(message.cloud, nanoseconds(self._now()))
-        sighting.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        return sighting
+        sensor_frame = cloud_frame(message.cloud, nanoseconds(self._now()))
+        sensor_frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
+        return sensor_frame
 
     def _newest(self, settings: Settings) -> SensorFrame:
         if self.newest is None:

@@ -84,7 +84,9 @@ class Views:
     stamp: Time = field(default_factory=Time)
     clouds: tuple[PointCloud, ...] = ()
 
-    def add(self, sighting: SensorFrame, settings: Settings, lookup: Callable[[str, str, Time], np.ndarray]) -> Views:
+    def add(
+        self, sensor_frame: SensorFrame, settings: Settings, lookup: Callable[[str, str, Time], np.ndarray]
+    ) -> Views:
         """With one more view, moved to the frame of the others (the settings' fixed_frame, or that of the first).
 
         Args:
@@ -98,14 +100,14 @@ class Views:
         """
         if len(self.clouds) >= MOST_VIEWS:
             raise RequestError(ErrorCode.BAD_REQUEST, f"{MOST_VIEWS} views are kept already; call ~/reset_views first")
-        frame = self.frame or settings.fixed_frame or sighting.frame
-        cloud = trimmed(sighting.read(), settings)
+        frame = self.frame or settings.fixed_frame or sensor_frame.frame
+        cloud = trimmed(sensor_frame.read(), settings)
         if len(cloud.points) > MOST_VIEW_POINTS:
             every = -(-len(cloud.points) // MOST_VIEW_POINTS)
             cloud = PointCloud(cloud.points[::every], cloud.viewpoint, cloud.forward)
-        if frame != sighting.frame:
-            cloud = transform_cloud(cloud, lookup(frame, sighting.frame, sighting.stamp))
-        return Views(frame, sighting.stamp, (*self.clouds, cloud))
+        if frame != sensor_frame.frame:
+            cloud = transform_cloud(cloud, lookup(frame, sensor_frame.frame, sensor_frame.stamp))
+        return Views(frame, sensor_frame.stamp, (*self.clouds, cloud))
 
 
 def scene_of_views(

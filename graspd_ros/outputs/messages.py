@@ -40,7 +40,7 @@ _SHORT = {
 
 
 @dataclass(frozen=True)
-class Ending:
+class AnswerEnding:
     """How a request ended, in the words of a GraspArray.
 
     Attributes:
@@ -56,19 +56,19 @@ class Ending:
     result: GraspResult | None = None
 
 
-def ending_of(result: GraspResult) -> Ending:
+def ending_of(result: GraspResult) -> AnswerEnding:
     """The ending of a run that nobody stopped."""
     message = result.message or result.outcome.value
     if result.outcome is Outcome.SUCCEEDED:
-        return Ending(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
+        return AnswerEnding(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
     if result.outcome is Outcome.CANCELLED:
-        return Ending(GraspArray.CANCELLED, ErrorCode.CANCELLED, message, result)
+        return AnswerEnding(GraspArray.CANCELLED, ErrorCode.CANCELLED, message, result)
     some = any(grasp.verdict is not Verdict.FAILED for grasp in result.grasps)
-    return Ending(GraspArray.PARTIAL if some else GraspArray.FAILED, _SHORT[result.outcome], message, result)
+    return AnswerEnding(GraspArray.PARTIAL if some else GraspArray.FAILED, _SHORT[result.outcome], message, result)
 
 
 def array_message(
-    ending: Ending, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
+    ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
     """The one answer to a request; `elapsed` seconds after it came. Raises FloatingPointError: a grasp holds a NaN."""
     message = GraspArray(

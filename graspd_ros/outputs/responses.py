@@ -26,7 +26,7 @@ from graspd_ros.outputs.markers import result_markers
 from graspd_ros.outputs.publishers import Publishers
 from graspd_ros.outputs.trajectory import Pace
 from graspd_ros.request_planner import Planned, limited
-from graspd_ros.worker import Admission, Ending, Refusal, Report
+from graspd_ros.worker import Admission, Refusal, Report, WorkerEnding
 
 COUNT_PERIOD = 1.0  # seconds between two counts of superseded clouds, and between two complaints about clouds
 _REFUSALS = {
@@ -35,8 +35,10 @@ _REFUSALS = {
     Refusal.STOPPING: ErrorCode.SHUTTING_DOWN,
 }
 _ENDINGS = {
-    Ending.CANCELLED: messages.Ending(GraspArray.CANCELLED, ErrorCode.CANCELLED, "cancelled"),
-    Ending.SUPERSEDED: messages.Ending(GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, "a newer request took its place"),
+    WorkerEnding.CANCELLED: messages.AnswerEnding(GraspArray.CANCELLED, ErrorCode.CANCELLED, "cancelled"),
+    WorkerEnding.SUPERSEDED: messages.AnswerEnding(
+        GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, "a newer request took its place"
+    ),
 }
 
 
@@ -44,8 +46,8 @@ class Responses:
     """Tells of requests through `outlets`, and counts them in `tally`."""
 
     def __init__(self, node: Node, hand: HandModel) -> None:
-        self.outlets = Publishers(node)
-        self.tally = Counters()
+        self.publishers = Publishers(node)
+        self.counters = Counters()
         self._node = node
         self._hand = hand
         self._superseded = 0
@@ -53,9 +55,9 @@ class Responses:
 
     def forget(self) -> None:
         """As after a start: no counts, and late joiners get nothing from before now but the last answer."""
-        self.outlets.publish(result_markers((), self._hand, "", self._now()))
-        self.outlets.forget()
-        self.tally.clear()
+        self.publishers.publish(result_markers((), self._hand, "", self._now()))
+        self.publishers.forget()
+        self.counters.clear()
 
     # Taken or not.
 
@@ -63,16 +65,18 @@ class Responses:
         """A request was taken, or not."""
         if admission.refusal is not None:
             code, message = _REFUSALS[admission.refusal], admission.reason
-            self.outlets.tell("refused", request.id, request.source, code=code, message=message)
+            self.publishers.tell("refused", request.id, request.source, code=code, message=message)
             self._log().warning(f"{request.id}: refused: {message}")
-            self._publish(self._answer(request, messages.Ending(GraspArray.REFUSED, code, message)), request.listener)
+            self._publish(
+                self._answer(request, messages.AnswerEnding(GraspArray.REFUSED, code, message)), request.listener
+            )
         elif not request.only_newest:
             self._accepted(request, admission.ahead)
 
     def not_made(self, request_id: str, source: str, error: Exception, listener: Listener | None = None) -> None:
         """A message that is no valid request."""
         self.tell_error(request_id[:MOST_ID], source, error)
-        ending = messages.Ending(GraspArray.REFUSED, code_of(error), sentence_of(error))
+        ending = messages.AnswerEnding(GraspArray.REFUSED, code_of(error), sentence_of(error))
         header = Header(stamp=self._now())
         self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
 
@@ -83,8 +87,8 @@ class Responses:
             self.not_made(request_id, "cloud", error)
 
     def _accepted(self, request: Request, ahead: int) -> None:
-        self.tally.count("accepted")
-        self.outlets.tell("accepted", request.id, request.source, ahead=ahead)
+        self.counters.count("accepted")
+        self.publishers.tell("accepted", request.id, request.source, ahead=ahead)
         if ahead:
             self._report(request, messages.queued_message(request.id, request.frame_out, self._now(), ahead))
 
@@ -102,14 +106,14 @@ class Responses:
         def tell(progress: Progress) -> None:
             elapsed = request.elapsed()
             event = {**convert.progress_event(progress), "elapsed": elapsed}
-            self.outlets.tell("progress", request.id, request.source, **event)
+            self.publishers.tell("progress", request.id, request.source, **event)
             message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
             self._report(request, message)
 
         return limited(tell, request.settings.progress_rate)
 
     def _report(self, request: Request, message: GraspProgress) -> None:
-        self.outlets.publish(message)
+        self.publishers.publish(message)
         if request.listener is not None:
             request.listener.progressed(message)
 
@@ -121,7 +125,7 @@ class Responses:
             self._finished(request, report)
         except Exception as error:  # whatever is wrong with a result, its client is not left waiting
             try:
-                self._finished(request, Report(Ending.FAILED, error=error))
+                self._finished(request, Report(WorkerEnding.FAILED, error=error))
             except Exception as again:  # and the worker's thread goes on
                 self._log().error(f"{request.id}: not answered:\n{''.join(traceback.format_exception(again))}")
 
@@ -129,18 +133,20 @@ class Responses:
         if report.error is not None:
             self.tell_error(request.id, request.source, report.error)
             code, message = code_of(report.error), sentence_of(report.error)
-            self._publish(self._answer(request, messages.Ending(GraspArray.FAILED, code, message)), request.listener)
-        elif report.ending is Ending.DONE and report.value is not None:
+            self._publish(
+                self._answer(request, messages.AnswerEnding(GraspArray.FAILED, code, message)), request.listener
+            )
+        elif report.ending is WorkerEnding.DONE and report.value is not None:
             self._result(request, report.value)
-        elif report.ending is Ending.SUPERSEDED and request.only_newest and report.value is None:
+        elif report.ending is WorkerEnding.SUPERSEDED and request.only_newest and report.value is None:
             self._superseded += 1
-            self.tally.count("clouds_superseded")
+            self.counters.count("clouds_superseded")
             if time.monotonic() - self._superseded_told >= COUNT_PERIOD:
                 self._tell_superseded(request.id)
         else:
             found = report.value.result if report.value else None
             answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], result=found))
-            self.outlets.tell(report.ending.value, request.id, request.source)
+            self.publishers.tell(report.ending.value, request.id, request.source)
             self._publish(answer, request.listener)
 
     def _result(self, request: Request, planned: Planned) -> None:
@@ -156,21 +162,21 @@ class Responses:
         if request.settings.publish_markers and planned.worked_on:
             shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp))
         for message in shown:
-            self.outlets.publish(message)
-        self.outlets.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
+            self.publishers.publish(message)
+        self.publishers.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
         self._log().info(f"{request.id}: {event['verified']} of {event['grasps']} verified: {event['message']}")
-        self.tally.planned(result, request.elapsed())
+        self.counters.planned(result, request.elapsed())
         self._publish(answer, request.listener)
 
-    def _answer(self, request: Request, ending: messages.Ending) -> GraspArray:
+    def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
         settings = request.settings
         pace = Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
         return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, pace)
 
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
-        self.tally.answered(message)
-        self.outlets.publish(message)
+        self.counters.answered(message)
+        self.publishers.publish(message)
         if listener is not None:
             try:
                 listener.ended(message)
@@ -182,7 +188,7 @@ class Responses:
     def tell_error(self, request_id: str, source: str, error: BaseException) -> None:
         """An error on ~/status and in the log."""
         message, kind, code = sentence_of(error), type(error).__name__, code_of(error)
-        self.outlets.tell("error", request_id, source, kind=kind, code=code, message=message)
+        self.publishers.tell("error", request_id, source, kind=kind, code=code, message=message)
         expected = isinstance(error, GraspdError | OSError)
         detail = "" if expected else "\n" + "".join(traceback.format_exception(error))
         self._log().error(f"{request_id or source}: {message}{detail}")
@@ -192,7 +198,7 @@ class Responses:
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_told = time.monotonic()
-            self.outlets.tell("superseded", request_id, "cloud", count=count)
+            self.publishers.tell("superseded", request_id, "cloud", count=count)
 
     def _now(self) -> Time:
         return self._node.get_clock().now().to_msg()

@@ -18,7 +18,7 @@ from graspd_core.bench.failure_maps import friction_mass
 from graspd_core.bench.failure_maps import object_size as size
 from graspd_core.bench.failure_maps import wall_thickness as wall
 from graspd_core.bench.failure_maps.map_job import Job, hand_for, job_key, kind_of, run_job
-from graspd_core.bench.failure_maps.map_registry import COUNT, MAPS, METHODS, Axis, jobs_of
+from graspd_core.bench.failure_maps.map_registry import COUNT, MAPS, METHODS, MapAxis, jobs_of
 from graspd_core.bench.failure_maps.run_map_jobs import (
     finished,
     job_file,
@@ -171,7 +171,7 @@ def test_rows_of_which_nothing_is_known_are_left_out(tmp_path: Path):
 
 
 def test_a_map_with_nothing_in_it_is_drawn_empty(tmp_path: Path):
-    drawn = replace(MAPS["size"], across=Axis("x", (1.0,)), up=Axis("y", ("box",)))
+    drawn = replace(MAPS["size"], across=MapAxis("x", (1.0,)), up=MapAxis("y", ("box",)))
     assert draw_map(drawn, {"none": {}}, tmp_path / "empty").is_file()
 
 

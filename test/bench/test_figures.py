@@ -16,7 +16,7 @@ from graspd_core.bench.figures import by_name, per_verified, rows, spread
 from graspd_core.bench.names import parent_of, short_name
 from graspd_core.bench.pareto import pareto_front
 from graspd_core.errors import ConfigError
-from graspd_core.metrics.registry import METRICS, Metric
+from graspd_core.metrics.metric_registry import METRICS, Metric
 
 # Small whole numbers, so that points are often equal on an axis.
 POINTS = arrays(np.float64, st.tuples(st.integers(1, 12), st.integers(1, 3)), elements=st.integers(0, 5).map(float))

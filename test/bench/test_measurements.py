@@ -12,12 +12,12 @@ import pytest
 from graspd_core.bench import result_store as store
 from graspd_core.bench.measurements import run_measurement as run
 from graspd_core.bench.measurements.measurement import Cell, cell_file, cell_key, code_version
-from graspd_core.bench.suites import SUITES, Request, cells_of, find_objects
+from graspd_core.bench.suites import SUITES, SuiteRequest, cells_of, find_objects
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
+from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset, override, to_mapping
-from graspd_core.methods.registry import METHODS
 from graspd_core.types import TriangleMesh
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "f00", "allegro_right", "f11", 0, 4, ("standard", "hard"))
@@ -137,9 +137,9 @@ def test_results_are_read_back_and_other_files_refused(tmp_path: Path):
 
 def test_every_suite_makes_cells_of_its_own(tmp_path: Path):
     for name in SUITES:
-        cells = cells_of([name], Request(quick=True))
+        cells = cells_of([name], SuiteRequest(quick=True))
         assert len({cell_key(cell) for cell in cells}) == len(cells) > 0
-    both = cells_of(["main", "ladder", "main"], Request(seeds=(0, 1)))
+    both = cells_of(["main", "ladder", "main"], SuiteRequest(seeds=(0, 1)))
     assert len({cell_key(cell) for cell in both}) == len(both)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from graspd_core.bench.stress.run_stress_case import Ending, faults, run_case
+from graspd_core.bench.stress.run_stress_case import StressEnding, faults, run_case
 from graspd_core.bench.stress.stress_case import GRASP
 from graspd_core.bench.stress.stress_cases import CASES
 from graspd_core.types import Outcome
@@ -34,7 +34,7 @@ def test_what_shows_nothing_is_refused_in_one_line(name: str):
 
 def test_faults_are_named():
     case = replace(CASES["open-box"], deadline=2.0, loading=1.0, memory=500.0)
-    fine = Ending("open-box", GRASP, "", 0.5, 2.4, 400.0, 3, 2, 2)
+    fine = StressEnding("open-box", GRASP, "", 0.5, 2.4, 400.0, 3, 2, 2)
     assert faults(case, fine) == ()
     for changed, word in (
         ({"ending": "crash", "message": "boom"}, "ended in crash"),

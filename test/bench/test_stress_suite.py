@@ -9,35 +9,35 @@ from pathlib import Path
 import pytest
 
 from graspd_core.bench.stress import stress_suite as suite
-from graspd_core.bench.stress.run_stress_case import Ending
+from graspd_core.bench.stress.run_stress_case import StressEnding
 from graspd_core.bench.stress.stress_case import GRASP
 from graspd_core.bench.stress.stress_cases import CASES
-from graspd_core.bench.stress.stress_suite import Shelf, cases_of, run_cases
+from graspd_core.bench.stress.stress_suite import EndingStore, cases_of, run_cases
 from graspd_core.bench.stress.stress_table import stress_table, summary
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
 from graspd_core.errors import ConfigError
 
 BOX, NAN = CASES["open-box"], CASES["nan-vertices"]
-GRASPED = Ending("open-box", GRASP, "open | closed", 0.5, 2.4, 400.0, 3, 2, 2)
+GRASPED = StressEnding("open-box", GRASP, "open | closed", 0.5, 2.4, 400.0, 3, 2, 2)
 
 
 def test_a_case_ends_in_a_process_of_its_own_and_a_death_is_an_ending(tmp_path: Path):
-    shelf = Shelf(tmp_path, "fast", "here")
+    store = EndingStore(tmp_path, "fast", "here")
     nobody = replace(NAN, name="not-a-case")
-    endings = {case.name: ending for case, ending in run_cases([NAN, nobody], shelf, processes=2)}
+    endings = {case.name: ending for case, ending in run_cases([NAN, nobody], store, processes=2)}
     assert endings["nan-vertices"].ending == "MeshError"
     assert "nan-vertices.obj: 3 of " in endings["nan-vertices"].message
     assert endings["not-a-case"].ending == "crash"
     assert endings["not-a-case"].message.startswith("exit status 2; ")
     assert "not-a-case" in endings["not-a-case"].message
-    assert shelf.read(NAN) == (endings["nan-vertices"], "here")
+    assert store.read(NAN) == (endings["nan-vertices"], "here")
 
 
 def test_nothing_of_a_case_is_remembered_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Else it would load faster the second time."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    ((_, ending),) = run_cases([CASES["too-wide"]], Shelf(tmp_path, "fast", "here"), processes=1)
+    ((_, ending),) = run_cases([CASES["too-wide"]], EndingStore(tmp_path, "fast", "here"), processes=1)
     assert ending.ending in CASES["too-wide"].expect
     assert not (tmp_path / "cache" / "graspd").exists()
 
@@ -45,24 +45,24 @@ def test_nothing_of_a_case_is_remembered_on_disk(tmp_path: Path, monkeypatch: py
 def test_a_process_that_does_not_end_is_killed_and_called_hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(suite, "_PATIENCE", 0.0)
     hasty = replace(BOX, loading=0.1, deadline=0.1)
-    ((_, ending),) = run_cases([hasty], Shelf(tmp_path, "fast", "here"), processes=1)
+    ((_, ending),) = run_cases([hasty], EndingStore(tmp_path, "fast", "here"), processes=1)
     assert ending.ending == "hang"
 
 
 def test_nothing_is_begun_once_stopped(tmp_path: Path):
-    assert list(run_cases([NAN], Shelf(tmp_path, "fast", "here"), 1, stop=lambda: True)) == []
+    assert list(run_cases([NAN], EndingStore(tmp_path, "fast", "here"), 1, stop=lambda: True)) == []
     assert not list(tmp_path.iterdir())
 
 
 def test_an_ending_counts_for_its_code_and_preset_alone(tmp_path: Path):
-    Shelf(tmp_path, "fast", "here").write(GRASPED, BOX)
-    assert Shelf(tmp_path, "fast", "here").read(BOX) == (GRASPED, "here")
-    assert Shelf(tmp_path, "fast", "there", any_code=True).read(BOX) == (GRASPED, "here")
-    assert Shelf(tmp_path, "fast", "there").read(BOX) is None
-    assert Shelf(tmp_path, "balanced", "here").read(BOX) is None
-    path = Shelf(tmp_path, "fast", "here").path(BOX)
+    EndingStore(tmp_path, "fast", "here").write(GRASPED, BOX)
+    assert EndingStore(tmp_path, "fast", "here").read(BOX) == (GRASPED, "here")
+    assert EndingStore(tmp_path, "fast", "there", any_code=True).read(BOX) == (GRASPED, "here")
+    assert EndingStore(tmp_path, "fast", "there").read(BOX) is None
+    assert EndingStore(tmp_path, "balanced", "here").read(BOX) is None
+    path = EndingStore(tmp_path, "fast", "here").path(BOX)
     path.write_text(json.dumps({**json.loads(path.read_text()), "ending": {"odd": 1}}))
-    assert Shelf(tmp_path, "fast", "here").read(BOX) is None
+    assert EndingStore(tmp_path, "fast", "here").read(BOX) is None
 
 
 def test_cases_are_chosen_by_name_and_family():
@@ -73,7 +73,7 @@ def test_cases_are_chosen_by_name_and_family():
 
 
 def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
-    wrong = Ending("nan-vertices", GRASP, "", 0.1, 30.0, 300.0, 2, 1, 0)
+    wrong = StressEnding("nan-vertices", GRASP, "", 0.1, 30.0, 300.0, 2, 1, 0)
     told = summary({BOX: GRASPED, NAN: wrong})
     assert told.startswith("2 cases, 4 faults. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
     assert "2 of 3 verified grasps hold in a second trial." in told
@@ -85,7 +85,7 @@ def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
 
 
 def test_the_command_reports_kept_endings_and_fills_a_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    Shelf(tmp_path, "balanced", "here").write(GRASPED, BOX)
+    EndingStore(tmp_path, "balanced", "here").write(GRASPED, BOX)
     page = tmp_path / "page.md"
     sections = ("stress-summary", "stress")
     page.write_text("".join(f"<!-- {name}:begin -->\nbygone\n<!-- {name}:end -->\n" for name in sections))

@@ -19,7 +19,7 @@ from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mount
 from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.metrics.registry import METRICS
+from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import (
     Contact,

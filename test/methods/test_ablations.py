@@ -15,10 +15,10 @@ from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.losses import hard_contact, soft_contact
+from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.methods.poses import pack
 from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
-from graspd_core.methods.registry import METHODS
 
 DEFAULT = ClosedFormConfig()
 DOUBLE = torch.float64

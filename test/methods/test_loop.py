@@ -64,8 +64,8 @@ def test_it_reports_every_step_and_the_last_one_always(problem, starts):
     assert [x[:2] for x in every] == [(i, 10) for i in range(1, 11)]
     assert all(x[2] < float("inf") for x in every)
     # Once iterates are judged, the best loss never rises.
-    judged = [x[2] for x in every[-CONFIG.polish_steps :]]
-    assert judged == sorted(judged, reverse=True)
+    scored = [x[2] for x in every[-CONFIG.polish_steps :]]
+    assert scored == sorted(scored, reverse=True)
     few: list[int] = []
     minimise(ClosedForm(CONFIG, STARTS), problem, starts, Hooks(report=lambda i, *_: few.append(i), interval=1e6))
     assert few == [1, 10]

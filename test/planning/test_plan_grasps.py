@@ -15,7 +15,7 @@ from graspd_core.planning import verification
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.trials.registry import TRIALS
+from graspd_core.trials.trial_registry import TRIALS
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 
 

@@ -108,9 +108,9 @@ def test_any_request_is_taken_or_refused_in_one_line(tmp_path_factory, message: 
 @given(message=clouds, now=stamps)
 def test_any_cloud_is_read_or_refused_in_one_line(message: PointCloud2, now: Time):
     intake = RequestBuilder(HAND, lambda: now, lambda target, source, stamp: np.eye(4))
-    sighting = cloud_frame(message, 5)
-    refused(lambda: intake.from_sighting("r", Settings(), sighting))
-    view, _ = refused(sighting.read)
+    sensor_frame = cloud_frame(message, 5)
+    refused(lambda: intake.from_sensor_frame("r", Settings(), sensor_frame))
+    view, _ = refused(sensor_frame.read)
     if view is not None:
         assert np.isfinite(view.points).all()
 

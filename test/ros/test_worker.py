@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_ros.worker import BusyPolicy, Ending, Refusal, Report, Worker
+from graspd_ros.worker import BusyPolicy, Refusal, Report, Worker, WorkerEnding
 
 TIMEOUT = 100.0  # seconds; what is waited for takes milliseconds
 
@@ -29,7 +29,7 @@ class Bench:
     def __init__(self, queue_size: int = 2) -> None:
         self.release = threading.Event()
         self.started = threading.Semaphore(0)
-        self.reports: list[tuple[str, Ending]] = []
+        self.reports: list[tuple[str, WorkerEnding]] = []
         self.errors: list[BaseException | None] = []
         self.values: list[str | None] = []
         self.worker: Worker[Job, str] = Worker(
@@ -56,7 +56,7 @@ class Bench:
         assert self.started.acquire(timeout=TIMEOUT)
         return taken + [self.worker.submit(job, policy).accepted for job in jobs[1:]]
 
-    def wait(self, count: int) -> dict[str, Ending]:
+    def wait(self, count: int) -> dict[str, WorkerEnding]:
         end = time.monotonic() + TIMEOUT
         while len(self.reports) < count:
             assert time.monotonic() < end, f"{len(self.reports)} of {count} reports"
@@ -79,22 +79,22 @@ def jobs(count: int, **kind) -> list[Job]:
 def test_the_queue_holds_its_size_and_refuses_the_next(bench: Bench):
     assert bench.run(*jobs(4)) == [True, True, True, False]
     bench.release.set()
-    assert bench.wait(3) == {str(i): Ending.DONE for i in range(3)}
+    assert bench.wait(3) == {str(i): WorkerEnding.DONE for i in range(3)}
 
 
 def test_reject_takes_nothing_while_busy(bench: Bench):
     assert bench.run(*jobs(2), policy=BusyPolicy.REJECT) == [True, False]
     bench.release.set()
-    assert bench.wait(1) == {"0": Ending.DONE}
+    assert bench.wait(1) == {"0": WorkerEnding.DONE}
     assert bench.worker.submit(Job("2"), BusyPolicy.REJECT).accepted
 
 
 def test_replace_supersedes_what_runs_and_waits(bench: Bench):
     bench.run(*jobs(2))
     assert bench.worker.submit(Job("2"), BusyPolicy.REPLACE).accepted
-    assert bench.wait(2) == {"0": Ending.SUPERSEDED, "1": Ending.SUPERSEDED}
+    assert bench.wait(2) == {"0": WorkerEnding.SUPERSEDED, "1": WorkerEnding.SUPERSEDED}
     bench.release.set()
-    assert bench.wait(3)["2"] is Ending.DONE
+    assert bench.wait(3)["2"] is WorkerEnding.DONE
 
 
 def test_only_the_newest_waits_and_jobs_go_first(bench: Bench):
@@ -102,8 +102,8 @@ def test_only_the_newest_waits_and_jobs_go_first(bench: Bench):
     assert all(bench.run(Job("0"), *clouds, Job("1")))
     bench.release.set()
     bench.wait(5)
-    assert bench.reports[:2] == [("cloud0", Ending.SUPERSEDED), ("cloud1", Ending.SUPERSEDED)]
-    assert bench.reports[2:] == [(name, Ending.DONE) for name in ("0", "1", "cloud2")]
+    assert bench.reports[:2] == [("cloud0", WorkerEnding.SUPERSEDED), ("cloud1", WorkerEnding.SUPERSEDED)]
+    assert bench.reports[2:] == [(name, WorkerEnding.DONE) for name in ("0", "1", "cloud2")]
 
 
 @pytest.mark.parametrize(
@@ -112,10 +112,10 @@ def test_only_the_newest_waits_and_jobs_go_first(bench: Bench):
 def test_an_error_ends_one_request_and_not_the_worker(bench: Bench, error: BaseException):
     bench.release.set()
     bench.worker.submit(Job("bad", error=error), BusyPolicy.QUEUE)
-    assert bench.wait(1) == {"bad": Ending.FAILED}
+    assert bench.wait(1) == {"bad": WorkerEnding.FAILED}
     assert bench.errors == [error]
     bench.worker.submit(Job("good"), BusyPolicy.QUEUE)
-    assert bench.wait(2)["good"] is Ending.DONE
+    assert bench.wait(2)["good"] is WorkerEnding.DONE
 
 
 def test_cancel_reaches_the_running_and_the_waiting(bench: Bench):
@@ -123,7 +123,7 @@ def test_cancel_reaches_the_running_and_the_waiting(bench: Bench):
     assert bench.worker.cancel("1") == 1
     assert bench.worker.cancel("1") == 0
     assert bench.worker.cancel("") == 2
-    assert bench.wait(3) == {str(i): Ending.CANCELLED for i in range(3)}
+    assert bench.wait(3) == {str(i): WorkerEnding.CANCELLED for i in range(3)}
 
 
 def test_what_was_done_before_a_cancel_is_not_lost(bench: Bench):
@@ -139,15 +139,15 @@ def test_an_id_is_taken_once_at_a_time(bench: Bench, policy: BusyPolicy):
     again = bench.worker.submit(Job("same"), policy)
     assert (again.refusal, again.reason) == (Refusal.DUPLICATE, "a request 'same' is already waiting or running")
     bench.release.set()
-    assert bench.wait(1) == {"same": Ending.DONE}
+    assert bench.wait(1) == {"same": WorkerEnding.DONE}
     assert bench.worker.submit(Job("same"), BusyPolicy.REJECT).accepted
     bench.wait(2)
 
 
 def test_those_who_waited_too_long_are_told_and_the_running_one_goes_on(bench: Bench):
     bench.run(*jobs(3), Job("cloud", only_newest=True))
-    assert bench.worker.end_waiting(lambda job: job.id != "1", Report(Ending.DONE, value="too late")) == 2
-    assert bench.wait(2) == {"2": Ending.DONE, "cloud": Ending.DONE}
+    assert bench.worker.end_waiting(lambda job: job.id != "1", Report(WorkerEnding.DONE, value="too late")) == 2
+    assert bench.wait(2) == {"2": WorkerEnding.DONE, "cloud": WorkerEnding.DONE}
     assert bench.values == ["too late", "too late"]
     assert bench.worker.state() == ("0", 1)
     bench.release.set()
@@ -157,14 +157,14 @@ def test_those_who_waited_too_long_are_told_and_the_running_one_goes_on(bench: B
 def test_a_job_that_raises_on_being_cancelled_is_cancelled(bench: Bench):
     bench.run(Job("0", error=RuntimeError("torn down")))
     bench.worker.cancel("0")
-    assert bench.wait(1) == {"0": Ending.CANCELLED}
+    assert bench.wait(1) == {"0": WorkerEnding.CANCELLED}
     assert bench.errors == [None]
 
 
 def test_after_stop_nothing_is_taken(bench: Bench):
     bench.run(*jobs(2))
     assert bench.worker.stop(TIMEOUT)
-    assert bench.wait(2) == {"0": Ending.CANCELLED, "1": Ending.CANCELLED}
+    assert bench.wait(2) == {"0": WorkerEnding.CANCELLED, "1": WorkerEnding.CANCELLED}
     refused = bench.worker.submit(Job("2"), BusyPolicy.QUEUE)
     assert (refused.refusal, refused.reason) == (Refusal.STOPPING, "the node is shutting down")
 

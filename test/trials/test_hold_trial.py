@@ -55,8 +55,8 @@ def test_a_push_from_one_side_holds_nothing(world, closing):
     # The finger pushes it 15 mm, which is allowed, to where nothing presses from the other side.
     assert hold.reason.startswith("the object moved")
     assert hold.reason.endswith("under a pull along +x")
-    judged = replace(closing(*GOOD), trials=(hold,))
-    assert (judged.verdict, judged.reason) == (Verdict.FAILED, hold.reason)
+    scored = replace(closing(*GOOD), trials=(hold,))
+    assert (scored.verdict, scored.reason) == (Verdict.FAILED, hold.reason)
 
 
 def test_a_start_fifteen_millimetres_deep_is_refused(world, closing):

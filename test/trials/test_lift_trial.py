@@ -16,7 +16,7 @@ from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.scene.scene import Obstacle
 from graspd_core.trials.lift_trial import LiftSettings, lift_trial, retreat_posture
-from graspd_core.trials.registry import TrialContext, grasp_trials
+from graspd_core.trials.trial_registry import TrialContext, grasp_trials
 from graspd_core.trials.world import PROTOCOLS, World, build_world
 from graspd_core.types import Plane, TrialResult, TriangleMesh, Verdict
 

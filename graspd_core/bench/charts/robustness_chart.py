@@ -9,7 +9,7 @@ import numpy as np
 
 from graspd_core.bench.charts.chart_style import figure, save
 from graspd_core.bench.robustness import Row, orders
-from graspd_core.methods.registry import METHODS
+from graspd_core.methods.method_registry import METHODS
 
 _SCORE, _NOISE, _BEST = (METHODS[name].colour for name in ("graspd2022", "closed_form", "random_closure"))
 

@@ -12,10 +12,10 @@ import numpy as np
 from graspd_core.bench.charts.chart_style import FRONT, figure, place_labels, save
 from graspd_core.bench.charts.sweep_chart import draw_ladder
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import is_preset, is_rung, parent_of, short_name
+from graspd_core.bench.names import is_preset, is_sweep_value, parent_of, short_name
 from graspd_core.bench.pareto import pareto_front
 from graspd_core.bench.result_store import Record
-from graspd_core.methods.registry import METHODS
+from graspd_core.methods.method_registry import METHODS
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     Returns the PNGs drawn, by "speed", "verified", "planned" and "ladder".
     """
     found = rows(records)
-    ladder = [row for row in found if is_rung(row.name)]
+    ladder = [row for row in found if is_sweep_value(row.name)]
     presets = by_name(row for row in found if is_preset(row.name))
     drawn = {
         "speed": draw_speed(presets, path, "cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),

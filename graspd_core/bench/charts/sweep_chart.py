@@ -8,7 +8,7 @@ from pathlib import Path
 from graspd_core.bench.charts.chart_style import figure, save
 from graspd_core.bench.figures import Row, by_name, spread
 from graspd_core.bench.suites import LADDER
-from graspd_core.methods.registry import METHODS
+from graspd_core.methods.method_registry import METHODS
 
 _LABELS = {
     "candidates": "contact candidates",
@@ -23,16 +23,16 @@ def draw_ladder(found: Sequence[Row], path: Path) -> Path:
     """A panel for every ladder. Returns the PNG's path."""
     ladders = {name: {} for name in LADDER}
     for name, group in by_name(found).items():
-        ladder, rung = name.split("=")
-        ladders[ladder][float(rung)] = group
-    present = {name: dict(sorted(rungs.items())) for name, rungs in ladders.items() if rungs}
+        ladder, sweep_value = name.split("=")
+        ladders[ladder][float(sweep_value)] = group
+    present = {name: dict(sorted(sweep_values.items())) for name, sweep_values in ladders.items() if sweep_values}
     with figure(3.2 * len(present), 3.0, ncols=len(present), squeeze=False, sharey=True) as (made, axes):
         seconds = [axis.twinx() for axis in axes[0]]
-        for axis, second, (name, rungs) in zip(axes[0], seconds, present.items(), strict=True):
-            _draw(axis, rungs, "standard", 100.0, _SUCCESS, "o-")
-            _draw(second, rungs, "cpu_with_scene", 1.0, _TIME, "s--")
+        for axis, second, (name, sweep_values) in zip(axes[0], seconds, present.items(), strict=True):
+            _draw(axis, sweep_values, "standard", 100.0, _SUCCESS, "o-")
+            _draw(second, sweep_values, "cpu_with_scene", 1.0, _TIME, "s--")
             axis.set_xscale("log", base=2)
-            axis.set_xticks(list(rungs), [f"{rung:g}" for rung in rungs])
+            axis.set_xticks(list(sweep_values), [f"{sweep_value:g}" for sweep_value in sweep_values])
             axis.minorticks_off()
             axis.set_xlabel(_LABELS[name])
             axis.set_ylim(-4.0, 104.0)
@@ -46,9 +46,9 @@ def draw_ladder(found: Sequence[Row], path: Path) -> Path:
         return save(made, path)
 
 
-def _draw(axis, rungs: dict[float, list[Row]], name: str, factor: float, colour: str, line: str) -> None:
+def _draw(axis, sweep_values: dict[float, list[Row]], name: str, factor: float, colour: str, line: str) -> None:
     """Mean over objects, with quartiles as a band."""
-    over = {rung: found for rung, group in rungs.items() if (found := spread(group, name))}
+    over = {sweep_value: found for sweep_value, group in sweep_values.items() if (found := spread(group, name))}
     axis.plot(list(over), [s.mean * factor for s in over.values()], line, color=colour, ms=4.5, lw=1.4)
     low, high = ([getattr(s, end) * factor for s in over.values()] for end in ("low", "high"))
     axis.fill_between(list(over), low, high, color=colour, alpha=0.12, lw=0)

@@ -54,7 +54,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Cell:
+class MapCell:
     """What came of one job's grasps in one cell.
 
     Attributes:
@@ -72,7 +72,7 @@ class Cell:
 class Done:
     """Cells of a job, and figures of what was planned on that help to explain them."""
 
-    cells: tuple[Cell, ...]
+    cells: tuple[MapCell, ...]
     evidence: Mapping[str, float | None]
 
 
@@ -97,7 +97,7 @@ def run_job(run: Run, job: Job) -> Done:
         return run(job)
     except GraspdError as error:
         reason = f"{NO_SCENE}: {kind_of(str(error))}"
-        return Done(tuple(Cell(up, 0, {reason: job.count}) for up in job.up), {})
+        return Done(tuple(MapCell(up, 0, {reason: job.count}) for up in job.up), {})
 
 
 @lru_cache(maxsize=4)
@@ -122,16 +122,16 @@ def plan(job: Job, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
 
 def try_grasps(
     job: Job, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
-) -> Cell:
+) -> MapCell:
     """Every grasp in the hold trial on `target`."""
     if not grasps:
-        return Cell(up, 0, {NOT_FOUND: job.count})
+        return MapCell(up, 0, {NOT_FOUND: job.count})
     world = build_world(hand, target, object_parts(target), protocol)
     holds = [hold_trial(world, grasp, protocol) for grasp in grasps]
     reasons = Counter(kind_of(hold.reason) for hold in holds if not hold.passed)
     if len(grasps) < job.count:
         reasons[NOT_FOUND] = job.count - len(grasps)
-    return Cell(up, sum(hold.passed for hold in holds), dict(reasons))
+    return MapCell(up, sum(hold.passed for hold in holds), dict(reasons))
 
 
 def kind_of(reason: str) -> str:

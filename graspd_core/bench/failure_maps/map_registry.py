@@ -19,7 +19,7 @@ COUNT = 8
 
 
 @dataclass(frozen=True)
-class Axis:
+class MapAxis:
     """What an axis shows, and where its cells lie, from left to right or from the bottom up."""
 
     label: str
@@ -39,8 +39,8 @@ class Map:
     """
 
     title: str
-    across: Axis
-    up: Axis
+    across: MapAxis
+    up: MapAxis
     things: tuple[str, ...]
     run: Run
     together: bool = False
@@ -54,30 +54,30 @@ class Map:
 MAPS: Mapping[str, Map] = {
     "friction_mass": Map(
         "friction and mass",
-        Axis("friction coefficient", friction_mass.FRICTIONS),
-        Axis("mass [kg]", friction_mass.MASSES),
+        MapAxis("friction coefficient", friction_mass.FRICTIONS),
+        MapAxis("mass [kg]", friction_mass.MASSES),
         friction_mass.THINGS,
         friction_mass.run,
         together=True,
     ),
     "size": Map(
         "size",
-        Axis("least width of the object / span of the hand", size.RATIOS),
-        Axis("object", size.THINGS),
+        MapAxis("least width of the object / span of the hand", size.RATIOS),
+        MapAxis("object", size.THINGS),
         size.THINGS,
         size.run,
     ),
     "view": Map(
         "view",
-        Axis("elevation of the only camera [deg]", view.ELEVATIONS),
-        Axis("noise [times a D415's]", view.NOISES),
+        MapAxis("elevation of the only camera [deg]", view.ELEVATIONS),
+        MapAxis("noise [times a D415's]", view.NOISES),
         view.THINGS,
         view.run,
     ),
     "wall": Map(
         "wall and grid",
-        Axis("resolution of the distance grid", wall.RESOLUTIONS),
-        Axis("wall of the cup [mm]", wall.WALLS),
+        MapAxis("resolution of the distance grid", wall.RESOLUTIONS),
+        MapAxis("wall of the cup [mm]", wall.WALLS),
         wall.THINGS,
         wall.run,
     ),

@@ -41,11 +41,11 @@ def run_pace(cell: Cell) -> dict[str, Any]:
     scene = load_scene(cell.source, resolution=cell.settings.resolution)
     runs: list[Stopwatch] = []
     for run in range(_RUNS + 1):
-        laps = Stopwatch()
-        with laps("optimise"):
+        stopwatch = Stopwatch()
+        with stopwatch("optimise"):
             find_candidates(scene, hand, count=cell.count, seed=cell.seed + run, config=cell.settings, hooks=Hooks())
-        runs.append(laps)
-    best = min(runs[1:], key=lambda laps: laps.cpu["optimise"])
+        runs.append(stopwatch)
+    best = min(runs[1:], key=lambda stopwatch: stopwatch.cpu["optimise"])
     return {"cpu": best.cpu, "wall": best.wall, "grasp_steps": grasp_steps(cell)}
 
 

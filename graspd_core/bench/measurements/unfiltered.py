@@ -18,37 +18,37 @@ from graspd_core.scene.scene import object_parts
 
 def run_raw(cell: Cell) -> dict[str, Any]:
     """Figures of one raw cell. Grasps that a method does not find are missing from the list, and count as failed."""
-    laps = Stopwatch()
+    stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
-    with laps("scene"):
+    with stopwatch("scene"):
         scene = load_scene(cell.source, resolution=cell.settings.resolution)
-    with laps("optimise"):
+    with stopwatch("optimise"):
         found = find_candidates(scene, hand, count=cell.count, seed=cell.seed, config=cell.settings, hooks=Hooks())
     grasps = found.grasps[: cell.count]
-    with laps("parts"):
+    with stopwatch("parts"):
         tried = Tried(hand, scene.object, object_parts(scene.object))
     results: list[dict[str, Any]] = [{"score": grasp.score, "links": len(grasp.contacts)} for grasp in grasps]
     # A method that finds nothing has paid for its scene and its search only.
     first: dict[str, float] | None = None
     for name in cell.trials if grasps else ():
-        with laps(f"world {name}"):
+        with stopwatch(f"world {name}"):
             trial = TRIALS[name](tried)
         for grasp, result in zip(grasps, results, strict=True):
-            with laps(name):
+            with stopwatch(name):
                 result[name] = trial(grasp)
             if name == "standard" and first is None and result[name]["passed"]:
                 # The parts are built beside the optimiser in `plan_grasps`: in CPU seconds they count all the same.
-                first = {"cpu": sum(laps.cpu.values()), "wall": sum(laps.wall.values())}
-    judge = make_metrics_context(scene.object, hand)
+                first = {"cpu": sum(stopwatch.cpu.values()), "wall": sum(stopwatch.wall.values())}
+    context = make_metrics_context(scene.object, hand)
     for grasp, result in zip(grasps, results, strict=True):
-        with laps("metrics"):
-            result["metrics"] = dict(measure(judge, grasp.grasp))
+        with stopwatch("metrics"):
+            result["metrics"] = dict(measure(context, grasp.grasp))
     return {
         "given": len(grasps),
         "held": sum(bool(r.get("standard", {}).get("passed")) for r in results),
         "first_verified": first,
-        "cpu": laps.cpu,
-        "wall": laps.wall,
+        "cpu": stopwatch.cpu,
+        "wall": stopwatch.wall,
         "parts": len(tried.parts),
         "grasps": results,
     }

@@ -31,7 +31,7 @@ GRACE = 0.5
 
 
 @dataclass(frozen=True)
-class Ending:
+class StressEnding:
     """What came of a case.
 
     Attributes:
@@ -60,7 +60,7 @@ class Ending:
     true: int | None = None
 
 
-def faults(case: Case, ending: Ending) -> tuple[str, ...]:
+def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
     """What is wrong with an ending, one line each; none where all is well."""
     wrong = []
     if ending.ending not in case.expect:
@@ -82,7 +82,7 @@ def faults(case: Case, ending: Ending) -> tuple[str, ...]:
     return tuple(wrong)
 
 
-def run_case(case: Case, preset: str = "balanced") -> Ending:
+def run_case(case: Case, preset: str = "balanced") -> StressEnding:
     """Run a case in this process."""
     from graspd_core.hands.library import load_hand
     from graspd_core.planning.plan_grasps import plan_grasps
@@ -98,10 +98,10 @@ def run_case(case: Case, preset: str = "balanced") -> Ending:
         except GraspdError as error:
             told = str(error).replace(f"{folder}/", "")
             loading = (loaded if loaded > began else time.perf_counter()) - began
-            return Ending(case.name, type(error).__name__, told, loading, memory=_peak())
+            return StressEnding(case.name, type(error).__name__, told, loading, memory=_peak())
         planned = time.perf_counter()
         verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
-        return Ending(
+        return StressEnding(
             case.name,
             GRASP if verified else result.outcome.name,
             _told(result, folder),

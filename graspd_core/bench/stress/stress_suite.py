@@ -18,7 +18,7 @@ from typing import IO
 
 from graspd_core.bench.benchmark_workers import ENVIRONMENT
 from graspd_core.bench.result_store import kept_record
-from graspd_core.bench.stress.run_stress_case import Ending
+from graspd_core.bench.stress.run_stress_case import StressEnding
 from graspd_core.bench.stress.stress_case import Case
 from graspd_core.bench.stress.stress_cases import CASES
 from graspd_core.errors import ConfigError
@@ -38,7 +38,7 @@ def cases_of(names: Sequence[str]) -> tuple[Case, ...]:
 
 
 @dataclass(frozen=True)
-class Shelf:
+class EndingStore:
     """Where endings are kept, and what they must have come from to count.
 
     Attributes:
@@ -63,24 +63,24 @@ class Shelf:
         """The file of one case."""
         return self.folder / f"stress-{Path(self.preset).stem}-{case.name}.json"
 
-    def write(self, ending: Ending, case: Case) -> None:
+    def write(self, ending: StressEnding, case: Case) -> None:
         """Keep an ending; its file appears whole or not at all."""
         record = {"key": self._key, "code": self.code, "ending": asdict(ending)}
         save_text(self.path(case), json.dumps(record, indent=1) + "\n")
 
-    def read(self, case: Case) -> tuple[Ending, str] | None:
+    def read(self, case: Case) -> tuple[StressEnding, str] | None:
         """The ending of a case and the code that it came of; None where there is none that counts."""
         record = kept_record(self.path(case), self._key, None if self.any_code else self.code)
         try:
-            return None if record is None else (Ending(**record["ending"]), str(record["code"]))
+            return None if record is None else (StressEnding(**record["ending"]), str(record["code"]))
         # Other code may have said other things of an ending.
         except (TypeError, KeyError):
             return None
 
 
 def run_cases(
-    cases: Sequence[Case], shelf: Shelf, processes: int, stop: Callable[[], bool] = lambda: False
-) -> Iterator[tuple[Case, Ending]]:
+    cases: Sequence[Case], store: EndingStore, processes: int, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[Case, StressEnding]]:
     """Run cases, `processes` at a time, and yield each as it ends; its ending is on disk by then.
 
     Ends early, its processes killed, once `stop` is true. A process that dies or hangs is an ending like any other.
@@ -90,12 +90,12 @@ def run_cases(
     try:
         while (waiting or running) and not stop():
             while waiting and len(running) < processes:
-                running.append(_Running(waiting.popleft(), shelf.preset))
+                running.append(_Running(waiting.popleft(), store.preset))
             ended = [one for one in running if one.over()]
             running = [one for one in running if one not in ended]
             for one in ended:
                 ending = one.ending()
-                shelf.write(ending, one.case)
+                store.write(ending, one.case)
                 yield one.case, ending
             time.sleep(0.0 if ended else _POLL)
     finally:
@@ -127,19 +127,19 @@ class _Running:
         for stream in self._streams:
             stream.close()
 
-    def ending(self) -> Ending:
+    def ending(self) -> StressEnding:
         """What it came to; it is over afterwards."""
         ended = self._process.poll() is not None
         out, err = (_lines(stream) for stream in self._streams)
         self.kill()
         if not ended:
-            return Ending(self.case.name, "hang", f"no end after {self._patience:.0f} s", planning=self._patience)
+            return StressEnding(self.case.name, "hang", f"no end after {self._patience:.0f} s", planning=self._patience)
         try:
-            return Ending(**json.loads(out[-1]))
+            return StressEnding(**json.loads(out[-1]))
         except (IndexError, ValueError, TypeError):
             # Both: the last words of what a signal ended are of something else.
             told = "; ".join([f"exit status {self._process.returncode}", *err[-1:]])
-            return Ending(self.case.name, "crash", told)
+            return StressEnding(self.case.name, "crash", told)
 
 
 def _scratch() -> IO[str]:

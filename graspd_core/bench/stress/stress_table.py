@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from graspd_core.bench.stress.run_stress_case import Ending, faults
+from graspd_core.bench.stress.run_stress_case import StressEnding, faults
 from graspd_core.bench.stress.stress_case import GRASP, Case
 from graspd_core.bench.tables import markdown_table
 from graspd_core.types import Outcome
@@ -14,7 +14,7 @@ _MESSAGE = 110
 _HEADINGS = ("case", "what is wrong", "ending", "load s", "plan s", "peak MB", "held/tried", "again", "true", "told")
 
 
-def stress_table(endings: Mapping[Case, Ending]) -> str:
+def stress_table(endings: Mapping[Case, StressEnding]) -> str:
     """A table a family; faults in bold."""
     blocks = []
     for family in dict.fromkeys(case.family for case in endings):
@@ -23,7 +23,7 @@ def stress_table(endings: Mapping[Case, Ending]) -> str:
     return "\n\n".join(blocks)
 
 
-def summary(endings: Mapping[Case, Ending]) -> str:
+def summary(endings: Mapping[Case, StressEnding]) -> str:
     """What held of all that should, and every fault, a line each."""
     wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
     lines = [f"{len(endings)} cases, {len(wrong)} faults."]
@@ -42,7 +42,7 @@ def summary(endings: Mapping[Case, Ending]) -> str:
     return "\n\n".join([" ".join(filter(None, lines)), *(["\n".join(wrong)] if wrong else [])])
 
 
-def _share(family: str, whole: Sequence[tuple[Case, Ending]]) -> str:
+def _share(family: str, whole: Sequence[tuple[Case, StressEnding]]) -> str:
     if not whole:
         return ""
     grasped = sum(ending.ending == GRASP for _, ending in whole)
@@ -50,7 +50,7 @@ def _share(family: str, whole: Sequence[tuple[Case, Ending]]) -> str:
     return f"{family}: {share} with something to grasp end in a verified grasp."
 
 
-def _line(case: Case, ending: Ending) -> list[str]:
+def _line(case: Case, ending: StressEnding) -> list[str]:
     good = ending.ending in case.expect
     # That all went well is told by the ending.
     told = ending.message.removeprefix(Outcome.SUCCEEDED.value).removeprefix("; ")

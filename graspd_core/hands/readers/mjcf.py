@@ -19,7 +19,7 @@ from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble,
 from graspd_core.hands.readers.mimic import Coupling, resolved_couplings
 from graspd_core.hands.readers.mjcf_geoms import read_geom
 from graspd_core.hands.readers.mjcf_values import (
-    Settings,
+    MjcfSettings,
     read_axis,
     read_pose,
     read_range,
@@ -38,7 +38,7 @@ _REFUSED = ("include", "frame", "replicate", "attach", "composite", "flexcomp", 
 class _Parts:
     """What has been read so far."""
 
-    settings: Settings
+    settings: MjcfSettings
     meshes: dict[str, ET.Element]
     links: list[LinkSpec] = field(default_factory=list)
     joints: list[JointSpec] = field(default_factory=list)
@@ -83,12 +83,12 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     return assemble(path, name, parts.links, joints, resolved_couplings(path, direct), tuple(warnings))
 
 
-def _is_free(settings: Settings, body: ET.Element) -> bool:
+def _is_free(settings: MjcfSettings, body: ET.Element) -> bool:
     free = [with_defaults(settings, joint, "main").get("type") == "free" for joint in body.findall("joint")]
     return body.find("freejoint") is not None or any(free)
 
 
-def _mesh_assets(settings: Settings, root: ET.Element) -> dict[str, ET.Element]:
+def _mesh_assets(settings: MjcfSettings, root: ET.Element) -> dict[str, ET.Element]:
     meshes: dict[str, ET.Element] = {}
     for element in root.findall("asset/mesh"):
         whole = with_defaults(settings, element, "main")
@@ -170,7 +170,9 @@ def _primitives(parts: _Parts, body: ET.Element, child_class: str, name: str) ->
     return [read_geom(parts.settings, geom, parts.meshes) for geom in colliding or geoms]
 
 
-def _inertial(settings: Settings, body: ET.Element) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+def _inertial(
+    settings: MjcfSettings, body: ET.Element
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Mass [kg], centre [m] and inertia about it [kg·m²]; zero where the body gives none."""
     inertial = body.find("inertial")
     if inertial is None:
@@ -212,7 +214,7 @@ def _couplings(parts: _Parts, root: ET.Element) -> dict[str, Coupling]:
     return direct
 
 
-def _efforts(settings: Settings, root: ET.Element) -> dict[str, float]:
+def _efforts(settings: MjcfSettings, root: ET.Element) -> dict[str, float]:
     """The greatest torque or force that a joint's actuator gives, where it is limited."""
     efforts: dict[str, float] = {}
     for section in root.findall("actuator"):

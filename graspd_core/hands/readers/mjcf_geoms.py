@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from graspd_core.hands.model import Primitive, PrimitiveKind
 from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, mesh_hull
-from graspd_core.hands.readers.mjcf_values import Settings, read_pose, turn_z_to
+from graspd_core.hands.readers.mjcf_values import MjcfSettings, read_pose, turn_z_to
 from graspd_core.hands.readers.xml_io import wrong
 from graspd_core.hands.readers.xml_values import read_numbers
 from graspd_core.mesh.convex_parts import limited_hull
@@ -27,7 +27,7 @@ _PLAIN: dict[str, PrimitiveKind] = {
 }
 
 
-def read_geom(settings: Settings, geom: ET.Element, meshes: Mapping[str, ET.Element]) -> Primitive:
+def read_geom(settings: MjcfSettings, geom: ET.Element, meshes: Mapping[str, ET.Element]) -> Primitive:
     """One geom, its class's attributes included, as a primitive of link zero; ellipsoids and meshes as hulls.
 
     Raises:
@@ -59,7 +59,7 @@ def read_geom(settings: Settings, geom: ET.Element, meshes: Mapping[str, ET.Elem
     return Primitive(0, _PLAIN[kind], rotation, translation, tuple(size.tolist()))
 
 
-def _sizes(settings: Settings, geom: ET.Element, count: int) -> Float[np.ndarray, "n"]:
+def _sizes(settings: MjcfSettings, geom: ET.Element, count: int) -> Float[np.ndarray, "n"]:
     words = (geom.get("size") or "").split()
     values = read_numbers(settings.path, geom, "size", len(words) or 1, "")
     # More sizes than the type needs are allowed, and mean nothing.
@@ -69,7 +69,7 @@ def _sizes(settings: Settings, geom: ET.Element, count: int) -> Float[np.ndarray
     return values[:count]
 
 
-def _mesh(settings: Settings, geom: ET.Element, meshes: Mapping[str, ET.Element]) -> TriangleMesh:
+def _mesh(settings: MjcfSettings, geom: ET.Element, meshes: Mapping[str, ET.Element]) -> TriangleMesh:
     name = geom.get("mesh", "")
     if name not in meshes:
         raise wrong(settings.path, geom, f"names the mesh {name!r}; known: {', '.join(meshes) or 'none'}")

@@ -27,7 +27,7 @@ _ACTUATORS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
+class MjcfSettings:
     """What the whole file says about its elements.
 
     Attributes:
@@ -52,7 +52,7 @@ class Settings:
         return float(np.pi / 180.0) if self.degrees else 1.0
 
 
-def read_settings(path: Path, root: ET.Element) -> Settings:
+def read_settings(path: Path, root: ET.Element) -> MjcfSettings:
     """Compiler settings and default classes of a file.
 
     Raises:
@@ -69,7 +69,7 @@ def read_settings(path: Path, root: ET.Element) -> Settings:
     classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
     for element in root.findall("default"):
         _collect_classes(path, element, classes, "main", {})
-    return Settings(
+    return MjcfSettings(
         path=path,
         degrees=compiler.get("angle", "degree") != "radian",
         euler=compiler.get("eulerseq", "xyz"),
@@ -105,7 +105,7 @@ def _kin(tag: str) -> str:
     return "general" if tag in _ACTUATORS else tag
 
 
-def with_defaults(settings: Settings, element: ET.Element, child_class: str) -> ET.Element:
+def with_defaults(settings: MjcfSettings, element: ET.Element, child_class: str) -> ET.Element:
     """The element with the attributes that its class gives it.
 
     Raises:
@@ -122,12 +122,12 @@ def with_defaults(settings: Settings, element: ET.Element, child_class: str) -> 
     return whole
 
 
-def read_pose(settings: Settings, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+def read_pose(settings: MjcfSettings, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Rotation and position [m] of a body, geom or inertial in its parent."""
     return read_rotation(settings, element), read_position(settings.path, element, "pos")
 
 
-def read_rotation(settings: Settings, element: ET.Element) -> Float[np.ndarray, "3 3"]:
+def read_rotation(settings: MjcfSettings, element: ET.Element) -> Float[np.ndarray, "3 3"]:
     """The one orientation that an element gives, identity where it gives none.
 
     Raises:
@@ -158,7 +158,7 @@ def read_rotation(settings: Settings, element: ET.Element) -> Float[np.ndarray, 
     return turn_z_to(_direction(settings, element, "zaxis", 3))
 
 
-def read_range(settings: Settings, element: ET.Element, key: str, flag: str) -> Float[np.ndarray, "2"] | None:
+def read_range(settings: MjcfSettings, element: ET.Element, key: str, flag: str) -> Float[np.ndarray, "2"] | None:
     """The two ends of a range, None where it does not hold: `flag` says so, or leaves it to the compiler's settings."""
     ends = read_numbers(settings.path, element, key, 2, "0 0")
     limited = element.get(flag, "auto")
@@ -166,7 +166,7 @@ def read_range(settings: Settings, element: ET.Element, key: str, flag: str) -> 
     return ends if limited == "true" or by_itself else None
 
 
-def read_axis(settings: Settings, joint: ET.Element) -> Float[np.ndarray, "3"]:
+def read_axis(settings: MjcfSettings, joint: ET.Element) -> Float[np.ndarray, "3"]:
     """A joint's unit axis in its body's frame."""
     return _direction(settings, joint, "axis", 3) if "axis" in joint.attrib else np.array([0.0, 0.0, 1.0])
 
@@ -177,11 +177,13 @@ def turn_z_to(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return rotation_from_quaternion(torch.as_tensor(quaternion_between(z, direction, around=x))).numpy()
 
 
-def _direction(settings: Settings, element: ET.Element, key: str, count: int) -> Float[np.ndarray, "n"]:
+def _direction(settings: MjcfSettings, element: ET.Element, key: str, count: int) -> Float[np.ndarray, "n"]:
     return _unit(settings, element, key, read_numbers(settings.path, element, key, count, ""))
 
 
-def _unit(settings: Settings, element: ET.Element, key: str, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _unit(
+    settings: MjcfSettings, element: ET.Element, key: str, values: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
     length = float(np.linalg.norm(values.clip(-1e10, 1e10)))
     if not 1e-10 < length < 1e10:
         raise wrong(settings.path, element, f"<{element.tag} {key}={element.get(key)!r}>: has no direction")

@@ -105,9 +105,9 @@ class ClosedForm:
         return replace(adam_step(problem, state, gradient, rate, index + 1, config), loss=loss)
 
     def best(self, state: AdamState) -> tuple[Poses, Float[Tensor, "batch"]]:
-        judged = torch.isfinite(state.best_loss)
-        poses = unpack(torch.where(judged[:, None], state.best_x, state.x))
-        return moved_along(poses, -state.pivot), torch.where(judged, state.best_loss, state.loss)
+        scored = torch.isfinite(state.best_loss)
+        poses = unpack(torch.where(scored[:, None], state.best_x, state.x))
+        return moved_along(poses, -state.pivot), torch.where(scored, state.best_loss, state.loss)
 
     def value_and_gradient(
         self,

@@ -167,9 +167,9 @@ class Graspd2022:
     def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
         if self.config.keep == "last":
             return unpack(state.pose.value), state.loss
-        judged = torch.isfinite(state.best_loss)
-        x = torch.where(judged[:, None], state.best, state.pose.value)
-        return unpack(x), torch.where(judged, state.best_loss, state.loss)
+        scored = torch.isfinite(state.best_loss)
+        x = torch.where(scored[:, None], state.best, state.pose.value)
+        return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
     def cost(self, found: Evaluation) -> Float[Tensor, "batch"]:
         """What is minimised: L_phys, or the motion itself without relaxation, with L_range and L_inter."""

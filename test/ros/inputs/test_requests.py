@@ -32,7 +32,7 @@ def intake(lookup=lambda target, source, stamp: np.eye(4)) -> RequestBuilder:
     return RequestBuilder(HAND, lambda: NOW, lookup)
 
 
-def sighting(points: np.ndarray, frame: str = "camera", stamp: Time = NOW) -> SensorFrame:
+def sensor_frame(points: np.ndarray, frame: str = "camera", stamp: Time = NOW) -> SensorFrame:
     return SensorFrame("cloud", frame, stamp, 1000 * 10**9, lambda: PointCloud(points, np.zeros(3)))
 
 
@@ -150,13 +150,13 @@ def test_a_cloud_is_refused_when_none_came_or_it_is_old():
     with pytest.raises(RequestError, match="no cloud or depth image has come yet") as refused:
         taker.from_message("a", Settings(), latest)
     assert refused.value.code is ErrorCode.NO_CLOUD
-    taker.newest = sighting(np.zeros((3, 3)), stamp=Time(sec=990))
+    taker.newest = sensor_frame(np.zeros((3, 3)), stamp=Time(sec=990))
     with pytest.raises(RequestError, match=r"10\.0 s old, more than cloud_max_age=5 s") as refused:
         taker.from_message("a", Settings(), latest)
     assert refused.value.code is ErrorCode.STALE_CLOUD
     request = taker.from_message("a", Settings(cloud_max_age=0.0), latest)
     assert (request.frame, request.stamp.sec, request.source) == ("camera", 990, "latest_cloud")
-    taker.newest = sighting(np.zeros((3, 3)), stamp=Time())  # without a stamp, arrival counts
+    taker.newest = sensor_frame(np.zeros((3, 3)), stamp=Time())  # without a stamp, arrival counts
     assert taker.from_message("b", Settings(), latest).stamp == NOW
 
 
@@ -172,16 +172,16 @@ def test_views_are_gathered_in_one_frame():
     with pytest.raises(RequestError, match="call ~/add_view") as refused:
         taker.from_message("a", settings, GraspRequest(source=GraspRequest.VIEWS))
     assert refused.value.code is ErrorCode.NO_CLOUD
-    taker.newest = sighting(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]]))
+    taker.newest = sensor_frame(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]]))
     taker.add_view(settings)
-    taker.newest = sighting(np.array([[2.0, 0.0, 0.0]]), frame="map")
+    taker.newest = sensor_frame(np.array([[2.0, 0.0, 0.0]]), frame="map")
     taker.add_view(settings)
     first, second = taker.views.clouds
     np.testing.assert_array_equal(first.points, [[1.0, 0.0, 1.0], [1.0, 0.5, 1.0]])
     np.testing.assert_array_equal(first.viewpoint, [1.0, 0.0, 0.0])
     np.testing.assert_array_equal(second.points, [[2.0, 0.0, 0.0]])
     assert taker.from_message("a", settings, GraspRequest(source=GraspRequest.VIEWS)).frame == "map"
-    taker.newest = sighting(np.zeros((3, 3)), frame="lost")
+    taker.newest = sensor_frame(np.zeros((3, 3)), frame="lost")
     with pytest.raises(GraspdError, match="lost"):
         taker.add_view(settings)
     assert len(taker.views.clouds) == 2
@@ -190,10 +190,10 @@ def test_views_are_gathered_in_one_frame():
 
 
 def test_the_number_of_views_and_their_size_are_bounded():
-    views, settings, crowd = Views(), Settings(), sighting(np.random.default_rng(0).normal(size=(500_000, 3)))
+    views, settings, crowd = Views(), Settings(), sensor_frame(np.random.default_rng(0).normal(size=(500_000, 3)))
     views = views.add(crowd, settings, lambda *_: np.eye(4))
     assert len(views.clouds[0].points) <= 200_000
-    few = sighting(np.zeros((3, 3)))
+    few = sensor_frame(np.zeros((3, 3)))
     for _ in range(MOST_VIEWS - 1):
         views = views.add(few, settings, lambda *_: np.eye(4))
     with pytest.raises(RequestError, match="64 views are kept already"):
@@ -245,7 +245,7 @@ def test_a_target_point_comes_into_the_frame_of_the_cloud():
         raise TransformError("not connected")
 
     taker = intake(lookup)
-    taker.newest = sighting(np.zeros((3, 3)))
+    taker.newest = sensor_frame(np.zeros((3, 3)))
     point = {"use_target_point": True, "target_point": Point(z=0.5), "source": GraspRequest.LATEST_CLOUD}
     for frame in ("", "camera"):
         taker.from_message("a", Settings(), GraspRequest(header=Header(frame_id=frame), **point))

@@ -34,7 +34,7 @@ from graspd_ros.inputs.requests import Request
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, overdue
-from graspd_ros.worker import Ending, Report
+from graspd_ros.worker import Report, WorkerEnding
 
 HAND = load_hand("allegro_right", candidates=200)
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), HAND.open_posture)
@@ -85,13 +85,13 @@ def node() -> Iterator[rclpy.node.Node]:
 
 def published(node, report: Report[Planned], listener=None) -> tuple[list, list[str]]:
     answers: Any = Responses(node, HAND)
-    outlets = answers.outlets = Publishers()
+    publishers = answers.publishers = Publishers()
     answers.finished(Request("r", "mesh", "object", Time(), Settings(), load_scene, listener=listener), report)
-    return outlets.published, outlets.events
+    return publishers.published, publishers.events
 
 
 def done(*grasps: Grasp) -> Report[Planned]:
-    return Report(Ending.DONE, value=Planned(GraspResult(Outcome.SUCCEEDED, grasps, Timing(), 0, "")))
+    return Report(WorkerEnding.DONE, value=Planned(GraspResult(Outcome.SUCCEEDED, grasps, Timing(), 0, "")))
 
 
 @pytest.mark.parametrize("culprit", NOT_A_NUMBER)
@@ -114,13 +114,13 @@ def test_a_result_is_answered_once_whatever_its_listener_does(node, listener):
 
 def test_progress_is_told_at_the_rate_that_is_set(node):
     answers: Any = Responses(node, HAND)
-    outlets = answers.outlets = Publishers()
+    publishers = answers.publishers = Publishers()
     settings = Settings(progress_rate=1e-4)  # once in three hours
     tell = answers.progress_hook(Request("r", "mesh", "object", Time(), settings, load_scene))
     for step in range(100):
         tell(Progress(Stage.OPTIMISE, step, 100, 0.0, 0, 0.0))
-    assert [message.step for message in outlets.published] == [0]
-    assert outlets.events == ["progress"]
+    assert [message.step for message in publishers.published] == [0]
+    assert publishers.events == ["progress"]
 
 
 def test_a_request_that_was_never_worked_on_leaves_the_markers_as_they_are(node):

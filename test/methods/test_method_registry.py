@@ -10,12 +10,12 @@ from types import ModuleType
 import pytest
 
 from graspd_core.bench.charts.speed_chart import draw_charts
-from graspd_core.bench.suites import SUITES, Request
+from graspd_core.bench.suites import SUITES, SuiteRequest
 from graspd_core.cli import build_parser
 from graspd_core.errors import ConfigError
+from graspd_core.methods.method_registry import METHODS, Method
 from graspd_core.methods.plan_config import PlanConfig, load_preset, override, plan_config, to_mapping
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
-from graspd_core.methods.registry import METHODS, Method
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import Verdict
@@ -81,7 +81,7 @@ def test_the_command_line_and_the_benchmark_know_a_new_method(dummy: str, tmp_pa
     assert options.method == dummy
     path = tmp_path / "mine.yaml"
     path.write_text("method: dummy\n")
-    cells = SUITES["main"](Request(presets=(str(path),), objects=("shape:box",)))
+    cells = SUITES["main"](SuiteRequest(presets=(str(path),), objects=("shape:box",)))
     assert {cell.count for cell in cells if cell.kind == "raw"} == {2}
 
 
