@@ -27,7 +27,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from graspd_core import all_joint_names, hand_names, load_hand, load_preset, trim_heap, warm_up
+from graspd_core import all_joint_names, hand_names, load_hand, trim_heap, warm_up
 from graspd_core.errors import GraspdError
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action_server import GoalServer
@@ -63,8 +63,7 @@ class GraspNode(Node):
         settings = declare_settings(self)
         # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
         torch.set_num_threads(settings.torch_threads)
-        # As many contact candidates as the command line loads, so that both find the same grasps.
-        self._hand = load_hand(settings.hand, candidates=load_preset(settings.preset).problem.fine_candidates)
+        self._hand = load_hand(settings.hand)
         self._on_failure = on_failure
         self._ready = False
         self._announcing = threading.Lock()

@@ -91,7 +91,7 @@ class Planner:
         run_isolated = request.frame_out != request.frame
         stamp = Time() if request.timeless else request.stamp
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
-        scene = request.load(config.resolution)
+        scene = request.load()
         result = plan_grasps(
             scene,
             self._hand,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -15,14 +16,18 @@ from graspd_core.cli import hands_command as hands
 from graspd_core.cli import reconstruct_command as reconstruct
 from graspd_core.cli import replay_command as replay
 from graspd_core.cli import synthesize_command as synthesize
+from graspd_core.cli.deadline import process_began
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from graspd_core.errors import ConfigError, GraspdError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
+    # With arguments of its own this is a call within a process that began long ago.
+    began = process_began() if arguments is None else time.perf_counter()
     try:
         options = build_parser().parse_args(arguments)
+        options.began = began
         return int(options.run(options))
     except (GraspdError, OSError) as error:
         print(f"graspd: {error}", file=sys.stderr)

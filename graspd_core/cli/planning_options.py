@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import time
 from typing import Any
 
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
@@ -11,7 +12,7 @@ from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
-from graspd_core.types import GraspResult, Outcome, Verdict
+from graspd_core.types import GraspResult, Outcome, Timing, Verdict
 
 # Metrics in the summary of a run.
 _SHOWN = ("penetration", "contact_area", "epsilon", "robustness")
@@ -26,7 +27,9 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mass", type=float, default=0.1, metavar="KG", help="of the object (default 0.1)")
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
-    parser.add_argument("--deadline", type=float, default=None, metavar="SEC", help="end with what there is then")
+    parser.add_argument(
+        "--deadline", type=float, default=None, metavar="SEC", help="end with what there is then; loading counts"
+    )
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
     parser.add_argument("--robust", action="store_true", help="grasps that hold out of place too come first")
     parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
@@ -34,7 +37,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
 
 
 def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:
-    """The settings, and the arguments of `plan_grasps`; sets torch's threads.
+    """The settings, and the arguments of `plan_grasps` but for the deadline; sets torch's threads.
 
     Raises:
         ConfigError: an option is out of range, or the preset is unknown or malformed.
@@ -43,8 +46,8 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
 
     from graspd_core.planning.plan_grasps import check_request
 
-    request = {key: getattr(options, key) for key in ("count", "seed", "verify", "deadline", "device")}
-    check_request(**request)
+    request = {key: getattr(options, key) for key in ("count", "seed", "verify", "device")}
+    check_request(**request, deadline=options.deadline)
     if options.threads < 1:
         raise ConfigError(f"threads: {options.threads}; at least 1")
     torch.set_num_threads(options.threads)
@@ -54,6 +57,12 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     if options.robust:
         config = dataclasses.replace(config, robust=dataclasses.replace(config.robust, rank=True))
     return config, request
+
+
+def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> GraspResult:
+    """What a run comes to whose deadline passed while its object was loaded, from `began` on."""
+    taken = time.perf_counter() - began
+    return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:

@@ -19,10 +19,19 @@ from graspd_core.cli.cloud_options import (
     scene_config_of,
     target_of,
 )
-from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options
+from graspd_core.cli.deadline import Deadline, DeadlinePassed
+from graspd_core.cli.planning_options import (
+    add_planning_options,
+    exit_status,
+    good_grasps,
+    not_loaded,
+    planning_options,
+)
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt, Reporter
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
+from graspd_core.hands.model import HandModel
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.transforms import SECOND
 from graspd_core.types import GraspResult
@@ -52,9 +61,8 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Returns the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no cloud of any use."""
-    from graspd_core.formats.grasps_json import check_writable, save_result
+    from graspd_core.formats.grasps_json import check_writable
     from graspd_core.hands.library import load_hand
-    from graspd_core.planning.plan_grasps import plan_grasps
 
     config, request = planning_options(options)
     check_bag_options(options)
@@ -64,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError(f"{options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
     if options.out:
         check_writable(options.out if single else options.out / "probe")
-    hand = load_hand(options.hand, candidates=config.problem.fine_candidates)
+    hand = load_hand(options.hand)
     began, statuses, grasps, interrupted = time.perf_counter(), [], 0, False
     with Interrupt() as interrupt:
         for job in _jobs(options):
@@ -72,19 +80,12 @@ def run(options: argparse.Namespace) -> int:
             if interrupted := interrupt.came():
                 break
             try:
-                scene = _scene_of(job, options, settings, config.resolution)
+                result = _planned(job, options, hand, config, {**request, "settings": settings, "stop": interrupt.came})
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
                 # An empty table is an answer; a cloud that cannot be used is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
-            for warning in scene.object.warnings:
-                print(f"graspd: {job.label}: {warning}", file=sys.stderr)
-            with Reporter() as reporter:
-                result = plan_grasps(scene, hand, preset=config, progress=reporter, stop=interrupt.came, **request)
-            if options.out:
-                path = options.out if single else options.out / f"{job.name}.json"
-                save_result(path, result, scene.object, hand, config)
             print(_outcome_line(job, result, options.count), flush=True)
             grasps += good_grasps(result)
             statuses.append(exit_status(result))
@@ -106,6 +107,30 @@ def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
     )
 
 
+def _planned(
+    job: _Job, options: argparse.Namespace, hand: HandModel, config: PlanConfig, request: dict[str, Any]
+) -> GraspResult:
+    """Grasps on what a job shows, written where that was asked for. Raises a GraspdError: it shows no usable object."""
+    from graspd_core.formats.grasps_json import save_result
+    from graspd_core.planning.plan_grasps import plan_grasps
+
+    began = time.perf_counter()
+    deadline = Deadline(options.deadline, began)
+    try:
+        with deadline.cuts_short():
+            scene = _scene_of(job, options, request.pop("settings"))
+    except DeadlinePassed:
+        return not_loaded(options, config, began)
+    for warning in scene.object.warnings:
+        print(f"graspd: {job.label}: {warning}", file=sys.stderr)
+    with Reporter() as reporter:
+        result = plan_grasps(scene, hand, preset=config, progress=reporter, deadline=deadline.left(), **request)
+    if options.out:
+        path = options.out if options.out.suffix == ".json" else options.out / f"{job.name}.json"
+        save_result(path, result, scene.object, hand, config)
+    return result
+
+
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
     """One cloud after the other, or all of them together."""
     if options.fuse:
@@ -121,7 +146,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
             yield _Job(name, label, (seen,))
 
 
-def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig, resolution: int):
+def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
     """What the views of a job show. Raises a GraspdError: they show no usable object."""
     from graspd_core.scene.scene_from_views import scene_from_views
 
@@ -135,7 +160,6 @@ def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig, res
         mass=options.mass,
         friction=options.friction,
         source=f"{options.bag}: {job.label}",
-        resolution=resolution,
     )
 
 

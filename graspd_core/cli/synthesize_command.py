@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.cli.cloud_options import add_object_options, scene_config_of, target_of
-from graspd_core.cli.planning_options import add_planning_options, exit_status, good_grasps, planning_options, summary
+from graspd_core.cli.deadline import Deadline, DeadlinePassed
+from graspd_core.cli.planning_options import (
+    add_planning_options,
+    exit_status,
+    good_grasps,
+    not_loaded,
+    planning_options,
+    summary,
+)
 from graspd_core.cli.running import Interrupt, Reporter
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
@@ -37,26 +45,33 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.scene.load_scene import load_scene
 
     config, request = planning_options(options)
+    deadline = Deadline(options.deadline, options.began)
     # A run whose result could not be written would be lost.
     for path in (options.out, options.html):
         if path:
             check_writable(path)
-    scale = _UNITS[options.units] if options.units else options.scale
-    scene = load_scene(
-        options.object,
-        mass=options.mass,
-        friction=options.friction,
-        scale=scale,
-        resolution=config.resolution,
-        target=target_of(options),
-        alone=options.alone,
-        settings=scene_config_of(options),
-    )
-    hand = load_hand(options.hand, candidates=config.problem.fine_candidates)
+    try:
+        with deadline.cuts_short():
+            scene = load_scene(
+                options.object,
+                mass=options.mass,
+                friction=options.friction,
+                scale=_UNITS[options.units] if options.units else options.scale,
+                target=target_of(options),
+                alone=options.alone,
+                settings=scene_config_of(options),
+            )
+            hand = load_hand(options.hand)
+    except DeadlinePassed:
+        # Nothing is written: results are of an object.
+        result = not_loaded(options, config, options.began)
+        print(summary(result, options.count, 0))
+        return exit_status(result)
     for warning in scene.object.warnings:
         print(f"graspd: {warning}", file=sys.stderr)
     with Reporter() as reporter, Interrupt() as interrupt:
-        result = plan_grasps(scene, hand, preset=config, progress=reporter, stop=interrupt.came, **request)
+        hooks = {"progress": reporter, "stop": interrupt.came}
+        result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html:

@@ -11,7 +11,8 @@ import torch
 from graspd_core.formats.grasps_json import save_text
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.model import HandModel
-from graspd_core.scene.far_objects import far_centre, moved_grasp, moved_mesh
+from graspd_core.mesh.topology import far_centre, moved_mesh
+from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
 

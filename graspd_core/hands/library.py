@@ -16,12 +16,11 @@ from graspd_core.hands.readers.mjcf import read_mjcf
 from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.hands.readers.xml_io import read_xml, wrong
 from graspd_core.hands.self_collision import adjacent_links
-from graspd_core.hands.surface_points import candidates as surface_candidates
+from graspd_core.hands.surface_points import with_candidates
 from graspd_core.paths import config_dir
 
 # A joint's greatest torque [N·m], a sliding joint's greatest force [N], where neither URDF nor description gives one.
 DEFAULT_EFFORT, DEFAULT_FORCE = 0.7, 40.0
-_CANDIDATE_SEED = 0
 
 
 def hand_names() -> tuple[str, ...]:
@@ -47,9 +46,7 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600) -> HandModel:
         hand = apply_description(_with_effort(read_hand_file(description.urdf)), description)
     else:
         hand = default_postures(default_palm(_with_effort(read_hand_file(path))))
-    hand = replace(hand, adjacent=adjacent_links(hand))
-    points, normals, links = surface_candidates(hand, candidates, _CANDIDATE_SEED)
-    return replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)
+    return with_candidates(replace(hand, adjacent=adjacent_links(hand)), candidates)
 
 
 def read_hand_file(path: Path) -> HandModel:

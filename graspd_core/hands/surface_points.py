@@ -6,7 +6,8 @@ are those that stay inside the next link of the chain at every value of the join
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -44,6 +45,21 @@ class _Pool:
     def take(self, keep: np.ndarray) -> _Pool:
         """The points that a mask or an index array chooses."""
         return _Pool(*(array[keep] for array in vars(self).values()))
+
+
+@lru_cache(maxsize=8)
+def with_candidates(hand: HandModel, count: int) -> HandModel:
+    """The hand with `count` contact candidates, the same of every such hand; itself where it has as many.
+
+    Raises:
+        HandError: fewer than one.
+    """
+    if count < 1:
+        raise HandError(f"candidates={count}: at least 1 is needed")
+    if count == len(hand.candidate_link):
+        return hand
+    points, normals, links = candidates(hand, count, seed=0)
+    return replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)
 
 
 def candidates(

@@ -18,14 +18,15 @@ from graspd_core.mesh.topology import (
     drop_degenerate,
     drop_repeated,
     drop_strays,
+    far_centre,
     is_closed,
     is_oriented,
     merge_vertices,
+    moved_mesh,
     orient,
 )
 from graspd_core.mesh.units import LARGE, LARGEST, SMALL, SMALLEST, unit_advice
 from graspd_core.mesh.winding_number import winding_inside
-from graspd_core.scene.far_objects import far_centre, moved_mesh
 from graspd_core.types import TriangleMesh
 
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")

@@ -99,3 +99,19 @@ def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
         corners = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
     soup = np.concatenate(done)
     return TriangleMesh(soup.reshape(-1, 3), np.arange(3 * len(soup)).reshape(-1, 3))
+
+
+# A thing is far that is this many times its own size away: float32 still tells a hundred-thousandth of its size.
+_FAR = 100.0
+
+
+def far_centre(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
+    """The middle of a thing that is farther from the origin than a hundred times its size [m]; else zero."""
+    low, high = vertices.min(0), vertices.max(0)
+    centre = (low + high) / 2
+    return centre if np.linalg.norm(centre) > _FAR * (high - low).max() else np.zeros(3)
+
+
+def moved_mesh(mesh: TriangleMesh, offset: Float[np.ndarray, "3"]) -> TriangleMesh:
+    """The mesh elsewhere; itself where the offset is zero."""
+    return TriangleMesh(mesh.vertices + offset, mesh.faces) if offset.any() else mesh

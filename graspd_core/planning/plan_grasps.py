@@ -10,6 +10,7 @@ import torch
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import PlanConfig, load_preset
@@ -39,23 +40,20 @@ def plan_grasps(
     progress: ProgressHook | None = None,
     stop: StopHook | None = None,
 ) -> GraspResult:
-    """Plan grasps and try them in MuJoCo in rank order until `count` of them hold.
+    """Plan grasps and try them in rank order until `count` of them hold; those that failed a trial come last.
 
     Args:
-        scene: from `load_scene` or `scene_from_views`.
-        hand: from `load_hand`.
+        scene: from `load_scene` or `scene_from_views`; where the preset asks for another grid, that is built.
+        hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
         count: verified grasps wanted (with verify="none": grasps wanted).
         seed: same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
-        verify: "standard" or "hard" hold trial, or "none". Where the object stands on something or among things, a
-            lift trial of the same physics follows, and a grasp is verified when it passes both.
+        verify: physics of the trials, "standard" or "hard", or "none"; a grasp is verified when it passes every trial
+            that applies to the scene.
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
         progress: called from this thread with `Progress` values.
         stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
-
-    Returns:
-        Always a result; `outcome` says how it went. Grasps that failed their trial follow the verified ones.
 
     Raises:
         ConfigError: count, seed, verify, deadline, device or preset is not valid.
@@ -64,20 +62,19 @@ def plan_grasps(
     config = load_preset(preset) if isinstance(preset, str) else preset
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = Run(time.perf_counter(), deadline, progress, stop)
-    support, message, far = scene.support, "", np.zeros(3)
-    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing; and no search
-    # finds what cannot be.
+    support, message, far, rounds = scene.support, "", np.zeros(3), []
+    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing.
     if not run.over():
         scene, far = planning_scene(scene, config.resolution)
+        hand = with_candidates(hand, config.problem.fine_candidates)
         message = out_of_reach(scene, hand)
-    rounds = [] if run.over() or message else rounds_of(scene, config, verify)
+        rounds = [] if message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
     found = run_rounds(run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device)
     grasps = found.grasps
     if found.context and config.robust.rank:
         grasps = rank_by_robustness(run, found.context, grasps, config.robust, seed)
-    timing = _timing(run, scene, found)
-    outcome = run.outcome(bool(grasps), found.good, count)
+    timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     grasps = tuple(moved_grasp(grasp, far) for grasp in grasps)
     return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, support)

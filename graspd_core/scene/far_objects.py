@@ -9,22 +9,7 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.mesh.sdf import GridSDF
-from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh
-
-# A thing is far that is this many times its own size away: float32 still tells a hundred-thousandth of its size.
-_FAR = 100.0
-
-
-def far_centre(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
-    """The middle of a thing that is farther from the origin than a hundred times its size [m]; else zero."""
-    low, high = vertices.min(0), vertices.max(0)
-    centre = (low + high) / 2
-    return centre if np.linalg.norm(centre) > _FAR * (high - low).max() else np.zeros(3)
-
-
-def moved_mesh(mesh: TriangleMesh, offset: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """The mesh elsewhere; itself where the offset is zero."""
-    return TriangleMesh(mesh.vertices + offset, mesh.faces) if offset.any() else mesh
+from graspd_core.types import Contact, Grasp, Plane, Posture
 
 
 def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:

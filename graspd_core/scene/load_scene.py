@@ -41,7 +41,7 @@ def load_scene(
         mass: [kg]; None takes 300 kg/m³ times the volume.
         friction: Coulomb coefficient between hand and object.
         scale: factor on the file's coordinates to make them metres.
-        resolution: the distance grid has at most the cube of it in nodes.
+        resolution: the distance grid has at most the cube of it in nodes; `plan_grasps` goes by its preset.
         target: which of the things in a cloud is meant.
         alone: a cloud shows the object and nothing else.
         settings: how a cloud becomes a scene.

@@ -14,10 +14,11 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
 from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
 from graspd_core.mesh.separate_bodies import bodies_apart
+from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.confidence import confidence_grid
-from graspd_core.scene.far_objects import far_centre, moved_mesh, moved_sdf
+from graspd_core.scene.far_objects import moved_sdf
 from graspd_core.types import Plane, TriangleMesh
 
 # Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.

@@ -88,16 +88,9 @@ def lift_trial(
     if reason:
         return TrialResult("lift", False, 0.0, 0.0, reason)
     away = (begin.position - grasp.pregrasp.position) / settings.retreat
-    stages = (
-        (_COMING, begin, grasp.pregrasp, settings.approach_time),
-        (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
-        ("while squeezing", grasp.grasp, grasp.squeeze, protocol.stage_time),
-        (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
-        ("while held up", grasp.squeeze, grasp.squeeze, settings.hold_time),
-    )
     set_hand_pose(world, data, begin)
     worst, touched = np.zeros(2), False
-    for name, start, end, duration in stages:
+    for name, start, end, duration in _stages(begin, grasp, protocol, settings):
         steps = round(duration / protocol.timestep)
         for step in range(1, steps + 1):
             set_targets(data, start, end, step / steps)
@@ -113,6 +106,19 @@ def lift_trial(
                     said = f"{reason} {name}" if reason else "stopped before the trial ended"
                     return TrialResult("lift", False, float(worst[0]), float(worst[1]), said)
     return TrialResult("lift", True, float(worst[0]), float(worst[1]))
+
+
+def _stages(
+    begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
+) -> tuple[tuple[str, Posture, Posture, float], ...]:
+    """Name, first and last posture and duration [s] of every stage, in order."""
+    return (
+        (_COMING, begin, grasp.pregrasp, settings.approach_time),
+        (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
+        ("while squeezing", grasp.grasp, grasp.squeeze, protocol.stage_time),
+        (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
+        ("while held up", grasp.squeeze, grasp.squeeze, settings.hold_time),
+    )
 
 
 def _touches(world: World, data: Any) -> bool:

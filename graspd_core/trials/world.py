@@ -21,7 +21,8 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, Mimic
-from graspd_core.scene.far_objects import moved_mesh, moved_plane
+from graspd_core.mesh.topology import moved_mesh
+from graspd_core.scene.far_objects import moved_plane
 from graspd_core.scene.scene import ObjectModel, Obstacle, moved_obstacle, near_object
 from graspd_core.se3 import quaternion_from_rotation
 from graspd_core.trials.bodies import (
@@ -141,7 +142,7 @@ def build_world(
         protocol: physics settings.
         support: a table, with gravity onto it. The hand meets it where it is; the object rests on a plane of its own
             through its lowest point, because a reconstructed bottom hovers or sinks by millimetres.
-        neighbours: fixed, as their convex hulls. Those that the object touches already let it pass.
+        obstacles: fixed, as their convex hulls. Those that the object touches already let it pass.
     """
     import mujoco
 
@@ -149,7 +150,7 @@ def build_world(
     target, far = near_object(target)
     parts = [moved_mesh(part, -far) for part in parts]
     support = support and moved_plane(support, -far)
-    obstacles = [moved_obstacle(neighbour, -far) for neighbour in obstacles]
+    obstacles = [moved_obstacle(obstacle, -far) for obstacle in obstacles]
     # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
     mujoco.set_mju_user_warning(_ignore)
     spec = mujoco.MjSpec()
@@ -163,7 +164,18 @@ def build_world(
     for index, obstacle in enumerate(obstacles):
         fixed.append(f"neighbour {index + 1}")
         add_obstacle(spec, fixed[-1], obstacle, target, protocol.friction)
-    model = spec.compile()
+    return _world_of(spec.compile(), hand, target, far, fixed, None if support is None else support.normal)
+
+
+def _world_of(
+    model: Any,
+    hand: HandModel,
+    target: ObjectModel,
+    origin: Float[np.ndarray, "3"],
+    fixed: Sequence[str],
+    up: Float[np.ndarray, "3"] | None,
+) -> World:
+    """A compiled model with the addresses that trials need; `fixed` names the geoms of the obstacles."""
     return World(
         model=model,
         joint_addresses=_joint_addresses(model, hand.joint_names),
@@ -171,10 +183,10 @@ def build_world(
         object_velocity=int(model.joint(OBJECT).dofadr[0]),
         object_body=int(model.body(OBJECT).id),
         center_of_mass=target.center_of_mass,
-        origin=far,
+        origin=origin,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
         obstacles=tuple((int(model.geom(name).id), name) for name in fixed),
-        up=None if support is None else support.normal,
+        up=up,
         coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
         mimics=hand.mimics,
     )

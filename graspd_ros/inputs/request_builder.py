@@ -138,15 +138,13 @@ class RequestBuilder:
         pose = self._lookup(frame, given, message.header.stamp)
         return pose[:3, :3] @ point + pose[:3, 3]
 
-    def _mesh_loader(self, uri: str, settings: Settings) -> Callable[[int], Scene]:
+    def _mesh_loader(self, uri: str, settings: Settings) -> Callable[[], Scene]:
         path = resolve_mesh(uri, settings.mesh_roots)
         mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
-        return lambda resolution: run_isolated(
-            load_scene, str(path), mass=mass, friction=friction, scale=scale, resolution=resolution
-        )
+        return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
 
 
 def _loader(
     read: Callable[[], tuple[PointCloud, ...]], settings: Settings, target: Float[np.ndarray, "3"] | None
-) -> Callable[[int], Scene]:
-    return lambda resolution: scene_of_views(read(), settings, target, resolution)
+) -> Callable[[], Scene]:
+    return lambda: scene_of_views(read(), settings, target)

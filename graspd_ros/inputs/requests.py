@@ -42,7 +42,7 @@ class Request:
         frame: the frame that the results are told in, unless the settings name an output_frame.
         stamp: when the object was as it was given.
         settings: the parameters at the time of the request, with what the request itself asks for.
-        load: reads the object, for a distance grid of that many nodes a side; slow, may raise a GraspdError.
+        load: reads the object; slow, may raise a GraspdError.
         T_frame_object: pose of the object's own frame in `frame`; None where they are one.
         only_newest: whether a newer request of this kind takes its place while it waits.
         listener: who is told of it beside the topics; None where nobody is.
@@ -55,7 +55,7 @@ class Request:
     frame: str
     stamp: Time
     settings: Settings
-    load: Callable[[int], Scene]
+    load: Callable[[], Scene]
     T_frame_object: Float[np.ndarray, "4 4"] | None = None
     only_newest: bool = False
     listener: Listener | None = None

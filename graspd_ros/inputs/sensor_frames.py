@@ -110,9 +110,7 @@ class Views:
         return Views(frame, sensor_frame.stamp, (*self.clouds, cloud))
 
 
-def scene_of_views(
-    views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None, resolution: int
-) -> Scene:
+def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None) -> Scene:
     """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m].
 
     Raises:
@@ -126,7 +124,6 @@ def scene_of_views(
         settings=load_scene_config(settings.scene_config) if settings.scene_config else None,
         mass=settings.mass,
         friction=settings.friction,
-        resolution=resolution,
     )
 
 

@@ -39,7 +39,7 @@ BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "notes.txt": (lambda path: path.write_text("hello"), "unknown ending"),
     "noise.stl": (lambda path: path.write_bytes(b"not a mesh at all"), "noise.stl"),
     "empty.obj": (lambda path: path.write_text(""), "empty.obj"),
-    "points.obj": (lambda path: path.write_text(NO_FACES), "empty mesh"),
+    "points.obj": (lambda path: path.write_text(NO_FACES), "3 vertices and no face"),
     "nan.obj": (lambda path: path.write_text(NAN_VERTEX), "NaN"),
     "large.ply": (save_large, "40 m across"),
     "empty.npy": (lambda path: np.save(path, np.zeros((0, 3))), "empty"),

@@ -105,6 +105,16 @@ def test_the_same_recording_gives_the_same_grasps_whatever_its_storage(replayed,
     assert first["object"]["sha256"] == again["object"]["sha256"]
 
 
+def test_a_cloud_that_is_not_made_whole_in_time_ends_by_the_deadline(bags, tmp_path, capsys):
+    options = ["--limit", "1", *QUICK, "--deadline", "1e-6", "--out", str(tmp_path / "out")]
+    assert main(["replay", str(bags["mcap"]), *options]) == EXIT_TOO_FEW
+    out, err = capsys.readouterr()
+    assert "0 of 1 grasps (0 tried): the deadline passed before enough grasps were found" in out
+    assert "1 scenes: 0 with enough grasps, 1 with fewer, 0 refused" in out
+    assert err == ""
+    assert not (tmp_path / "out" / "cloud_000000.json").exists()
+
+
 def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys):
     out = tmp_path / "grasps.json"
     fused = ["--fuse", "--frame", "world"]

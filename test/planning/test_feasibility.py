@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.planning.feasibility import out_of_reach, reach_of
 from graspd_core.planning.plan_grasps import plan_grasps
@@ -43,6 +44,11 @@ HOLDABLE = {
     "open crate": crate(0.005),
     "cube with a handle": (box((0.5, 0.5, 0.5)), box((0.01, 0.06, 0.03), (0.53, 0.0, 0.0))),
 }
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return load_hand("allegro_right", candidates=120)
 
 
 @pytest.fixture(scope="module")

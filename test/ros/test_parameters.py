@@ -53,7 +53,7 @@ def test_a_scene_file_sets_the_reconstruction_and_is_refused_by_its_key(tmp_path
     assert check_parameters([Parameter("scene_config", value=str(path))]).successful
     points = np.random.default_rng(0).normal(size=(2000, 3))
     ball = PointCloud(0.04 * points / np.linalg.norm(points, axis=1, keepdims=True), np.array([0.5, 0.0, 0.3]))
-    scene = scene_of_views((ball,), Settings(segment=False, scene_config=str(path)), None, 16)
+    scene = scene_of_views((ball,), Settings(segment=False, scene_config=str(path)), None)
     assert len(scene.object.mesh.faces) <= 300
     path.write_text("reconstruction: {most_faces: 300}")
     answer = check_parameters([Parameter("scene_config", value=str(path))])

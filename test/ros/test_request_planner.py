@@ -47,7 +47,7 @@ def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):
     stages: list[Progress] = []
     pose = np.eye(4)
     pose[:3, 3] = [10.0, 0.0, 0.0]
-    asked = request(lambda resolution: load_scene("shape:sphere", resolution=resolution), pose=pose)
+    asked = request(lambda: load_scene("shape:sphere"), pose=pose)
     planned = planner(hand).plan(asked, never, stages.append)
     assert planned.result.outcome is Outcome.SUCCEEDED
     best = planned.result.grasps[0]
@@ -57,16 +57,16 @@ def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):
 
 
 def test_trouble_on_the_way_comes_out_as_it_is(hand):
-    def broken(resolution: int):
+    def broken():
         raise MeshError("no such thing")
 
     with pytest.raises(MeshError, match="no such thing"):
         planner(hand).plan(request(broken), never, lambda _: None)
-    read: list[int] = []
+    read = threading.Event()
     run_isolated = replace(SETTINGS, output_frame="base")
     with pytest.raises(TransformError, match="object -> base"):
-        planner(hand).plan(request(read.append, run_isolated), never, lambda _: None)
-    assert not read, "the object was read before it was known that the result cannot be told"
+        planner(hand).plan(request(read.set, run_isolated), never, lambda _: None)
+    assert not read.is_set(), "the object was read before it was known that the result cannot be told"
 
 
 @pytest.mark.parametrize(("timeless", "asked_for"), [(True, Time()), (False, Time(sec=7))])
@@ -78,8 +78,7 @@ def test_what_came_without_a_time_is_told_by_the_newest_transforms(hand, timeles
         return np.eye(4)
 
     settings = replace(SETTINGS, output_frame="base", verify="none")
-    load = lambda resolution: load_scene("shape:sphere", resolution=resolution)  # noqa: E731
-    given = Request("r", "mesh", "object", Time(sec=7), settings, load, timeless=timeless)
+    given = Request("r", "mesh", "object", Time(sec=7), settings, lambda: load_scene("shape:sphere"), timeless=timeless)
     Planner(hand, lookup).plan(given, never, lambda _: None)
     assert asked == [asked_for]
 
@@ -88,11 +87,11 @@ def test_what_came_without_a_time_is_told_by_the_newest_transforms(hand, timeles
 def test_a_request_that_is_over_is_answered_while_its_object_is_still_being_read(hand, ends_by):
     reading, release, read, told = threading.Event(), threading.Event(), threading.Event(), []
 
-    def slow(resolution: int):
+    def slow():
         reading.set()
         release.wait()
         read.set()
-        return load_scene("shape:sphere", resolution=resolution)
+        return load_scene("shape:sphere")
 
     plans = planner(hand)
     settings = replace(SETTINGS, deadline=100.0 if ends_by is Outcome.CANCELLED else 0.1)
@@ -109,7 +108,7 @@ def test_a_request_that_is_over_is_answered_while_its_object_is_still_being_read
 
     def box(resolution: int):
         after.append(read.is_set())
-        return load_scene("shape:box", resolution=resolution)
+        return load_scene("shape:box")
 
     fine = plans.plan(request(box), never, lambda _: None)
     assert after == [True]

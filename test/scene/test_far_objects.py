@@ -10,10 +10,10 @@ from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape, shape_volume
+from graspd_core.mesh.topology import far_centre
 from graspd_core.methods.plan_config import load_preset
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.planning_scene import planning_scene
-from graspd_core.scene.far_objects import far_centre
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import build_scene, object_parts
 from graspd_core.trials.hold_trial import hold_trial

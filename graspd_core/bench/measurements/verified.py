@@ -28,10 +28,10 @@ class _First:
 
 def run_verified(cell: Cell) -> dict[str, Any]:
     """Figures of one planned run: how many of `count` were verified, and what all of it cost."""
-    hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
+    hand = load_hand(cell.hand)
     began = _now()
     told = _First(began)
-    scene = load_scene(cell.source, resolution=cell.settings.resolution)
+    scene = load_scene(cell.source)
     result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=told)
     taken = {name: value - began[name] for name, value in _now().items()}
     return {

@@ -197,8 +197,8 @@ def _stray() -> TriangleMesh:
 
 def _debris() -> TriangleMesh:
     rng = np.random.default_rng(_SEED)
-    specks = [_shifted_by(_box((0.0007,) * 3), rng.choice([-1, 1], 3) * rng.uniform(0.05, 0.09, 3)) for _ in range(40)]
-    return _joined(make_shape("box"), *specks)
+    tiny = [_shifted_by(_box((0.0007,) * 3), rng.choice([-1, 1], 3) * rng.uniform(0.05, 0.09, 3)) for _ in range(40)]
+    return _joined(make_shape("box"), *tiny)
 
 
 def _shifted_by(mesh: TriangleMesh, offset: np.ndarray) -> TriangleMesh:

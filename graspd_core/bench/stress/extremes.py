@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from graspd_core.bench.stress.stress_case import GRASP, Case
+from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
 
@@ -58,8 +59,14 @@ def number_cases() -> tuple[Case, ...]:
         _case("inf-in-distance", "numbers", "one node of the distance is infinite", _poisoned(0, float("inf"))),
         _case("nan-in-gradient", "numbers", "one node of the gradient is NaN", _poisoned(1, float("nan"))),
         _case("zero-gradient", "numbers", "the gradient is zero all over one slab", _flattened),
-        _case("coarse-grid", "numbers", "a grid of 8 nodes a side", "shape:box", (GRASP, *_FEW), resolution=8),
-        _case("fine-grid", "numbers", "a grid of 128 nodes a side", "shape:box", resolution=128),
+        replace(
+            _case("coarse-grid", "numbers", "a grid of 8 nodes a side", "shape:box", (GRASP, *_FEW)),
+            options={"preset": PlanConfig(resolution=8)},
+        ),
+        replace(
+            _case("fine-grid", "numbers", "a grid of 128 nodes a side", "shape:box"),
+            options={"preset": PlanConfig(resolution=128)},
+        ),
         replace(
             _case("no-time", "numbers", "a deadline of 0.2 s", "shape:box", (GRASP, "DEADLINE"), whole=False),
             deadline=0.2,

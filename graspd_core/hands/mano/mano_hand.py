@@ -24,13 +24,12 @@ from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_man
 from graspd_core.hands.mano.mano_skin import Skin, close_wrist, closed_faces, make_skin, rest, skin_vertices
 from graspd_core.hands.model import HandModel, JointKind, Primitive
 from graspd_core.hands.self_collision import adjacent_links
-from graspd_core.hands.surface_points import candidates as surface_candidates
+from graspd_core.hands.surface_points import with_candidates
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
 # Of muscle and bone together [kg/m³].
 _DENSITY = 1100.0
-_CANDIDATE_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +80,7 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     frames = mano_joints.anatomical_frames(joints, tips, normal)
     hand = _bare_hand(data, vertices, joints, owner, tips, normal, frames)
     hand = replace(hand, adjacent=adjacent_links(hand))
-    points, normals, links = surface_candidates(hand, candidates, _CANDIDATE_SEED)
-    hand = replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)
-    return ManoHand(hand, data, shape, frames)
+    return ManoHand(with_candidates(hand, candidates), data, shape, frames)
 
 
 def _float64(data: ManoData) -> Skin:

@@ -46,7 +46,7 @@ NOT_A_NUMBER = {
 }
 
 
-def load_scene(resolution: int) -> Scene:
+def load_scene() -> Scene:
     raise MeshError("it ended before it began")
 
 
