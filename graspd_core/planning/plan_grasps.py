@@ -45,8 +45,7 @@ def plan_grasps(
     Args:
         scene: from `load_scene` or `scene_from_views`; where the preset asks for another grid, that is built.
         hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
-        count: verified grasps wanted (with verify="none": grasps wanted).
-        seed: same seed, same machine, same grasps.
+        count, seed: verified grasps wanted; same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
         verify: physics of the trials, "standard" or "hard", or "none"; a grasp is verified when it passes every trial
             that applies to the scene.
@@ -76,8 +75,8 @@ def plan_grasps(
         grasps = rank_by_robustness(run, found.context, grasps, config.robust, seed)
     timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    grasps = tuple(moved_grasp(grasp, far) for grasp in grasps)
-    return GraspResult(outcome, grasps, timing, seed, config.method, message, scene.object.warnings, support)
+    moved = tuple(moved_grasp(grasp, far) for grasp in grasps)
+    return GraspResult(outcome, moved, timing, seed, config.method, message, scene.object.warnings, support)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
