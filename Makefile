@@ -20,8 +20,8 @@ $(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh $(I
 	@scripts/setup.sh $(VENV) $(PYTHON)
 	@touch $@
 
-test: setup  ## run the fast tests
-	$(RUN)/python -m pytest
+test: setup  ## run the fast tests on WORKERS (2) processes
+	$(RUN)/python -m pytest -n $(or $(WORKERS),2)
 
 check: setup  ## lint, formatting and types
 	$(RUN)/ruff check .

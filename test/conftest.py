@@ -29,6 +29,18 @@ hypothesis.settings.register_profile("ci", hypothesis.settings.get_profile("dev"
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """With several workers: a file's tests go to one, for what they share, and all of test/ros, for its node."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return "test/ros" if nodeid.startswith("test/ros/") else nodeid.partition("::")[0]
+
+    return ByFile(config, log)
+
+
 @pytest.fixture(scope="session")
 def claim_domain() -> Iterator[Callable[[], int]]:
     """Gives DDS domains that nobody else has: no other worker, and no other run of the tests beside this one."""

@@ -109,7 +109,8 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def node(directory: Path, claim_domain: Callable[[], int]) -> Iterator[GraspNode]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        arguments = ["--ros-args", "-p", f"mesh_roots:=['{directory}']"]
+        # A deadline beyond all that a busy machine may need.
+        arguments = ["--ros-args", "-p", f"mesh_roots:=['{directory}']", "-p", "deadline:=1000.0"]
         domain = claim_domain()
         patch.setenv("ROS_DOMAIN_ID", str(domain))
         rclpy.init(args=arguments, domain_id=domain)

@@ -38,7 +38,8 @@ def test_config_is_found_beside_an_installed_package(tmp_path: Path, monkeypatch
     assert paths.config_dir() == tmp_path / "share" / "graspd" / "config"
 
 
-def test_the_doctor_finds_this_machine_healthy():
+def test_the_doctor_finds_this_machine_healthy(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 600.0)  # of a busy machine
     failed = [check for check in doctor.run_checks() if not check.ok]
     assert not failed, doctor.format_checks(failed)
 

@@ -31,7 +31,7 @@ CAMERA = PinholeCamera(160, 120, 190.0, 190.0, 79.5, 59.5, (0.05, -0.1))
 OPTICAL = "camera_optical_frame"
 START = 1_700_000_000 * SECOND
 EYES = [(0.4, 0.1, 0.25), (-0.3, -0.3, 0.25)]
-QUICK = ["-n", "1", "--preset", "fast", "--verify", "none"]
+QUICK_PRESET = "closed_form: {explore_steps: 6, refine_steps: 6, polish_steps: 6}\n"
 
 
 def records() -> list[Record]:
@@ -70,11 +70,19 @@ def the_line(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def replayed(bags, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, list[str], Path, str]:
+def quick(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Options of a run that tries nothing and optimises hardly at all."""
+    path = tmp_path_factory.mktemp("presets") / "quick.yaml"
+    path.write_text(QUICK_PRESET)
+    return ["-n", "1", "--preset", str(path), "--verify", "none"]
+
+
+@pytest.fixture(scope="module")
+def replayed(bags, quick, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, list[str], Path, str]:
     """Exit status, lines, results and stderr of the whole mcap recording in the world's frame."""
     out, printed, said = tmp_path_factory.mktemp("replayed") / "grasps", io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
-        status = main(["replay", str(bags["mcap"]), "--frame", "world", *QUICK, "--out", str(out)])
+        status = main(["replay", str(bags["mcap"]), "--frame", "world", *quick, "--out", str(out)])
     return status, printed.getvalue().splitlines(), out, said.getvalue()
 
 
@@ -96,16 +104,16 @@ def test_every_cloud_of_a_recording_is_planned_on_in_the_frame_asked_for(replaye
         assert np.linalg.norm(load_document(path)["object"]["center_of_mass"]) < 0.05
 
 
-def test_the_same_recording_gives_the_same_grasps_whatever_its_storage(replayed, bags, tmp_path):
+def test_the_same_recording_gives_the_same_grasps_whatever_its_storage(replayed, bags, tmp_path, quick):
     out = tmp_path / "again.json"
-    options = ["--frame", "world", "--limit", "1", *QUICK, "--out", str(out)]
+    options = ["--frame", "world", "--limit", "1", *quick, "--out", str(out)]
     assert main(["replay", str(bags["sqlite3"]), *options]) == EXIT_OK
     first, again = load_document(replayed[2] / "cloud_000000.json"), load_document(out)
     assert first["grasps"] == again["grasps"]
     assert first["object"]["sha256"] == again["object"]["sha256"]
 
 
-def test_a_cloud_that_is_not_made_whole_in_time_ends_by_the_deadline(bags, tmp_path, capsys):
+def test_a_cloud_that_is_not_made_whole_in_time_ends_by_the_deadline(bags, tmp_path, capsys, quick):
     options = ["--limit", "1", *QUICK, "--deadline", "1e-6", "--out", str(tmp_path / "out")]
     assert main(["replay", str(bags["mcap"]), *options]) == EXIT_TOO_FEW
     out, err = capsys.readouterr()
@@ -115,41 +123,41 @@ def test_a_cloud_that_is_not_made_whole_in_time_ends_by_the_deadline(bags, tmp_p
     assert not (tmp_path / "out" / "cloud_000000.json").exists()
 
 
-def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys):
+def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys, quick):
     out = tmp_path / "grasps.json"
     fused = ["--fuse", "--frame", "world"]
-    assert main(["replay", str(bags["sqlite3"]), *fused, *QUICK, "--out", str(out)]) == EXIT_OK
+    assert main(["replay", str(bags["sqlite3"]), *fused, *quick, "--out", str(out)]) == EXIT_OK
     printed, said = capsys.readouterr()
     assert printed.startswith("2 clouds fused: ")
     assert np.abs(load_document(out)["object"]["center_of_mass"]).max() < 0.01
     # The empty image between the two is no view of anything.
     assert "graspd: 1 of 3 clouds left out, the first cloud 1: depth image: none of its" in said
-    assert main(["replay", str(bags["hopeless"]), "--fuse", *QUICK]) == EXIT_BAD_INPUT
+    assert main(["replay", str(bags["hopeless"]), "--fuse", *quick]) == EXIT_BAD_INPUT
     assert "cloud 0: the cloud has no finite point" in the_line(capsys)
 
 
-def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch):
+def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):
     monkeypatch.setattr(clouds, "MOST_VIEWS", 1)
-    assert main(["replay", str(bags["mcap"]), "--fuse", "--frame", "world", *QUICK]) == EXIT_BAD_INPUT
+    assert main(["replay", str(bags["mcap"]), "--fuse", "--frame", "world", *quick]) == EXIT_BAD_INPUT
     assert "more than 1 clouds to fuse; choose some with --every or --limit" in the_line(capsys)
 
 
-def test_ctrl_c_ends_a_recording_of_which_every_cloud_is_refused(bags, capsys, monkeypatch):
+def test_ctrl_c_ends_a_recording_of_which_every_cloud_is_refused(bags, capsys, monkeypatch, quick):
     monkeypatch.setattr(Interrupt, "came", lambda self: True)
-    assert main(["replay", str(bags["hopeless"]), *QUICK]) == EXIT_INTERRUPTED
+    assert main(["replay", str(bags["hopeless"]), *quick]) == EXIT_INTERRUPTED
     assert capsys.readouterr().out.startswith("0 scenes: ")
 
 
-def test_a_recording_without_any_usable_cloud_is_bad_input(bags, capsys):
-    assert main(["replay", str(bags["hopeless"]), *QUICK]) == EXIT_BAD_INPUT
+def test_a_recording_without_any_usable_cloud_is_bad_input(bags, capsys, quick):
+    assert main(["replay", str(bags["hopeless"]), *quick]) == EXIT_BAD_INPUT
     lines = capsys.readouterr().out.splitlines()
     assert ["no finite point" in line for line in lines] == [True, True, False]
     assert lines[-1].startswith("2 scenes: 0 with enough grasps, 0 with fewer, 2 refused; 0 grasps")
 
 
-def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys):
+def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys, quick):
     far = ["--target", "0", "0", "3"]
-    assert main(["replay", str(bags["mcap"]), "--limit", "1", *far, *QUICK]) == EXIT_TOO_FEW
+    assert main(["replay", str(bags["mcap"]), "--limit", "1", *far, *quick]) == EXIT_TOO_FEW
     assert "refused: " in capsys.readouterr().out.splitlines()[0]
 
 

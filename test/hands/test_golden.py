@@ -61,7 +61,7 @@ GOLDEN.append(("allegro_left", 0.5, np.array(ALLEGRO[0.5]) * [1.0, -1.0, 1.0]))
 
 @pytest.mark.parametrize(("name", "share", "golden"), GOLDEN)
 def test_golden_fingertips(name: str, share: float | None, golden: np.ndarray) -> None:
-    hand = load_hand(name)
+    hand = load_hand(name, candidates=8)
     q = np.clip(0, hand.lower, hand.upper) if share is None else hand.lower + share * (hand.upper - hand.lower)
     tips = link_poses(hand, q)[1][[hand.link_index[tip] for tip in TIPS[name]]]
     np.testing.assert_allclose(tips, golden, atol=1e-5)  # the golden values have five decimals

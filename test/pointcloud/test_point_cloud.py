@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.mesh_distance import make_distance_query, unsigned_distance
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
-from graspd_core.mesh.sdf import build_sdf, sample_sdf
 from graspd_core.mesh.shapes import make_shape, shape_volume
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.camera import PinholeCamera
@@ -75,10 +75,8 @@ def view(name: str, eye) -> tuple[np.ndarray, TriangleMesh]:
 
 
 def far_share(surface: TriangleMesh, other: TriangleMesh) -> float:
-    import torch
-
-    samples = torch.as_tensor(surface_samples(surface, 2000, 0)[0], dtype=torch.float32)
-    return float((sample_sdf(build_sdf(other), samples)[0].abs() > 0.01).float().mean())
+    off = unsigned_distance(make_distance_query(other), surface_samples(surface, 2000, 0)[0])
+    return float((off > 0.01).mean())
 
 
 @pytest.mark.parametrize("name", ["sphere", "box", "cylinder", "mug"])
@@ -94,7 +92,7 @@ def test_a_single_view_becomes_a_solid_near_the_truth(name, eye):
     assert far_share(truth, mesh) < 0.25
 
 
-@pytest.mark.parametrize("name", ["sphere", "box", "bottle", "torus"])
+@pytest.mark.parametrize("name", ["box", "torus"])
 def test_a_cloud_from_all_round_gives_the_volume(name):
     points, _ = surface_samples(make_shape(name), 6000, 0)
     whole = reconstruct([PointCloud(points, np.array([0.5, 0.1, 0.3]))])

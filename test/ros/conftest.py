@@ -34,7 +34,7 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.paths import config_dir
 from graspd_ros.parameters import Settings
 
-PATIENCE = 100.0  # seconds until what is waited for is held to never come; pytest's own limit is 120
+PATIENCE = 200.0  # seconds until what is waited for is held to never come; a test's own limit is 300
 
 READ_ONLY = {"hand", "device", "torch_threads", "queue_size"}
 DEFAULTS = {n: v for n, v in dataclasses.asdict(Settings()).items() if n not in READ_ONLY} | {"output_dir": "out"}

@@ -18,7 +18,7 @@ SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = pytest.mark.timeout(300)
 
 
 class Goal:

@@ -13,7 +13,7 @@ from graspd_msgs.msg import GraspArray, GraspRequest
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 
 def memory_of(pid: int) -> int:

@@ -13,7 +13,7 @@ FEW = {"num_grasps": 2, "preset": "fast", "deadline": 100.0, "busy_policy": "que
 LONG = {"num_grasps": 64, "preset": "accurate", "deadline": 600.0, "busy_policy": "queue"}
 HAND_LENGTH = 0.25  # metres; the base of a hand that holds something is within this of it
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 
 def seen_from_the_camera(count: int = 4000) -> np.ndarray:

@@ -30,7 +30,7 @@ for arguments in json.loads(sys.argv[1]):
     print(json.dumps([status, told.getvalue()]), flush=True)
 """
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -63,7 +63,7 @@ print("asked for the result", flush=True)
 rclpy.spin_until_future_complete(node, answer)
 """
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 
 def matrix(pose: Pose) -> np.ndarray:

@@ -57,7 +57,8 @@ def centre(mesh: TriangleMesh) -> np.ndarray:
 @pytest.mark.parametrize("shape", sorted(SHAPES))
 def test_the_object_is_cut_out_of_a_table_scene(shape):
     views = ((0.4, 0.0, "high"), (0.8, 2.0, "default"), (1.2, 4.0, "default"), (1.2, 1.0, "none"))
-    for elevation, turn, level in views:
+    # Every other shape from every other view: each view shows six shapes, each shape twice.
+    for elevation, turn, level in views[sorted(SHAPES).index(shape) % 2 :: 2]:
         scene = tabletop(shape, yaw=turn)
         pose = ring_poses(1, elevation=elevation, azimuth=turn)[0]
         view, label = seen(scene.meshes, pose, LEVELS[level])
@@ -97,11 +98,17 @@ def test_the_one_that_was_asked_for_is_picked(kind, wanted):
         assert max(share_near(points, other, 0.009) for points in found.obstacles) > 0.95
 
 
-@settings(max_examples=8)
-@given(st.integers(0, 10**6), st.floats(-1, 1), st.floats(-1, 1))
-def test_moving_the_whole_scene_moves_the_answer(seed, x, y):
+@pytest.fixture(scope="module")
+def three() -> tuple[PointCloud, Segmentation]:
+    """A view of three things, and what is made of it."""
     view, _ = seen(THREE.meshes, noise=LEVELS["low"])
-    first = segment([view])
+    return view, segment([view])
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10**6), st.floats(-1, 1), st.floats(-1, 1))
+def test_moving_the_whole_scene_moves_the_answer(three, seed, x, y):
+    view, first = three
     turn, shift = Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), np.array([x, y, 0.3])
     assert view.forward is not None
     moved = PointCloud(view.points @ turn.T + shift, turn @ view.viewpoint + shift, turn @ view.forward)

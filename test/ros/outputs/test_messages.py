@@ -23,7 +23,7 @@ SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 BALL, RADIUS = np.array([0.0, 0.0, 0.5]), 0.035  # metres, camera frame
 HAND_LENGTH = 0.25
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 
 def place(pose: Pose) -> np.ndarray:
