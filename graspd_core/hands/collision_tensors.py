@@ -6,6 +6,7 @@ to the contact candidates. Gradients are exact where the distance is smooth.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,9 @@ from torch import Tensor
 
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import safe_norm
+
+# Distances at once; each takes some hundred bytes on the way.
+_AT_ONCE = 2**23
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +76,11 @@ def solid_distance(
     points: Float[Tensor, "batch points 3"],
 ) -> Float[Tensor, "batch points solids"]:
     """Signed distance [m] of base-frame points to every solid, negative inside, for the link poses of `forward`."""
-    local = _to_solids(solids, rotations, translations, points)
-    return _distance(local, solids.core, solids.radius, solids.is_round)
+
+    def whole(*rows: Tensor) -> Tensor:
+        return _distance(_to_solids(solids, *rows), solids.core, solids.radius, solids.is_round)
+
+    return _in_parts(whole, len(solids.link), rotations, translations, points)
 
 
 def solid_bound(
@@ -83,8 +90,19 @@ def solid_bound(
     points: Float[Tensor, "batch points 3"],
 ) -> Float[Tensor, "batch points solids"]:
     """A cheap lower bound of `solid_distance` [m]: largest coordinate of the offset from the bounding box."""
-    local = _to_solids(solids, rotations, translations, points)
-    return (local.abs() - (solids.core + solids.radius[:, None])).amax(-1)
+
+    def whole(*rows: Tensor) -> Tensor:
+        return (_to_solids(solids, *rows).abs() - (solids.core + solids.radius[:, None])).amax(-1)
+
+    return _in_parts(whole, len(solids.link), rotations, translations, points)
+
+
+def _in_parts(whole: Callable[..., Tensor], solids: int, *rows: Tensor) -> Tensor:
+    """`whole` of link poses and points, of so many rows of the batch at once as memory is there for."""
+    most = max(1, _AT_ONCE // max(1, solids * rows[-1].shape[1]))
+    if len(rows[-1]) <= most:
+        return whole(*rows)
+    return torch.cat([whole(*part) for part in zip(*(row.split(most) for row in rows), strict=True)])
 
 
 def _to_solids(

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.trials.hold_trial import breach, set_hand_pose, set_joints, set_targets
+from graspd_core.trials.hold_trial import breach, gave_up, set_hand_pose, set_joints, set_targets
 from graspd_core.trials.world import Protocol, World
 from graspd_core.types import Grasp, LiftResult, Posture
 
@@ -78,6 +78,17 @@ def lift_trial(
     The object has to stay within the protocol's limits (5 cm, 15°) of where it stood, as carried along by the lift, at
     all times. Without a support there is no gravity, and the hand takes the object back the way it came.
     """
+    import mujoco
+
+    try:
+        return _lift(world, hand, grasp, protocol, settings, stop)
+    except mujoco.FatalError as error:
+        return LiftResult(False, 0.0, 0.0, 0.0, gave_up(error))
+
+
+def _lift(
+    world: World, hand: HandModel, grasp: Grasp, protocol: Protocol, settings: LiftSettings, stop: Callable[[], bool]
+) -> LiftResult:
     import mujoco
 
     data = mujoco.MjData(world.model)

@@ -34,6 +34,9 @@ from graspd_core.trials.bodies import (
 )
 from graspd_core.types import Plane, TriangleMesh
 
+# A hand of more solids than this has thousands of contacts with itself and the object, more than MuJoCo's 14 MB hold.
+_CROWD, _MEMORY = 100, 2**28
+
 
 @dataclass(frozen=True)
 class Protocol:
@@ -156,14 +159,16 @@ def build_world(
     # Several contact points between flat faces: on one point each, a box between two plates rolls out. Later versions
     # of MuJoCo have no such switch, because it is always on.
     option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
+    if len(hand.primitives) > _CROWD:
+        spec.memory = _MEMORY
     _add_hand(spec, hand, protocol)
     add_object(spec, target, parts, protocol.friction)
-    fixed = [TABLE] if support is not None else []
+    obstacles = [TABLE] if support is not None else []
     if support is not None:
         add_support(spec, hand, parts, protocol.friction, support)
     for index, neighbour in enumerate(obstacles):
-        fixed.append(f"neighbour {index + 1}")
-        add_obstacle(spec, fixed[-1], neighbour, target, protocol.friction)
+        obstacles.append(f"neighbour {index + 1}")
+        add_obstacle(spec, obstacles[-1], neighbour, target, protocol.friction)
     model = spec.compile()
     return World(
         model=model,
@@ -173,7 +178,7 @@ def build_world(
         object_body=int(model.body(OBJECT).id),
         center_of_mass=target.center_of_mass,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
-        obstacles=tuple((int(model.geom(name).id), name) for name in fixed),
+        obstacles=tuple((int(model.geom(name).id), name) for name in obstacles),
         up=None if support is None else support.normal,
         coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
         mimics=hand.mimics,

@@ -11,9 +11,8 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.hands.readers.build_model import axis_rotation
 from graspd_core.hands.readers.xml_io import Element, wrong
-from graspd_core.hands.readers.xml_values import read_numbers, read_position
+from graspd_core.hands.readers.xml_values import axis_rotation, read_numbers, read_position
 
 _Attributes = Mapping[str, Mapping[str, str]]
 # Each class holds all that the classes above it say.
@@ -35,6 +34,7 @@ class Settings:
         euler: the axes of Euler angles in their order, lower case where they turn with the body.
         limits_by_range: whether a joint with a range is limited by it.
         mesh_folder: where mesh files lie.
+        corners: the most that the hull of a mesh may have.
         classes: default attributes by class and element; each class holds those of the classes above it.
     """
 
@@ -43,6 +43,7 @@ class Settings:
     euler: str = "xyz"
     limits_by_range: bool = True
     mesh_folder: str = ""
+    corners: int = 200
     classes: Mapping[str, _Attributes] = field(default_factory=lambda: MappingProxyType({"main": {}}))
 
     @property
