@@ -6,6 +6,7 @@ to the contact candidates. Gradients are exact where the distance is smooth.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,6 +17,9 @@ from torch import Tensor
 
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import SE3, safe_norm
+
+# Distances at once; each takes some hundred bytes on the way.
+_AT_ONCE = 2**23
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,16 +79,31 @@ def solid_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
     """Signed distance [m] of base-frame points to every solid, negative inside, for the link poses of `forward`."""
-    local = _to_solids(solids, links, points)
-    return _distance(local, solids.core, solids.radius, solids.is_round)
+
+    def whole(links: SE3, points: Tensor) -> Tensor:
+        return _distance(_to_solids(solids, links, points), solids.core, solids.radius, solids.is_round)
+
+    return _in_parts(whole, len(solids.link), links, points)
 
 
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
     """A cheap lower bound of `solid_distance` [m]: largest coordinate of the offset from the bounding box."""
-    local = _to_solids(solids, links, points)
-    return (local.abs() - (solids.core + solids.radius[:, None])).amax(-1)
+
+    def whole(links: SE3, points: Tensor) -> Tensor:
+        return (_to_solids(solids, links, points).abs() - (solids.core + solids.radius[:, None])).amax(-1)
+
+    return _in_parts(whole, len(solids.link), links, points)
+
+
+def _in_parts(whole: Callable[[SE3, Tensor], Tensor], solids: int, links: SE3, points: Tensor) -> Tensor:
+    """`whole` of link poses and points, of so many rows of the batch at once as memory is there for."""
+    most = max(1, _AT_ONCE // max(1, solids * points.shape[1]))
+    if len(points) <= most:
+        return whole(links, points)
+    parts = [slice(i, i + most) for i in range(0, len(points), most)]
+    return torch.cat([whole(links[part], points[part]) for part in parts])
 
 
 def _to_solids(

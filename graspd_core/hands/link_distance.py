@@ -7,13 +7,19 @@ greatest of its face planes' distances, exact inside and a lower bound outside n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_sdf import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+
+# Primitives of which planes and bounds are remembered: those of the most crowded hand.
+_MOST = 2048
 
 
 def hand_sdf(hand: HandModel, link: int, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -41,6 +47,44 @@ def primitive_sdf(primitive: Primitive, points: Float[Tensor, "*batch 3"]) -> Fl
     return (local @ normals.T - offsets).amax(-1)
 
 
+def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
+    """Depth [m] of points in a link's frame inside the union of its primitives, zero outside and for a bare link.
+
+    Primitives are only asked about points within their bounding boxes: a hand of many fine meshes has a hundred
+    thousand planes.
+    """
+    depth = np.zeros(len(points))
+    near = np.flatnonzero(within_bounds(hand.primitives_of[link], points))
+    for primitive in hand.primitives_of[link]:
+        at = near[within_bounds((primitive,), points[near])]
+        if len(at):
+            depth[at] = np.maximum(depth[at], -primitive_sdf(primitive, torch.as_tensor(points[at])).numpy())
+    return depth
+
+
+def within_bounds(
+    primitives: Sequence[Primitive], points: Float[np.ndarray, "points 3"], margin: float = 0.0
+) -> Bool[np.ndarray, "points"]:
+    """Which points in the link's frame lie within the bounding box of its primitives, or up to `margin` [m] off it."""
+    if not primitives:
+        return np.zeros(len(points), dtype=bool)
+    low, high = zip(*(bounds(primitive) for primitive in primitives), strict=True)
+    return ((points >= np.min(low, axis=0) - margin) & (points <= np.max(high, axis=0) + margin)).all(1)
+
+
+@lru_cache(maxsize=_MOST)
+def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Least and greatest coordinates of a primitive in its link's frame [m]; those of a box about it if it is round."""
+    if primitive.kind == "hull":
+        corners = primitive.vertices @ primitive.rotation.T + primitive.translation
+        return corners.min(0), corners.max(0)
+    size = primitive.size
+    half = {"box": size, "sphere": size * 3, "cylinder": (size[0], *size), "capsule": (size[0], size[0], sum(size))}
+    reach = np.abs(primitive.rotation) @ np.array(half[primitive.kind])
+    return primitive.translation - reach, primitive.translation + reach
+
+
+@lru_cache(maxsize=_MOST)
 def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Float[np.ndarray, "planes"]]:
     """Distinct face planes `n·x = d` of a hull in its own frame: outward unit normals and offsets [m]."""
     a, b, c = (primitive.vertices[primitive.faces[:, i]] for i in range(3))

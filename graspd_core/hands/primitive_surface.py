@@ -54,6 +54,16 @@ def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points
     return *_to_link(primitive, points, normals), corner
 
 
+def outermost(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
+    """The points that lie farthest out along `count` directions, which are spread evenly on a golden spiral."""
+    index = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * index / count), np.pi * (1 + 5**0.5) * index
+    rays = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
+    # By parts: a fine mesh has a hundred thousand points.
+    parts = np.array_split(rays, -(-count // 64), axis=1)
+    return points[np.unique(np.concatenate([(points @ part).argmax(0) for part in parts]))]
+
+
 def _to_link(primitive: Primitive, points: Points, normals: Points) -> tuple[Points, Points]:
     return points @ primitive.rotation.T + primitive.translation, normals @ primitive.rotation.T
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
-from graspd_core.hands.link_distance import hand_sdf
+from graspd_core.hands.link_distance import depth_inside
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import dense_samples, parent_groups
 
@@ -36,7 +36,7 @@ def link_overlaps(
         if not hand.primitives_of[link]:
             continue
         local = poses[:, link].apply_inverse(base)
-        inside = (-hand_sdf(hand, link, local)).clamp_min(0.0).numpy()
+        inside = depth_inside(hand, link, local.flatten(0, 1).numpy()).reshape(local.shape[:-1])
         np.maximum.at(depth[:, link].T, links, inside.T)
     depth[:, range(hand.num_links), range(hand.num_links)] = 0.0
     return np.maximum(depth, depth.transpose(0, 2, 1))

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.link_distance import primitive_sdf
+from graspd_core.hands.link_distance import primitive_sdf, within_bounds
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
 
@@ -25,6 +25,8 @@ _STEP = 1e-6
 _CREASE = 1e-4
 # Random points drawn for each that lies on the outer surface, at most.
 _MOST_DRAWN = 200
+# Points on edges and corners that candidates are chosen from, at most.
+_MOST_FEATURES = 20_000
 # Of the candidates, the most that may be corners chosen beforehand.
 _CORNER_SHARE = 0.3
 # Spacing of candidates is inversely proportional to these; a surface that faces the grasp has 1.
@@ -111,7 +113,9 @@ def dense_samples(
 
 def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool:
     areas = np.array([primitive_area(p) for p in hand.primitives])
-    counts = np.maximum(8, np.ceil(count * areas / areas.sum())).astype(int)
+    # A few for the smallest solid too, but not thousands because there are thousands of solids.
+    least = np.clip(count // len(areas), 1, 8)
+    counts = np.maximum(least, np.ceil(count * areas / areas.sum())).astype(int)
     parts = [surface_points(p, int(n), rng) for p, n in zip(hand.primitives, counts, strict=True)]
     return _Pool(
         points=np.concatenate([points for points, _ in parts]),
@@ -126,7 +130,7 @@ def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool
 def _feature_pool(hand: HandModel) -> _Pool:
     parts = [feature_points(p, spacing=0.004) for p in hand.primitives]
     counts = [len(points) for points, _, _ in parts]
-    return _Pool(
+    pool = _Pool(
         points=np.concatenate([part[0] for part in parts]),
         normals=np.concatenate([part[1] for part in parts]),
         links=np.repeat([p.link for p in hand.primitives], counts),
@@ -134,22 +138,27 @@ def _feature_pool(hand: HandModel) -> _Pool:
         areas=np.zeros(sum(counts)),
         corner=np.concatenate([part[2] for part in parts]),
     )
+    # Of thousands of solids no more than can be looked at: every so many-th, so that all have their share.
+    total = len(pool.points)
+    return pool if total <= _MOST_FEATURES else pool.take(np.linspace(0, total - 1, _MOST_FEATURES).astype(int))
 
 
 def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
     """The points of the pool that lie on the outer surface."""
     pool = pool.take(~_covered_in_group(hand, pool))
-    groups, parent_group = hand.link_group[pool.links], parent_groups(hand)
+    groups, above = hand.link_group[pool.links], parent_groups(hand)
     always = np.ones(len(pool.points), dtype=bool)
     # One joint lies between neighbouring groups, so that its range is covered by moving all joints together.
     for share in np.linspace(0.0, 1.0, 5):
         poses = link_poses(hand, hand.lower + share * (hand.upper - hand.lower))
+        placed = _placed(poses, pool.points, pool.links)
         inside = np.zeros(len(pool.points), dtype=bool)
-        for primitive in hand.primitives:
-            group = hand.link_group[primitive.link]
-            neighbour = (parent_group[groups] == group) | (groups == parent_group[group])
+        for group, primitives in _by_group(hand).items():
+            neighbour = (above[groups] == group) | (groups == above[group])
             at = np.flatnonzero(always & neighbour & (groups != group))
-            inside[at] |= _distance(poses, primitive, pool.points[at], pool.links[at]) < 0.0
+            for _, primitive in primitives:
+                at = at[~inside[at]]
+                inside[at] = _distance(poses, primitive, placed[at]) < 0.0
         always &= inside
     return pool.take(~always)
 
@@ -157,15 +166,26 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
     """Points inside another solid of their rigid group, on a face glued to one, or flush with an earlier one."""
     poses = link_poses(hand, hand.open_posture)
+    placed = _placed(poses, pool.points, pool.links)
+    raised = _placed(poses, pool.points + _CREASE * pool.normals, pool.links)
     covered = np.zeros(len(pool.points), dtype=bool)
     groups = hand.link_group[pool.links]
-    for number, primitive in enumerate(hand.primitives):
-        at = np.flatnonzero((groups == hand.link_group[primitive.link]) & (pool.source != number))
-        here = _distance(poses, primitive, pool.points[at], pool.links[at])
-        outside = _distance(poses, primitive, pool.points[at] + _CREASE * pool.normals[at], pool.links[at])
-        flush = (np.abs(here) < 0.1 * _STEP) & (number < pool.source[at])
-        covered[at] |= (here < -0.1 * _STEP) | (outside < 0.5 * _CREASE) | flush
+    for group, primitives in _by_group(hand).items():
+        members = np.flatnonzero(groups == group)
+        for number, primitive in primitives:
+            at = members[(pool.source[members] != number) & ~covered[members]]
+            here, outside = (_distance(poses, primitive, points[at]) for points in (placed, raised))
+            flush = (np.abs(here) < 0.1 * _STEP) & (number < pool.source[at])
+            covered[at] = (here < -0.1 * _STEP) | (outside < 0.5 * _CREASE) | flush
     return covered
+
+
+def _by_group(hand: HandModel) -> dict[int, list[tuple[int, Primitive]]]:
+    """Number and primitive of all solids of each rigid group."""
+    found: dict[int, list[tuple[int, Primitive]]] = {}
+    for number, primitive in enumerate(hand.primitives):
+        found.setdefault(int(hand.link_group[primitive.link]), []).append((number, primitive))
+    return found
 
 
 def _placed(
@@ -182,12 +202,15 @@ def _distance(
     poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
     primitive: Primitive,
     points: Float[np.ndarray, "points 3"],
-    links: Int[np.ndarray, "points"],
 ) -> Float[np.ndarray, "points"]:
-    """Signed distance [m] of points of any links to one primitive, at one posture."""
+    """Signed distance [m] of base-frame points to one primitive, at one posture; infinite off its bounds."""
     rotations, translations = poses
-    local = (_placed(poses, points, links) - translations[primitive.link]) @ rotations[primitive.link]
-    return primitive_sdf(primitive, torch.as_tensor(local)).numpy()
+    local = (points - translations[primitive.link]) @ rotations[primitive.link]
+    distance = np.full(len(local), np.inf)
+    near = within_bounds((primitive,), local, _CREASE)
+    if near.any():
+        distance[near] = primitive_sdf(primitive, torch.as_tensor(local[near])).numpy()
+    return distance
 
 
 def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:

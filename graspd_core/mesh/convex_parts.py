@@ -202,7 +202,14 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
         rays = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
         chosen = set((corners @ rays).argmax(0).tolist())
         while len(chosen) < most:
-            planes = ConvexHull(corners[sorted(chosen)]).equations
+            found = _hull(corners[sorted(chosen)])
+            if found is None:
+                # All even directions ended in one plane, or in less: so thin that only its own axes span it.
+                along = corners @ np.linalg.eigh(np.cov(corners.T))[1]
+                ends = {*along.argmin(0).tolist(), *along.argmax(0).tolist()}
+                chosen |= ends if not ends <= chosen else set(range(len(corners)))
+                continue
+            planes = found.equations
             gaps = (corners @ planes[:, :3].T + planes[:, 3]).max(1)
             chosen |= set(np.argsort(gaps)[-min(4, most - len(chosen)) :].tolist())
         corners = corners[sorted(chosen)]

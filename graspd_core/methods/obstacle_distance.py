@@ -18,6 +18,7 @@ from torch import Tensor
 from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.kinematics import Kinematics, forward, link_poses, place_points, placement
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.primitive_surface import outermost
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.scene.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
@@ -124,12 +125,7 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
         rim = size[0] * np.column_stack([np.cos(turn), np.sin(turn)])
         return np.vstack([np.column_stack([rim, np.full(_RIM, s * size[1])]) for s in (1, -1)]), 0.0
     corners = primitive.vertices
-    if len(corners) > _HULL:
-        index = np.arange(_HULL) + 0.5
-        polar, azimuth = np.arccos(1 - 2 * index / _HULL), np.pi * (1 + 5**0.5) * index
-        rays = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
-        corners = corners[np.unique((corners @ rays).argmax(0))]
-    return corners, 0.0
+    return outermost(corners, _HULL) if len(corners) > _HULL else corners, 0.0
 
 
 def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Tensor, "batch gaps"]:

@@ -29,16 +29,31 @@ def hold_trial(
 
     Returns:
         Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions.
-        A simulation that diverges is a failure with that reason.
+        A simulation that diverges, or has more contacts than memory, is a failure with that reason.
     """
     import mujoco
 
     grasp = moved_grasp(grasp, -world.origin)
-    data = mujoco.MjData(world.model)
     worst = np.zeros(2)
+    try:
+        return _result(worst, _hold(world, grasp, protocol, worst, stop))
+    except mujoco.FatalError as error:
+        return _result(worst, gave_up(error))
+
+
+def gave_up(error: Exception) -> str:
+    """Why a trial is over that MuJoCo has broken off."""
+    return f"the simulation gave up: {str(error).splitlines()[0]}"
+
+
+def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, stop: Callable[[], bool]) -> str:
+    """Why the grasp does not hold, empty if it does; `worst` travel [m] and turn [rad] are brought up to date."""
+    import mujoco
+
+    data = mujoco.MjData(world.model)
     reason = close_hand(world, data, grasp, protocol, worst)
     if reason:
-        return _result(worst, reason)
+        return reason
     held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
     mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
     mass = float(world.model.body_mass[world.object_body])
@@ -47,12 +62,12 @@ def hold_trial(
         data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
         for _ in range(round(protocol.hold_time / protocol.timestep / _CHECK_EVERY)):
             if stop():
-                return _result(worst, "stopped before the trial ended")
+                return "stopped before the trial ended"
             mujoco.mj_step(world.model, data, _CHECK_EVERY)
             reason = breach(world, data, protocol, worst)
             if reason:
-                return _result(worst, f"{reason} under a pull along {axis_name(direction)}")
-    return _result(worst, "")
+                return f"{reason} under a pull along {axis_name(direction)}"
+    return ""
 
 
 def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst: np.ndarray) -> str:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.trials.hold_trial import breach, set_hand_pose, set_joints, set_targets
+from graspd_core.trials.hold_trial import breach, gave_up, set_hand_pose, set_joints, set_targets
 from graspd_core.trials.world import Protocol, World
 from graspd_core.types import Grasp, Posture, TrialResult
 
@@ -82,6 +82,17 @@ def lift_trial(
     import mujoco
 
     grasp = moved_grasp(grasp, -world.origin)
+    try:
+        return _lift(world, hand, grasp, protocol, settings, stop)
+    except mujoco.FatalError as error:
+        return TrialResult("lift", False, 0.0, 0.0, gave_up(error))
+
+
+def _lift(
+    world: World, hand: HandModel, grasp: Grasp, protocol: Protocol, settings: LiftSettings, stop: Callable[[], bool]
+) -> TrialResult:
+    import mujoco
+
     data = mujoco.MjData(world.model)
     begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
     reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)

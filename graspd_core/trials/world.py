@@ -36,6 +36,9 @@ from graspd_core.trials.bodies import (
 )
 from graspd_core.types import Plane, TriangleMesh
 
+# A hand of more solids than this has thousands of contacts with itself and the object, more than MuJoCo's 14 MB hold.
+_CROWD, _MEMORY = 100, 2**28
+
 
 @dataclass(frozen=True)
 class Protocol:
@@ -156,6 +159,8 @@ def build_world(
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     _set_physics(spec.option, protocol)
+    if len(hand.primitives) > _CROWD:
+        spec.memory = _MEMORY
     _add_hand(spec, hand, protocol)
     add_object(spec, target, parts, protocol.friction)
     fixed = [TABLE] if support is not None else []

@@ -47,7 +47,7 @@ def test_arrays_tensors_and_named_arguments_travel(child: WorkerProcess):
 def test_an_error_says_where_it_came_from_and_one_that_cannot_travel_what_it_was(child: WorkerProcess):
     with pytest.raises(ValueError, match="math domain") as caught:
         child(math.sqrt, -1.0)
-    assert "own_process.py" in caught.value.__notes__[0]
+    assert "worker_process.py" in caught.value.__notes__[0]
     with pytest.raises(RuntimeError, match="Homebound: no luggage"):
         child(exec, "class Homebound(Exception): pass\nraise Homebound('no luggage')")
     assert child(math.sqrt, 4.0) == 2.0
@@ -63,11 +63,11 @@ def test_only_a_process_that_asked_for_it_has_its_work_done_elsewhere():
     assert run_isolated(os.getpid) == os.getpid()
     program = (
         "import os\n"
-        "from graspd_core.runtime.worker_process import elsewhere, start_worker_process\n"
+        "from graspd_core.runtime.worker_process import run_isolated, start_worker_process\n"
         "start_worker_process()\n"
         "start_worker_process()\n"
-        "print(elsewhere(os.getpid) == elsewhere(os.getpid) != os.getpid())\n"
-        "print(elsewhere(elsewhere, os.getpid) == elsewhere(os.getpid))\n"
+        "print(run_isolated(os.getpid) == run_isolated(os.getpid) != os.getpid())\n"
+        "print(run_isolated(run_isolated, os.getpid) == run_isolated(os.getpid))\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.split() == ["True", "True"]
@@ -78,12 +78,12 @@ def test_the_main_module_of_its_user_is_not_imported_again(way: str, tmp_path: P
     """A script without a guard, what is typed into an interpreter, and a module that only the working directory has."""
     program = (
         "import os, sys\n"
-        "from graspd_core.runtime.worker_process import elsewhere, start_worker_process\n"
+        "from graspd_core.runtime.worker_process import run_isolated, start_worker_process\n"
         "sys.path.append(os.path.join(os.getcwd(), 'more'))\n"
         "import beside\n"
         "print('imported')\n"
         "start_worker_process()\n"
-        "print(elsewhere(beside.whoami) not in (os.getpid(), None))\n"
+        "print(run_isolated(beside.whoami) not in (os.getpid(), None))\n"
     )
     (tmp_path / "more").mkdir()
     (tmp_path / "more/beside.py").write_text("import os\n\ndef whoami():\n    return os.getpid()\n")

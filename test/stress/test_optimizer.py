@@ -20,7 +20,7 @@ from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput, problem_of
 from graspd_core.methods.poses import Poses, pack, unpack
-from graspd_core.methods.problem import Problem, hand_forward
+from graspd_core.methods.problem import Problem, evaluate, hand_forward
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graspd_core.hands.model import HandModel
+from graspd_core.trials import world as trial_world
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.noisy_trial import displaced, noisy_trial, pose_error
 from graspd_core.trials.world import PROTOCOLS, Protocol, World, build_world
@@ -82,6 +84,28 @@ def test_a_diverging_simulation_is_a_failure_not_an_exception(gripper, cube, clo
     assert hold.displacement == np.inf
     # MuJoCo's own log of such things stays unwritten.
     assert list(tmp_path.iterdir()) == []
+
+
+def crowded(gripper: HandModel, times: int) -> HandModel:
+    """The gripper with each of its solids there many times, each a little larger than the last."""
+    grown = [replace(p, size=tuple(x + 1e-6 * k for x in p.size)) for p in gripper.primitives for k in range(times)]
+    return replace(gripper, primitives=tuple(grown))
+
+
+def test_a_hand_of_hundreds_of_solids_is_tried_like_any(gripper, cube, closing):
+    world = build_world(crowded(gripper, 40), cube, (cube.mesh,), STANDARD)
+    assert hold_trial(world, closing(*GOOD), replace(STANDARD, hold_time=0.3)).reason == ""
+
+
+def test_more_contacts_than_memory_are_a_failure_not_an_exception(gripper, cube, closing, monkeypatch):
+    monkeypatch.setattr(trial_world, "_CROWD", 0)
+    reasons = []
+    # With too little for the contacts MuJoCo drops them; between that and enough it breaks off.
+    for memory in (200_000, 300_000, 1_000_000):
+        monkeypatch.setattr(trial_world, "_MEMORY", memory)
+        world = build_world(crowded(gripper, 10), cube, (cube.mesh,), STANDARD)
+        reasons.append(hold_trial(world, closing(*GOOD), replace(STANDARD, hold_time=0.1)).reason)
+    assert any(reason.startswith("the simulation gave up: ") for reason in reasons)
 
 
 @pytest.mark.parametrize(("share", "held"), [(1.3, True), (0.75, False)])

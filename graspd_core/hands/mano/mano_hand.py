@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from graspd_core.errors import HandError
 from graspd_core.hands.mano import mano_joints
 from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
 from graspd_core.hands.mano.mano_skin import Skin, close_wrist, closed_faces, make_skin, rest, skin_vertices
-from graspd_core.hands.model import HandModel, JointKind, Primitive
+from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.se3 import rotation_from_quaternion
@@ -111,18 +112,8 @@ def _bare_hand(
 
     A body hangs from its parent by two massless links and its own: flexion, abduction, twist.
     """
-    names, parents, axes = [BODIES[0]], [-1], [np.zeros(3)]
-    offsets = [(np.eye(3), np.zeros(3))]
-    link_of = {0: 0}
-    for body in range(1, len(BODIES)):
-        above = PARENTS[body]
-        turn = frames[above].T
-        offsets += [(turn @ frames[body], turn @ (joints[body] - joints[above])), *[(np.eye(3), np.zeros(3))] * 2]
-        parents += [link_of[above], len(names), len(names) + 1]
-        names += [f"{BODIES[body]}_{hinge}" for hinge in mano_joints.HINGES[:2]] + [BODIES[body]]
-        axes += list(np.eye(3))
-        link_of[body] = len(names) - 1
-    count = len(names)
+    tree, link_of = _tree(joints, frames)
+    count = len(tree["link_names"])
     hulls = {
         body: _hull(data, BODIES[body], link_of[body], (vertices[owner == body] - joints[body]) @ frames[body])
         for body in range(len(BODIES))
@@ -132,11 +123,10 @@ def _bare_hand(
         mass[link_of[body]], com[link_of[body]], inertia[link_of[body]] = _inertial(hull)
     lower, upper = mano_joints.limits()
     opened, closed = mano_joints.postures()
-    turning: tuple[JointKind, ...] = ("revolute",)
     return HandModel(
         name=data.path.stem,
         urdf=str(data.path),
-        link_names=tuple(names),
+        **tree,
         joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in mano_joints.HINGES),
         lower=lower,
         upper=upper,
@@ -147,12 +137,7 @@ def _bare_hand(
         palm_center=_palm_center(hulls[0], joints, normal),
         palm_normal=normal,
         approach=normal,
-        link_parent=np.array(parents),
         link_joint=np.arange(-1, count - 1),
-        link_offset_rotation=np.array([rotation for rotation, _ in offsets]),
-        link_offset_translation=np.array([translation for _, translation in offsets]),
-        joint_axis=np.array(axes),
-        joint_kind=("fixed", *turning * (count - 1)),
         link_group=np.arange(count),
         link_mass=mass,
         link_com=com,
@@ -163,6 +148,30 @@ def _bare_hand(
         candidate_normals=np.zeros((0, 3)),
         candidate_link=np.zeros(0, dtype=np.int64),
     )
+
+
+def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]) -> tuple[dict[str, Any], list[int]]:
+    """The fields of a hand that say how its links hang from each other, and the number of each body's own link."""
+    names, parents, axes = [BODIES[0]], [-1], [np.zeros(3)]
+    offsets = [(np.eye(3), np.zeros(3))]
+    link_of = [0]
+    for body in range(1, len(BODIES)):
+        above = PARENTS[body]
+        turn = frames[above].T
+        offsets += [(turn @ frames[body], turn @ (joints[body] - joints[above])), *[(np.eye(3), np.zeros(3))] * 2]
+        parents += [link_of[above], len(names), len(names) + 1]
+        names += [f"{BODIES[body]}_{hinge}" for hinge in mano_joints.HINGES[:2]] + [BODIES[body]]
+        axes += list(np.eye(3))
+        link_of.append(len(names) - 1)
+    tree = {
+        "link_names": tuple(names),
+        "link_parent": np.array(parents),
+        "link_offset_rotation": np.array([rotation for rotation, _ in offsets]),
+        "link_offset_translation": np.array([translation for _, translation in offsets]),
+        "joint_axis": np.array(axes),
+        "joint_kind": ("fixed", *["revolute"] * (len(names) - 1)),
+    }
+    return tree, link_of
 
 
 def _hull(data: ManoData, name: str, link: int, points: Float[np.ndarray, "points 3"]) -> Primitive:

@@ -1,4 +1,4 @@
-"""A `HandModel` from links and joints, whichever format they were read from: checks, order, couplings, limits.
+"""A `HandModel` from links and joints, whichever format they were read from: checks, order, couplings.
 
 The order of links and joints is depth-first, children in the order of the file's joints.
 """
@@ -9,21 +9,23 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
+from graspd_core.hands.readers.joint_limits import (
+    finite_limits,
+    refuse_long_slides,
+    welded_groups,
+    with_still_joints_welded,
+)
 from graspd_core.hands.readers.mimic import Coupling, narrowed
-from graspd_core.se3 import axis_rotation
 
 # More than this is no hand, and would take minutes to check against itself.
 _MOST_LINKS, _MOST_SOLIDS, _LONGEST_CHAIN = 300, 2000, 100
-# A joint that moves less than this is welded [rad] or [m].
-_STILL = 1e-6
-# Wider limits than this say nothing [rad]; a slide that is longer is in another unit [m].
-_WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +89,7 @@ def assemble(
     """The hand without candidates: postures mid-range, palm at the base's origin, every pair of links checked.
 
     Args:
-        path: of the file, for errors.
-        name: of the hand.
+        path, name: of the file, for errors, and of the hand.
         links, joints: one tree.
         couplings: of the coupled joints by name, chains resolved.
         warnings: what reading has found.
@@ -98,10 +99,47 @@ def assemble(
     """
     order = _depth_first(path, links, joints)
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
-    index = {link: i for i, link in enumerate(order)}
     moving = [into[link] for link in order[1:] if into[link].kind != "fixed"]
-    actuated = [joint for joint in moving if joint.name not in couplings]
-    number = {joint.name: i for i, joint in enumerate(actuated)}
+    specs, tree = [by_name[link] for link in order], _linked(order, into, moving, couplings)
+    limits, mended = _limits(path, moving, tree["mimics"], tree["joint_kind"])
+    middle = 0.5 * (limits["lower"] + limits["upper"])
+    hand = HandModel(
+        name=name,
+        urdf=str(path),
+        link_names=tuple(order),
+        **limits,
+        open_posture=middle,
+        closed_posture=middle,
+        palm_center=np.zeros(3),
+        palm_normal=np.array([1.0, 0.0, 0.0]),
+        approach=np.array([1.0, 0.0, 0.0]),
+        **tree,
+        link_mass=np.array([spec.mass for spec in specs]),
+        link_com=np.stack([spec.com for spec in specs]),
+        link_inertia=np.stack([spec.inertia for spec in specs]),
+        primitives=tuple(replace(p, link=i) for i, spec in enumerate(specs) for p in spec.primitives),
+        adjacent=np.eye(len(order), dtype=bool),
+        candidate_points=np.zeros((0, 3)),
+        candidate_normals=np.zeros((0, 3)),
+        candidate_link=np.zeros(0, dtype=np.int64),
+        warnings=(*warnings, *mended),
+    )
+    hand = with_still_joints_welded(hand)
+    if not hand.joint_names:
+        raise HandError(f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp")
+    return hand
+
+
+def _linked(
+    order: Sequence[str],
+    into: Mapping[str, JointSpec],
+    moving: Sequence[JointSpec],
+    couplings: Mapping[str, Coupling],
+) -> dict[str, Any]:
+    """The fields of a hand that say how its links hang from each other; `into` is each link's own joint."""
+    index = {link: i for i, link in enumerate(order)}
+    actuated = [joint.name for joint in moving if joint.name not in couplings]
+    number = {joint: i for i, joint in enumerate(actuated)}
     count = len(order)
     parent, link_joint = np.full(count, -1), np.full(count, -1)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
@@ -119,55 +157,38 @@ def assemble(
         link_joint[link] = number[joint.name if coupling is None else coupling.leader]
         if coupling is not None:
             mimics.append(Mimic(joint.name, link, int(link_joint[link]), coupling.multiplier, coupling.offset))
+    return {
+        "joint_names": tuple(actuated),
+        "link_parent": parent,
+        "link_joint": link_joint,
+        "link_offset_rotation": rotations,
+        "link_offset_translation": translations,
+        "joint_axis": axes,
+        "joint_kind": tuple(kinds),
+        "link_group": welded_groups(parent, link_joint),
+        "mimics": tuple(mimics),
+    }
+
+
+def _limits(
+    path: Path, moving: Sequence[JointSpec], mimics: Sequence[Mimic], kinds: Sequence[JointKind]
+) -> tuple[dict[str, Float[np.ndarray, "joints"]], tuple[str, ...]]:
+    """The actuated joints' limits, by the names of a hand's fields, and what was done to them.
+
+    `moving` are all movable joints, `kinds` those of every link's joint.
+    """
+    followers = {mimic.name for mimic in mimics}
+    actuated = [joint for joint in moving if joint.name not in followers]
+    coupled = {joint.name: (joint.lower, joint.upper, joint.velocity) for joint in moving if joint.name in followers}
     lower, upper, effort, velocity = (
         np.array([getattr(joint, key) for joint in actuated], dtype=float)
         for key in ("lower", "upper", "effort", "velocity")
     )
-    coupled = {joint.name: (joint.lower, joint.upper, joint.velocity) for joint in moving if joint.name in couplings}
     lower, upper, velocity, given_up = narrowed(lower, upper, velocity, mimics, coupled)
-    lower, upper, made_finite = _finite(path, actuated, lower, upper)
-    for mimic in mimics:
-        slide = abs(mimic.multiplier) * float(upper[mimic.joint] - lower[mimic.joint])
-        if kinds[mimic.link] == "prismatic" and slide > _LONGEST_SLIDE:
-            raise _too_long(path, mimic.name, slide)
-    middle = 0.5 * (lower + upper)
-    specs = [by_name[link] for link in order]
-    hand = HandModel(
-        name=name,
-        urdf=str(path),
-        link_names=tuple(order),
-        joint_names=tuple(joint.name for joint in actuated),
-        lower=lower,
-        upper=upper,
-        effort=effort,
-        velocity=velocity,
-        open_posture=middle,
-        closed_posture=middle,
-        palm_center=np.zeros(3),
-        palm_normal=np.array([1.0, 0.0, 0.0]),
-        approach=np.array([1.0, 0.0, 0.0]),
-        link_parent=parent,
-        link_joint=link_joint,
-        link_offset_rotation=rotations,
-        link_offset_translation=translations,
-        joint_axis=axes,
-        joint_kind=tuple(kinds),
-        link_group=_groups(parent, link_joint),
-        link_mass=np.array([spec.mass for spec in specs]),
-        link_com=np.stack([spec.com for spec in specs]),
-        link_inertia=np.stack([spec.inertia for spec in specs]),
-        primitives=tuple(replace(p, link=i) for i, spec in enumerate(specs) for p in spec.primitives),
-        adjacent=np.eye(count, dtype=bool),
-        candidate_points=np.zeros((0, 3)),
-        candidate_normals=np.zeros((0, 3)),
-        candidate_link=np.zeros(0, dtype=np.int64),
-        warnings=(*warnings, *given_up, *made_finite),
-        mimics=tuple(mimics),
-    )
-    hand = _with_still_joints_welded(hand)
-    if not hand.joint_names:
-        raise HandError(f"{path}: {name!r} has no joint that moves ({count} links), so that it could not grasp")
-    return hand
+    names = [joint.name for joint in actuated]
+    lower, upper, made_finite = finite_limits(path, names, [joint.kind for joint in actuated], lower, upper)
+    refuse_long_slides(path, mimics, kinds, lower, upper)
+    return {"lower": lower, "upper": upper, "effort": effort, "velocity": velocity}, (*given_up, *made_finite)
 
 
 def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSpec]) -> list[str]:
@@ -216,70 +237,3 @@ def _reaches(root: str, link: str, above: Mapping[str, str]) -> bool:
             return True
         link = above.get(link, root)
     return False
-
-
-def _groups(parent: Int[np.ndarray, "links"], link_joint: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
-    """Links welded to their parent take its number; numbers are those of each group's first link."""
-    groups = np.arange(len(parent))
-    for link in range(1, len(parent)):
-        if link_joint[link] < 0:
-            groups[link] = groups[parent[link]]
-    return groups
-
-
-def _finite(
-    path: Path, joints: Sequence[JointSpec], lower: Float[np.ndarray, "joints"], upper: Float[np.ndarray, "joints"]
-) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"], tuple[str, ...]]:
-    """Limits that mean something: a joint that turns without end is kept within ±π; what was done about it."""
-    lower, upper, warnings = lower.copy(), upper.copy(), []
-    # Limits in use go up to the largest float.
-    with np.errstate(over="ignore"):
-        ranges = upper - lower
-    for i, joint in enumerate(joints):
-        if joint.kind == "prismatic" and not ranges[i] <= _LONGEST_SLIDE:
-            raise _too_long(path, joint.name, float(ranges[i]))
-        if joint.kind == "revolute" and not ranges[i] <= _WIDEST:
-            # One turn: the one from -π to π, moved no farther than the limits ask for.
-            lower[i] = min(max(-np.pi, lower[i]), upper[i] - 2 * np.pi)
-            upper[i] = lower[i] + 2 * np.pi
-            warnings.append(f"joint {joint.name!r} turns without end: kept to [{lower[i]:.3g}, {upper[i]:.3g}] rad")
-    return lower, upper, tuple(warnings)
-
-
-def _too_long(path: Path, joint: str, slide: float) -> HandError:
-    return HandError(
-        f"{path}: joint {joint!r} slides by {slide:g} m; a hand's slides are limited, to {_LONGEST_SLIDE:g} m at most"
-    )
-
-
-def _with_still_joints_welded(hand: HandModel) -> HandModel:
-    """The hand with joints that cannot move, because their limits coincide, fixed where they are."""
-    still = hand.upper - hand.lower < _STILL
-    if not still.any():
-        return hand
-    rotations, translations = hand.link_offset_rotation.copy(), hand.link_offset_translation.copy()
-    kinds, axes, link_joint = list(hand.joint_kind), hand.joint_axis.copy(), hand.link_joint.copy()
-    for link in np.flatnonzero((hand.link_joint >= 0) & still[np.maximum(hand.link_joint, 0)]):
-        value = hand.link_multiplier[link] * hand.lower[hand.link_joint[link]] + hand.link_shift[link]
-        if kinds[link] == "prismatic":
-            translations[link] = translations[link] + rotations[link] @ axes[link] * value
-        else:
-            rotations[link] = rotations[link] @ axis_rotation(axes[link], value)
-        kinds[link], axes[link], link_joint[link] = "fixed", 0.0, -1
-    renumbered = np.where(link_joint >= 0, (np.cumsum(~still) - 1)[np.maximum(link_joint, 0)], -1)
-    welded = [name for name, stays in zip(hand.joint_names, still, strict=True) if stays]
-    return replace(
-        hand,
-        joint_names=tuple(name for name, stays in zip(hand.joint_names, still, strict=True) if not stays),
-        **{key: getattr(hand, key)[~still] for key in ("lower", "upper", "effort", "velocity")},
-        open_posture=hand.open_posture[~still],
-        closed_posture=hand.closed_posture[~still],
-        link_joint=renumbered,
-        link_offset_rotation=rotations,
-        link_offset_translation=translations,
-        joint_axis=axes,
-        joint_kind=tuple(kinds),
-        link_group=_groups(hand.link_parent, renumbered),
-        mimics=tuple(replace(m, joint=int(renumbered[m.link])) for m in hand.mimics if renumbered[m.link] >= 0),
-        warnings=(*hand.warnings, *(f"joint {name!r} cannot move: its limits coincide; welded" for name in welded)),
-    )

@@ -82,48 +82,58 @@ def read_description(path: Path) -> HandDescription:
     palm = _mapping(path, lines["palm"], "palm", root["palm"]) if "palm" in root else {}
     _check_keys(path, lines, palm, "palm.", _PALM_KEYS, ("center", "normal") if "palm" in root else ())
 
-    def vector(key: str, value: Any, *, unit: bool) -> Float[np.ndarray, "3"]:
-        if not isinstance(value, list) or len(value) != 3 or not all(is_number(x) for x in value):
-            raise HandError(f"{path}:{lines[key]}: {key}: expected three numbers, got {shown(value)}")
-        array = np.array(value, dtype=np.float64)
-        length = float(np.linalg.norm(array))
-        if unit and length < 1e-9:
-            raise HandError(f"{path}:{lines[key]}: {key}: a direction cannot be zero")
-        return array / length if unit else array
-
-    def posture(key: str) -> dict[str, float]:
-        values = _mapping(path, lines[key], key, root[key])
-        for joint, value in values.items():
-            if not is_number(value):
-                line = lines[f"{key}.{joint}"]
-                raise HandError(f"{path}:{line}: {key}.{joint}: expected a number, got {shown(value)}")
-        return {joint: float(value) for joint, value in values.items()}
-
     for key, value in (("name", root.get("name", "")), ("urdf", root["urdf"]), ("palm.link", palm.get("link", ""))):
         if not isinstance(value, str):
             raise HandError(f"{path}:{lines[key]}: {key}: expected text, got {shown(value)}")
-    effort = root.get("effort")
-    if effort is not None:
-        effort = posture("effort") if isinstance(effort, dict) else effort
-        values = list(effort.values()) if isinstance(effort, dict) else [effort]
-        if not all(is_number(value) and value > 0 for value in values):
-            told = shown(root["effort"])
-            raise HandError(f"{path}:{lines['effort']}: effort: expected positive numbers, got {told}")
-        effort = effort if isinstance(effort, dict) else float(effort)
+    # In this order, which decides what is told of a file with several mistakes.
+    effort = _effort(path, lines, root["effort"]) if root.get("effort") is not None else None
     return HandDescription(
         path=path,
         name=root.get("name", path.stem),
         urdf=path.parent / root["urdf"],
         palm_link=palm.get("link"),
-        palm_center=vector("palm.center", palm["center"], unit=False) if palm else None,
-        palm_normal=vector("palm.normal", palm["normal"], unit=True) if palm else None,
-        approach=vector("approach", root["approach"], unit=True) if "approach" in root else None,
+        palm_center=_vector(path, lines, "palm.center", palm["center"]) if palm else None,
+        palm_normal=_direction(path, lines, "palm.normal", palm["normal"]) if palm else None,
+        approach=_direction(path, lines, "approach", root["approach"]) if "approach" in root else None,
         effort=effort,
-        open=posture("open") if "open" in root else None,
-        closed=posture("closed") if "closed" in root else None,
+        open=_numbers(path, lines, "open", root["open"]) if "open" in root else None,
+        closed=_numbers(path, lines, "closed", root["closed"]) if "closed" in root else None,
         lines=lines,
         mount=read_mount(path, lines, root["mount"]) if "mount" in root else None,
     )
+
+
+def _vector(path: Path, lines: Mapping[str, int], key: str, value: Any) -> Float[np.ndarray, "3"]:
+    if not isinstance(value, list) or len(value) != 3 or not all(is_number(x) for x in value):
+        raise HandError(f"{path}:{lines[key]}: {key}: expected three numbers, got {shown(value)}")
+    return np.array(value, dtype=np.float64)
+
+
+def _direction(path: Path, lines: Mapping[str, int], key: str, value: Any) -> Float[np.ndarray, "3"]:
+    vector = _vector(path, lines, key, value)
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise HandError(f"{path}:{lines[key]}: {key}: a direction cannot be zero")
+    return vector / length
+
+
+def _numbers(path: Path, lines: Mapping[str, int], key: str, value: Any) -> dict[str, float]:
+    """Numbers by joint name."""
+    values = _mapping(path, lines[key], key, value)
+    for joint, number in values.items():
+        if not is_number(number):
+            line = lines[f"{key}.{joint}"]
+            raise HandError(f"{path}:{line}: {key}.{joint}: expected a number, got {shown(number)}")
+    return {joint: float(number) for joint, number in values.items()}
+
+
+def _effort(path: Path, lines: Mapping[str, int], value: Any) -> float | dict[str, float]:
+    """One greatest torque for all joints, or some by name."""
+    efforts = _numbers(path, lines, "effort", value) if isinstance(value, dict) else value
+    values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
+    if not all(is_number(number) and number > 0 for number in values):
+        raise HandError(f"{path}:{lines['effort']}: effort: expected positive numbers, got {shown(value)}")
+    return efforts if isinstance(efforts, dict) else float(efforts)
 
 
 def apply_description(hand: HandModel, description: HandDescription) -> HandModel:

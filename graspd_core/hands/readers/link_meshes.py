@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import MeshError
+from graspd_core.hands.primitive_surface import outermost
 from graspd_core.hands.readers.xml_io import wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import load_mesh
@@ -20,6 +21,10 @@ from graspd_core.types import TriangleMesh
 
 # The most corners of a hull: on a ball of 12 mm its facets lie up to 0.3 mm below the mesh's own surface.
 _CORNERS = 200
+# The most corners that all hulls of a hand have between them, and the fewest that each may have, however many they are.
+_ALL_CORNERS, _FEWEST_CORNERS = 12_800, 48
+# A fine rounded mesh, whose hull has more corners than this, is first thinned to a few for each that will be left.
+_MANY_CORNERS, _CHOICE = 1000, 3
 # Nothing of a hand is larger [m].
 LARGEST_SIZE = 2.0
 
@@ -63,15 +68,22 @@ def inside_exists(path: Path) -> bool:
         return False
 
 
-def mesh_hull(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """Convex hull of a mesh file, scaled along each axis (a negative factor mirrors), at most some 200 corners [m].
+def corners_each(meshes: int) -> int:
+    """The corners that the hull of each of so many meshes of one hand may have."""
+    return int(np.clip(_ALL_CORNERS // max(meshes, 1), _FEWEST_CORNERS, _CORNERS))
+
+
+def mesh_hull(
+    urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"], corners: int = _CORNERS
+) -> TriangleMesh:
+    """Convex hull of a mesh file, scaled along each axis (a negative factor mirrors), of some `corners` at most [m].
 
     Raises:
         HandError: the file is not there, not a mesh, or not of a hand's size.
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
-        hull = _hull(path, path.stat().st_mtime_ns, tuple(scale.tolist()))
+        hull = _hull(path, path.stat().st_mtime_ns, tuple(scale.tolist()), corners)
     except (MeshError, OSError) as error:
         raise wrong(urdf, shape, f"mesh {filename!r} cannot be read as a collision mesh: {error}") from error
     extent = float(np.ptp(hull.vertices, axis=0).max())
@@ -82,12 +94,27 @@ def mesh_hull(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndar
     return hull
 
 
-@lru_cache(maxsize=64)
-def _hull(path: Path, modified: int, scale: tuple[float, float, float]) -> TriangleMesh:
+@lru_cache(maxsize=2048)
+def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners: int) -> TriangleMesh:
     del modified
     mesh = load_mesh(path)
     # Scaled first and hulled then: a mirrored hull would be inside out.
-    return limited_hull(mesh.vertices[np.unique(mesh.faces)] * np.array(scale), _CORNERS)
+    points = mesh.vertices[np.unique(mesh.faces)] * np.array(scale)
+    return limited_hull(_fewer(points, _CHOICE * corners), corners)
+
+
+def _fewer(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
+    """The points, or the outermost `count` at most where they have a hull of very many corners."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) <= _MANY_CORNERS:
+        return points
+    try:
+        outer = ConvexHull(points).vertices
+    except QhullError:
+        # Flat: `limited_hull` makes a plate of them.
+        return points
+    return outermost(points[outer], count) if len(outer) > _MANY_CORNERS else points
 
 
 def _package_folders(package: str, parents) -> list[Path]:

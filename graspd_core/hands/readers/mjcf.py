@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, JointKind, Primitive
 from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.link_meshes import corners_each
 from graspd_core.hands.readers.mimic import Coupling, resolved_couplings
 from graspd_core.hands.readers.mjcf_geoms import read_geom
 from graspd_core.hands.readers.mjcf_values import (
@@ -57,7 +58,8 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
         if element.tag in _REFUSED:
             raise wrong(path, element, f"<{element.tag}> is not read; save the compiled model as one plain MJCF file")
     refuse_crowds(path, *(len(root.findall(f"worldbody//{tag}")) for tag in ("body", "joint", "geom")))
-    settings = read_settings(path, root)
+    meshes = sum("mesh" in geom.attrib for geom in root.findall("worldbody//geom"))
+    settings = replace(read_settings(path, root), corners=corners_each(meshes))
     parts = _Parts(settings, _mesh_assets(settings, root))
     bodies = root.findall("worldbody/body")
     if len(bodies) != 1:

@@ -87,5 +87,7 @@ def _mesh(settings: MjcfSettings, geom: ET.Element, meshes: Mapping[str, ET.Elem
             raise wrong(
                 settings.path, asset, f"<mesh vertex=...>: {len(points)} points, not all within {LARGEST_SIZE:g} m"
             )
-        return limited_hull(points, 200)
-    return mesh_hull(settings.path, asset, str(Path(settings.mesh_folder) / (asset.get("file") or "")), scale)
+        return limited_hull(points, settings.corners)
+    return mesh_hull(
+        settings.path, asset, str(Path(settings.mesh_folder) / (asset.get("file") or "")), scale, settings.corners
+    )

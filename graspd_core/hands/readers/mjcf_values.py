@@ -36,6 +36,7 @@ class MjcfSettings:
         euler: the axes of Euler angles in their order, lower case where they turn with the body.
         limits_by_range: whether a joint with a range is limited by it.
         mesh_folder: where mesh files lie.
+        corners: the most that the hull of a mesh may have.
         classes: default attributes by class and element; each class holds those of the classes above it.
     """
 
@@ -44,6 +45,7 @@ class MjcfSettings:
     euler: str = "xyz"
     limits_by_range: bool = True
     mesh_folder: str = ""
+    corners: int = 200
     classes: Mapping[str, _Attributes] = field(default_factory=lambda: MappingProxyType({"main": {}}))
 
     @property

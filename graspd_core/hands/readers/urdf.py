@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, JointKind
 from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.link_meshes import corners_each
 from graspd_core.hands.readers.mimic import read_couplings
-from graspd_core.hands.readers.urdf_geometry import read_primitives
+from graspd_core.hands.readers.urdf_geometry import colliding, read_primitives
 from graspd_core.hands.readers.xml_io import read_xml, wrong
 from graspd_core.hands.readers.xml_values import read_numbers, read_origin
 
@@ -54,9 +55,10 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     _refuse_xacro(path, root)
     links, joints, dropped = _below_world(path, links, joints)
     specs = [_read_joint(path, joint) for joint in joints]
+    corners = corners_each(sum(shape.find("geometry/mesh") is not None for link in links for shape in colliding(link)))
     bodies, shown = [], []
     for link in links:
-        primitives, from_visuals = read_primitives(path, link)
+        primitives, from_visuals = read_primitives(path, link, corners)
         if from_visuals:
             shown.append(str(link.get("name")))
         bodies.append(LinkSpec(str(link.get("name")), *_inertial(path, link), tuple(primitives)))

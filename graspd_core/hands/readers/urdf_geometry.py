@@ -17,20 +17,25 @@ _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
 
 
-def read_primitives(path: Path, link: ET.Element) -> tuple[list[Primitive], bool]:
+def read_primitives(path: Path, link: ET.Element, corners: int) -> tuple[list[Primitive], bool]:
     """The primitives of one `<link>`, link number zero, and whether they are those of its visuals.
 
-    A link without `<collision>` collides with what it shows.
+    A link without `<collision>` collides with what it shows. A mesh is a hull of `corners` at most.
 
     Raises:
         HandError: a shape is unknown, has no positive size, or its mesh cannot be found or read.
     """
-    collisions, visuals = link.findall("collision"), link.findall("visual")
-    shown = not collisions and bool(visuals)
-    return [_read_primitive(path, element) for element in (visuals if shown else collisions)], shown
+    elements = colliding(link)
+    shown = bool(elements) and elements[0].tag == "visual"
+    return [_read_primitive(path, element, corners) for element in elements], shown
 
 
-def _read_primitive(path: Path, element: ET.Element) -> Primitive:
+def colliding(link: ET.Element) -> list[ET.Element]:
+    """The elements of a `<link>` that its solids are read from."""
+    return link.findall("collision") or link.findall("visual")
+
+
+def _read_primitive(path: Path, element: ET.Element, corners: int) -> Primitive:
     rotation, translation = read_origin(path, element)
     geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
@@ -46,7 +51,7 @@ def _read_primitive(path: Path, element: ET.Element) -> Primitive:
         radius, length = (float(_positive(path, shape, key, 1)[0]) for key in ("radius", "length"))
         return Primitive(0, _ROUND[shape.tag], rotation, translation, (radius, 0.5 * length))
     if shape.tag == "mesh":
-        hull = mesh_hull(path, shape, shape.get("filename") or "", _scale(path, shape))
+        hull = mesh_hull(path, shape, shape.get("filename") or "", _scale(path, shape), corners)
         return Primitive(0, "hull", rotation, translation, (), hull.vertices, hull.faces)
     raise wrong(path, shape, f"unknown {element.tag} shape <{shape.tag}>; known: {', '.join(_SHAPES)}")
 

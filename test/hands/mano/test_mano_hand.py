@@ -17,8 +17,9 @@ from hypothesis import given
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
+from graspd_core.hands.mano import mano_joints
 from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
-from graspd_core.hands.mano.mano_hand import ManoHand, load_mano, mano_joints
+from graspd_core.hands.mano.mano_hand import ManoHand, load_mano
 from graspd_core.hands.mano.mano_skin import (
     close_wrist,
     closed_faces,
