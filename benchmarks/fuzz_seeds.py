@@ -62,7 +62,7 @@ DESCRIPTIONS = [
 ]
 PRESETS = [
     b"resolution: 48\nmethod: closed_form\nclosed_form: {explore_steps: 10}\nproblem: {friction: 0.4}",
-    b"graspd2022: {steps: 10, starts: hull}\ngrasp_stages: {open_steps: 3}\nmethod: graspd2022\n",
+    b"graspd2022: {steps: 10, initial: {kind: hull}}\ngrasp_stages: {open_steps: 3}\nmethod: graspd2022\n",
 ]
 _GRASP: dict[str, Any] = {
     **{"rank": 0, "verdict": "verified", "reason": "", "score": -1.5, "position": [0.0, 0.1, 0.2]},

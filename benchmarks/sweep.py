@@ -24,8 +24,13 @@ HAND, COUNT = "allegro_right", 8
 OBJECTS = ("shape:box", "shape:mug")
 # Title, preset, setting and its values; the preset's own is among them.
 SWEEPS = (
-    ("Grasp'D, stiffness [N/m]", "graspd2022_short", "graspd2022.stiffness", (30, 100, 300, 1e3, 3e3, 1e4, 3e4)),
-    ("Grasp'D, friction", "graspd2022_short", "graspd2022.friction", (0.02, 0.06, 0.2, 0.8, 2.0, 6.0, 20.0)),
+    (
+        "Grasp'D, stiffness [N/m]",
+        "graspd2022_short",
+        "graspd2022.contact.stiffness",
+        (30, 100, 300, 1e3, 3e3, 1e4, 3e4),
+    ),
+    ("Grasp'D, friction", "graspd2022_short", "graspd2022.contact.friction", (0.02, 0.06, 0.2, 0.8, 2.0, 6.0, 20.0)),
     ("closed form, width [mm]", "balanced", "closed_form.delta_end", (1e-4, 4e-4, 1e-3, 4e-3, 1e-2, 4e-2, 1e-1)),
     ("closed form, friction", "balanced", "problem.friction", (0.02, 0.06, 0.2, 0.4, 2.0, 6.0, 20.0)),
 )

@@ -11,7 +11,7 @@ from graspd_core.methods.annealing.annealing_config import AnnealingConfig
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form import ClosedForm
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.losses import hard_contact, soft_contact
@@ -50,7 +50,7 @@ def test_baselines_have_a_preset_that_changes_the_method_alone(method: str):
 
 SHORT = {
     "closed_form": (replace(DEFAULT, explore_steps=1, refine_steps=1, polish_steps=1), 3),
-    "graspd2022": (Graspd2022Config(steps=4, coarse_steps=1), 4),
+    "graspd2022": (Graspd2022Config(steps=4, level_set=LevelSetConfig(coarse_steps=1)), 4),
     "annealing": (AnnealingConfig(steps=5), 5),
     # Fingers close over twice the way from open to closed.
     "random_closure": (RandomClosureConfig(close_steps=6), 12),

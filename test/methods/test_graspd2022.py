@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from graspd_core.contact.free_body import make_body
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
 from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, plan
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
 from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import Hooks, minimise
@@ -26,12 +27,22 @@ from graspd_core.methods.poses import Poses, pack
 from graspd_core.methods.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
-SHORT = Graspd2022Config(steps=12, coarse_steps=6)
+SHORT = Graspd2022Config(steps=12, level_set=LevelSetConfig(coarse_steps=6))
+
+
+def changed(config: Graspd2022Config, **changes: Any) -> Graspd2022Config:
+    """The settings with some changed, each by its dotted name with two underscores for a dot."""
+    for name, value in changes.items():
+        group, _, rest = name.partition("__")
+        config = replace(config, **{group: replace(getattr(config, group), **{rest: value}) if rest else value})
+    return config
+
+
 VARIANTS = {
     "force": SHORT,
-    "wrench": replace(SHORT, desired="wrench"),
-    "cone": replace(SHORT, desired="cone", scaling="object", stiffness=1e3),
-    "direct": replace(SHORT, relaxation=False),
+    "wrench": changed(SHORT, relaxation__desired="wrench"),
+    "cone": changed(SHORT, relaxation__desired="cone", simulation__scaling="object", contact__stiffness=1e3),
+    "direct": changed(SHORT, relaxation__enabled=False),
 }
 
 
@@ -122,7 +133,7 @@ def test_desired_forces_that_balance_the_momentum_leave_no_motion(solver_of):
 
 
 def test_the_scaling_by_object_needs_the_same_forces_for_every_mass(solver_of):
-    config = replace(SHORT, scaling="object", stopping_force=5.0)
+    config = changed(SHORT, simulation__scaling="object", simulation__stopping_force=5.0)
     for mass in (0.01, 0.1, 2.0):
         solver = solver_of(config)
         solver = replace(solver, body=replace(solver.body, mass=mass))
@@ -135,7 +146,7 @@ def test_the_scaling_by_object_needs_the_same_forces_for_every_mass(solver_of):
 
 
 def test_gradients_of_motion_and_physics(solver_of):
-    solver = solver_of(replace(SHORT, scaling="object"))
+    solver = solver_of(changed(SHORT, simulation__scaling="object"))
 
     def cost(forces: Tensor, arms: Tensor) -> Tensor:
         left = motion_left(solver.body, forces, arms, solver.velocities, solver.time_step)
@@ -147,7 +158,7 @@ def test_gradients_of_motion_and_physics(solver_of):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_gradients_of_the_whole_evaluation(name, problem, starts, solver_of, slope_errors):
     # Without a leak, and with the hand partly below the level set; the leak's own gradient is tested in test_forces.py.
-    solver = solver_of(replace(VARIANTS[name], leak=0.0, scaling="object", stiffness=1e3))
+    solver = solver_of(changed(VARIANTS[name], contact__leak=0.0, simulation__scaling="object", contact__stiffness=1e3))
     x = pack(starts)
     components = 6 if name == "wrench" else 3
     desired = 0.1 * draw(0, len(x), len(problem.hand.coarse.links), 3, components)
@@ -212,8 +223,14 @@ def test_the_same_seed_gives_the_same_bits_and_nothing_is_not_a_number(name, pro
 @pytest.mark.parametrize("name", VARIANTS)
 def test_it_brings_its_own_cost_down(name, problem, starts, solver_of):
     # On a fixed level set that the hands already touch.
-    config = replace(
-        VARIANTS[name], steps=60, coarse_steps=0, scaling="object", stiffness=1e3, force_rate=0.05, starts="hull"
+    config = changed(
+        VARIANTS[name],
+        steps=60,
+        level_set__coarse_steps=0,
+        simulation__scaling="object",
+        contact__stiffness=1e3,
+        relaxation__force_rate=0.05,
+        initial__kind="hull",
     )
     near = replace(starts, translation=0.6 * starts.translation)
     first = run(replace(config, steps=1), problem, near, solver_of)[1]
@@ -222,7 +239,7 @@ def test_it_brings_its_own_cost_down(name, problem, starts, solver_of):
 
 
 def test_desired_forces_of_the_cone_stay_in_it(problem, starts, solver_of):
-    solver = solver_of(replace(VARIANTS["cone"], force_rate=0.05))
+    solver = solver_of(changed(VARIANTS["cone"], relaxation__force_rate=0.05))
     state = solver.init(problem, starts)
     for index in range(5):
         before = state
@@ -240,19 +257,19 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
     solver = solver_of(SHORT)
     state = solver.init(problem, starts)
     assert state.radius.tolist() == [0.1] * 3
-    for index in range(SHORT.coarse_steps):
+    for index in range(SHORT.level_set.coarse_steps):
         state = solver.step(problem, state, index)
         assert not torch.isfinite(state.best_loss).any()
-    state = solver.step(problem, state, SHORT.coarse_steps)
+    state = solver.step(problem, state, SHORT.level_set.coarse_steps)
     assert torch.isfinite(state.best_loss).all()
-    by_code = solver_of(replace(SHORT, radius="code")).init(problem, starts).radius
+    by_code = solver_of(changed(SHORT, level_set__schedule="code")).init(problem, starts).radius
     placed = hand_forward(problem, problem.hand.coarse, starts.translation, starts.quaternion, starts.joints)
     nearest = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)
     assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
 
 
 def test_the_best_iterate_is_kept_or_the_last(problem, starts, solver_of):
-    wild = replace(VARIANTS["cone"], steps=20, coarse_steps=0, pose_rate=0.05)
+    wild = changed(VARIANTS["cone"], steps=20, level_set__coarse_steps=0, pose_rate=0.05)
     _, best = run(wild, problem, starts, solver_of)
     _, last = run(replace(wild, keep="last"), problem, starts, solver_of)
     assert (best <= last).all()
@@ -284,9 +301,9 @@ def test_presets_name_this_method_and_change_what_they_say():
     mine = {name: load_preset(name) for name in preset_names() if name.startswith("graspd2022")}
     assert {p.method for p in mine.values()} == {"graspd2022"}
     assert mine["graspd2022"].settings == Graspd2022Config()
-    assert mine["graspd2022_no_coarse_to_fine"].settings.coarse_steps == 0
-    assert not mine["graspd2022_no_relaxation"].settings.relaxation
-    assert mine["graspd2022_no_leak"].settings.leak == 0.0
+    assert mine["graspd2022_no_coarse_to_fine"].settings.level_set.coarse_steps == 0
+    assert not mine["graspd2022_no_relaxation"].settings.relaxation.enabled
+    assert mine["graspd2022_no_leak"].settings.contact.leak == 0.0
 
 
 def test_every_setting_is_explained():

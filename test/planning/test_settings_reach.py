@@ -16,7 +16,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.annealing.annealing_config import AnnealingConfig
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, InitialPosesConfig, LevelSetConfig
 from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
@@ -30,7 +30,9 @@ SETTINGS: dict[str, Any] = {
     "closed_form": ClosedFormConfig(
         starts_per_grasp=9.0, explore_steps=2, refine_steps=2, polish_steps=2, keep_per_grasp=5.0
     ),
-    "graspd2022": Graspd2022Config(starts_per_grasp=3.0, steps=4, coarse_steps=2),
+    "graspd2022": Graspd2022Config(
+        initial=InitialPosesConfig(starts_per_grasp=3.0), level_set=LevelSetConfig(coarse_steps=2), steps=4
+    ),
     "annealing": AnnealingConfig(chains_per_grasp=9.0, keep_per_grasp=5.0, steps=4, close_steps=4, directions=8),
     "random_closure": RandomClosureConfig(rounds=2, touching=1, close_steps=4),
 }
@@ -101,10 +103,10 @@ CASES = {
     "closed_form.weights.penetration": Case(base=FAR_JUMPS),
     "closed_form.weights.self_collision": Case(base=FAR_JUMPS),
     "closed_form.polish_weights.self_collision": Case(base=(*FAR_JUMPS, *FEW_STARTS), hand="allegro_right", count=6),
-    "graspd2022.stopping_force": Case(base=(("graspd2022.scaling", "object"),)),
-    "graspd2022.friction_stiffness": Case(1e-3),
-    "graspd2022.limit_bound": Case(base=(("graspd2022.pose_rate", 1.0),)),
-    "graspd2022.inter_weight": Case(base=(("graspd2022.pose_rate", 1.0),)),
+    "graspd2022.simulation.stopping_force": Case(base=(("graspd2022.simulation.scaling", "object"),)),
+    "graspd2022.contact.friction_stiffness": Case(1e-3),
+    "graspd2022.constraints.limit_bound": Case(base=(("graspd2022.pose_rate", 1.0),)),
+    "graspd2022.weights.inter": Case(base=(("graspd2022.pose_rate", 1.0),)),
     "annealing.keep_per_grasp": Case(1.0, FEW_KEPT, count=10),
     "annealing.contacts_per_link": Case(1, (("problem.fine_candidates", 200),)),
     "annealing.directions": Case(1, FEW_KEPT, count=10),

@@ -91,28 +91,28 @@ class Graspd2022:
     @property
     def velocities(self) -> Float[Tensor, "3 3"]:
         """Initial velocities of the object in the three simulations [m/s]."""
-        speed = self.config.speed
+        speed = self.config.simulation.speed
         return self.body.center.new_tensor([[0.0] * 3, [speed] * 3, [-speed] * 3])
 
     @property
     def time_step(self) -> float:
         """Length of the one step [s]."""
         config = self.config
-        if config.scaling == "published":
-            return config.time_step
-        return self.body.mass * config.speed * math.sqrt(3) / config.stopping_force
+        if config.simulation.scaling == "published":
+            return config.simulation.time_step
+        return self.body.mass * config.simulation.speed * math.sqrt(3) / config.simulation.stopping_force
 
     def points(self, problem: Problem) -> PointSet:
         """The hand's points that may touch."""
-        return problem.hand.fine if self.config.all_candidates else problem.hand.coarse
+        return problem.hand.fine if self.config.contact.all_candidates else problem.hand.coarse
 
     def init(self, problem: Problem, starts: Poses) -> RelaxedState:
         config = self.config
         x = pack(starts)
-        points = len(self.points(problem).links) if config.relaxation else 0
-        components = 6 if config.desired == "wrench" else 3
-        radius = x.new_full((len(x),), config.radius_start)
-        if config.radius == "code":
+        points = len(self.points(problem).links) if config.relaxation.enabled else 0
+        components = 6 if config.relaxation.desired == "wrench" else 3
+        radius = x.new_full((len(x),), config.level_set.radius_start)
+        if config.level_set.schedule == "code":
             with torch.no_grad():
                 nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
                 radius = (nearest - 0.01).clamp_min(0.0)
@@ -129,13 +129,14 @@ class Graspd2022:
 
     def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
         config = self.config
-        remaining = max(0.0, 1.0 - index / config.coarse_steps) if config.coarse_steps else 0.0
+        remaining = max(0.0, 1.0 - index / config.level_set.coarse_steps) if config.level_set.coarse_steps else 0.0
         pose, forces = (x.value.detach().requires_grad_(True) for x in (state.pose, state.forces))
         found = self.evaluate(problem, pose, forces, remaining * state.radius)
-        task, limit = excess(found.task, config.task_bound), excess(found.limit, config.limit_bound)
+        bounds = config.constraints
+        task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
         broken = torch.stack([task, limit], -1)
         cost = self.cost(found)
-        lagrangian = cost + damped(broken, state.multipliers.value, config.damping).sum(-1)
+        lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
         by_pose, by_force = torch.autograd.grad(lagrangian.sum(), (pose, forces), allow_unused=True)
         broken, cost = broken.detach(), cost.detach()
         loss = cost + damped(broken, torch.ones_like(broken), 1.0).sum(-1)
@@ -145,15 +146,17 @@ class Graspd2022:
         better = (loss < state.best_loss) & (remaining == 0.0)
         fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
         count = index + 1
-        moved = adamax_step(state.pose, _clean(by_pose, finite), fade * config.pose_rate, count, config.memory)
+        moved = adamax_step(state.pose, _clean(by_pose, finite), fade * config.pose_rate, count, config.beta2)
         x = moved.value
         quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
         pulled = state.forces
-        if config.relaxation:
-            pulled = adamax_step(pulled, _clean(by_force, finite), fade * config.force_rate, count, config.memory)
-            if config.desired == "cone":
-                pulled = replace(pulled, value=into_cone(pulled.value, found.normals.detach(), config.friction))
-        climbed = adamax_step(state.multipliers, _clean(broken, finite), -config.multiplier_rate, count)
+        if config.relaxation.enabled:
+            pulled = adamax_step(
+                pulled, _clean(by_force, finite), fade * config.relaxation.force_rate, count, config.beta2
+            )
+            if config.relaxation.desired == "cone":
+                pulled = replace(pulled, value=into_cone(pulled.value, found.normals.detach(), config.contact.friction))
+        climbed = adamax_step(state.multipliers, _clean(broken, finite), -bounds.multiplier_rate, count)
         return replace(
             state,
             pose=replace(moved, value=torch.cat([x[:, :3], quaternion, x[:, 7:]], -1)),
@@ -174,8 +177,8 @@ class Graspd2022:
     def cost(self, found: Evaluation) -> Float[Tensor, "batch"]:
         """What is minimised: L_phys, or the motion itself without relaxation, with L_range and L_inter."""
         config = self.config
-        goal = config.physics_weight * found.physics if config.relaxation else found.motion
-        return goal + config.range_weight * found.range + config.inter_weight * found.inter
+        goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
+        return goal + config.weights.range * found.range + config.weights.inter * found.inter
 
     def evaluate(
         self,
@@ -195,13 +198,13 @@ class Graspd2022:
             distance - radius[:, None],
             normals,
             velocities,
-            stiffness=config.stiffness,
-            friction_stiffness=config.friction_stiffness,
-            friction=config.friction,
-            leak=config.leak,
+            stiffness=config.contact.stiffness,
+            friction_stiffness=config.contact.friction_stiffness,
+            friction=config.contact.friction,
+            leak=config.contact.leak,
         )
         none = torch.zeros_like(radius)
-        if config.relaxation:
+        if config.relaxation.enabled:
             difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
             # The pose answers to L_phys alone, as in the released code: L_task is a matter of the forces.
             left = motion_left(body, desired, arms.detach(), velocities, self.time_step)
@@ -237,9 +240,9 @@ def plan(task: PlannerInput) -> PlannerOutput:
     """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
     settings, thing = task.config.settings, task.scene.object
     problem = problem_of(task)
-    drawn = max(1, round(task.count * settings.starts_per_grasp))
-    if settings.starts == "published":
-        starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.standoff)
+    drawn = max(1, round(task.count * settings.initial.starts_per_grasp))
+    if settings.initial.kind == "published":
+        starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
     else:
         starts = initial_poses_of(task, drawn)
     body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
