@@ -237,9 +237,12 @@ def _errors(*names: str) -> tuple[type[Exception], ...]:
     return tuple(getattr(errors, name) for name in names)
 
 
-_HANDS = tuple(f"graspd_core.hands.{n}" for n in ("markup", "tree", "mimic", "elements", "meshfiles", "library"))
+_READERS = ("xml_io", "build_model", "mimic", "xml_values", "link_meshes", "joint_limits")
+_HANDS = ("graspd_core.hands.library", *(f"graspd_core.hands.readers.{n}" for n in _READERS))
 _NUMBERS = ("nan", "inf", "-inf", "1e400", "1e308", "-1e308", "1e-320", "0", "-1", "99999999999999999999", "0x10")
 _YAML = ("&a", "*a", "<<:", "!!binary", "!!set", "2001-99-99", "? ", "[[", "{")
+
+_MESSAGES = ("bags.messages", "pointcloud.camera", "pointcloud.depth_image", "transforms")
 
 TARGETS: dict[str, Target] = {
     target.name: target
@@ -266,12 +269,12 @@ TARGETS: dict[str, Target] = {
         ),
         Target(
             "document", _document, "json", lambda: DOCUMENTS, _errors("FormatError"),
-            ("graspd_core.formats.grasps_json",),
+            ("graspd_core.formats.read_grasps",),
             (*_NUMBERS, '"grasps"', '"hand"', "null", "true", "[[", '"mimic"', "NaN", '"verified"', '{"hold":'),
         ),
         Target(
             "mano", _mano, "pkl", pickles, _errors("HandError"),
-            tuple(f"graspd_core.hands.mano_{n}" for n in ("file", "numbers", "pickle")),
+            tuple(f"graspd_core.hands.mano.mano_{n}" for n in ("file", "numbers", "pickle")),
             ("cnumpy\nndarray\n", "cnumpy\ndtype\n", "cchumpy.ch\nCh\n", "(", "tR", "}", "\x8a\xff", "\x8d", "2"),
             16384,
         ),
@@ -287,7 +290,7 @@ TARGETS: dict[str, Target] = {
         Target("layout", _layout, "bin", layouts, _errors("CloudError"), ("graspd_core.pointcloud.pointcloud2",)),
         Target(
             "message", _message, "bin", messages, _errors("CloudError", "TransformError", "FormatError"),
-            tuple(f"graspd_core.{n}" for n in ("bags.messages", "geometry.camera", "geometry.depth", "transforms")),
+            tuple(f"graspd_core.{n}" for n in _MESSAGES),
         ),
         Target(
             "bag", _bag, "mcap", bags, _errors("BagError", "CloudError", "TransformError"),

@@ -1,4 +1,4 @@
-"""Records to figures: for every name (a preset, a rung) and object, then for every name over its objects."""
+"""Records to figures: for every name (a preset, a sweep value) and object, then for every name over its objects."""
 
 from __future__ import annotations
 

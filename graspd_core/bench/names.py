@@ -24,12 +24,12 @@ def is_hand(name: str) -> bool:
 
 
 def is_preset(name: str) -> bool:
-    """Whether a name is of a preset: neither a rung of a ladder nor a hand."""
+    """Whether a name is of a preset: neither a sweep value nor a hand."""
     return not is_sweep_value(name) and not is_hand(name)
 
 
 def is_sweep_value(name: str) -> bool:
-    """Whether a name is of a rung of a ladder, `steps=90` say, and not of a preset."""
+    """Whether a name is of a sweep value, `steps=90` say, and not of a preset."""
     return "=" in name
 
 

@@ -165,7 +165,7 @@ SUITES: dict[str, Callable[[SuiteRequest], tuple[Cell, ...]]] = {
 
 
 def sweep_name(ladder: str, changes: Mapping[str, int]) -> str:
-    """Name of a rung's cells: the ladder and its value (steps: all of them together)."""
+    """Name of a sweep value's cells: the sweep and its value (steps: all of them together)."""
     return f"{ladder}={sum(changes.values()):g}"
 
 

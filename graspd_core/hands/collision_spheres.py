@@ -1,7 +1,7 @@
 """Spheres that fill the links, for a cheap differentiable self-collision term.
 
 An approximation by choice: spheres bulge out of the flat faces of long boxes by up to a fifth of their half thickness,
-and leave edges and corners bare. Judges use signed distances instead.
+and leave edges and corners bare. Metrics use signed distances instead.
 
 The term looks at every pair of spheres, so that they are bounded: solids thinner than a few millimetres get spheres
 that bulge, and of those of a hand of many or large solids only the ones are kept that stick out of each other farthest.

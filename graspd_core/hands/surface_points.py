@@ -1,4 +1,4 @@
-"""The hand's outer surface as points: contact candidates for the optimiser, dense samples for the judges.
+"""The hand's outer surface as points: contact candidates for the optimiser, dense samples for the metrics.
 
 The outer surface is what can touch something: points inside another solid welded to the same link are left out, and so
 are those that stay inside the next link of the chain at every value of the joint between them.

@@ -1,4 +1,4 @@
-"""Exact signed distance of points to a mesh: what judges measure with. No grid, no gradient.
+"""Exact signed distance of points to a mesh: what metrics are measured with. No grid, no gradient.
 
 Negative where the winding number says inside. Distances are counted in float32 about the object's centre (1e-8 m).
 """

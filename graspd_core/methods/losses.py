@@ -1,7 +1,6 @@
 """Loss terms of the closed-form relaxation: pure functions of arrays, one value per start, each of order one.
 
-Weights live in `config.LossWeights`. Gradients are exact
-where a term is smooth.
+Weights live in `closed_form_config.LossWeights`. Gradients are exact where a term is smooth.
 """
 
 from __future__ import annotations

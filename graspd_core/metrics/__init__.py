@@ -1,1 +1,1 @@
-"""Static grasp quality. A judge: shares no code with the optimiser."""
+"""Static grasp quality. It shares no code with the methods."""

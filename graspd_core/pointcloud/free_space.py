@@ -52,7 +52,7 @@ class FreeSpace:
     """All that is known of where the object is not.
 
     Attributes:
-        sights: one a camera; none where cameras are not known.
+        view_depths: one a camera; none where cameras are not known.
         standing: the object stands on a support that fills z < 0.
         lowest: height of the lowest points seen [m]: segmentation cuts the rest off with the support, so that outlines
             end too high by up to this.

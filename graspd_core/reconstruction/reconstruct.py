@@ -37,7 +37,7 @@ class Reconstruction:
 
     Attributes:
         mesh: closed, in the frame of the views [m].
-        trust: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
+        confidence: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
         method: "poisson", and what completed it, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
     """

@@ -40,7 +40,7 @@ class TabletopScene:
     Attributes:
         truth: the object to grasp [m].
         T_world_object: pose of the shape's own frame.
-        neighbours: what stands beside it [m].
+        obstacles: what stands beside it [m].
         table: its surface [m].
         support: its top as a half-space.
     """
@@ -68,7 +68,7 @@ def tabletop(
     Args:
         shape: named ones stand as authored if they would, else lie; a mesh lies where it is lowest.
         yaw: turn about the vertical [rad].
-        neighbours: shape, x and y [m] of what stands beside it.
+        obstacles: shape, x and y [m] of what stands beside it.
 
     Raises:
         MeshError: an unknown shape.

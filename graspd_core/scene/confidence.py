@@ -21,7 +21,7 @@ _NEAR_SURFACE_CELLS = 2.0
 def confidence_grid(
     vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """The trust of the vertex nearest to each node by the surface; elsewhere, that of the nearest such node."""
+    """The confidence in the vertex nearest to each node by the surface; elsewhere, that of the nearest such node."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)

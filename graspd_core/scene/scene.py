@@ -81,8 +81,8 @@ class Scene:
         sdf: its signed distance.
         timing: seconds taken by loading and by the distance field.
         support: what the object stands on, if anything; gravity points against its normal.
-        neighbours: other things, only those that the hand could reach.
-        trust: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it is known.
+        obstacles: other things, only those that the hand could reach.
+        confidence: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it known.
     """
 
     object: ObjectModel
@@ -112,15 +112,15 @@ def build_scene(
 
     Args:
         support: what the object stands on.
-        neighbours: other things near it.
-        trust: how far each of the mesh's vertices was seen, 1, or guessed, 0; None: all of it is known.
+        obstacles: other things near it.
+        confidence: how far each of the mesh's vertices was seen, 1, or guessed, 0; None: all of it is known.
 
     Raises:
-        MeshError: see `load_scene`; or there is not one trust for every vertex.
+        MeshError: see `load_scene`; or there is not one confidence for every vertex.
     """
     if confidence is not None and len(confidence) != len(mesh.vertices):
         raise MeshError(
-            f"{source}: {len(confidence)} values of trust for {len(mesh.vertices)} vertices; valid: one each"
+            f"{source}: {len(confidence)} values of confidence for {len(mesh.vertices)} vertices; valid: one each"
         )
     started = time.perf_counter() if started is None else started
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)

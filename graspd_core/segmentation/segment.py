@@ -31,7 +31,7 @@ class Segmentation:
     Attributes:
         views: the object's points as each camera saw them, at full density; views that do not show it are left out.
         support: what it stands on; None where none was seen.
-        neighbours: the points of each other thing near it, thinned [m].
+        obstacles: the points of each other thing near it, thinned [m].
         warnings: what was doubtful.
     """
 

@@ -1,4 +1,4 @@
-"""The judge's world in MuJoCo bodies and geoms: the hand's solids, the object, the support, the neighbours."""
+"""The world of a trial in MuJoCo bodies and geoms: the hand's solids, the object, the support, the obstacles."""
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false

@@ -1,4 +1,4 @@
-"""The judge's world: a hand of primitives on a position-controlled base, and a free object of convex parts.
+"""The world of a trial: a hand of primitives on a position-controlled base, and a free object of convex parts.
 
 With a support there are gravity and a table, with neighbours there are these; without, neither costs anything. They are
 mocap bodies after the hand's own, so that a trial can lower them all away from the hand.

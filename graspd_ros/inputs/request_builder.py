@@ -27,9 +27,9 @@ SOURCES = {
 
 
 class RequestBuilder:
-    """Makes requests, and holds what they may be made of: the newest sighting and the kept views.
+    """Makes requests, and holds what they may be made of: the newest frame and the kept views.
 
-    Used by the executor's thread only. Sightings and views are immutable, so that requests may hold on to them.
+    Used by the executor's thread only. Frames and views are immutable, so that requests may hold on to them.
 
     Args:
         hand: name of the hand that the node plans for.
@@ -51,7 +51,7 @@ class RequestBuilder:
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
-        """Drop the newest sighting and the views."""
+        """Drop the newest frame and the views."""
         self.newest = None
         self.forget_views()
 
@@ -60,7 +60,7 @@ class RequestBuilder:
         self.views = Views()
 
     def add_view(self, settings: Settings) -> None:
-        """Keep the newest sighting as one more view. Raises GraspdError: none has come, or it cannot be used."""
+        """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
         self.views = self.views.add(self._newest(settings), settings, self._lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:

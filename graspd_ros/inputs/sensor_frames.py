@@ -90,7 +90,7 @@ class Views:
         """With one more view, moved to the frame of the others (the settings' fixed_frame, or that of the first).
 
         Args:
-            sighting: the view.
+            sensor_frame: the view.
             settings: workspace, thinning and frame.
             lookup: `T_target_source` of two frames at a time; may raise a TransformError.
 

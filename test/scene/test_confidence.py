@@ -39,5 +39,5 @@ def test_a_scene_without_trust_has_no_grid():
 
 
 def test_one_trust_for_every_vertex():
-    with pytest.raises(MeshError, match=r"3 values of trust for \d+ vertices"):
+    with pytest.raises(MeshError, match=r"3 values of confidence for \d+ vertices"):
         build_scene(SPHERE, source="half a ball", confidence=np.ones(3))

@@ -26,7 +26,7 @@ class Cell:
     Attributes:
         kind: what is run: "raw" grasps each tried, "verified" ones planned, "pace" of the optimiser alone, "start":
             the first verified grasp of a fresh process.
-        name: of the settings: a preset, or a rung of a ladder.
+        name: of the settings: a preset, or a sweep value.
         settings: the settings themselves.
         source: a mesh file or shape:NAME.
         object_hash: of the object's content.

@@ -1,6 +1,6 @@
 """A MANO model as a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
 
-The optimiser, the judges and the trials see a hand like any other; figures of the skinned surface come from
+The methods, the metrics and the trials see a hand like any other; figures of the skinned surface come from
 `ManoHand.skinned_mesh`, the mesh that MANO itself makes of the same joint values. The hulls stand for the skin at rest:
 they do not follow the blend shapes of the pose, and at a strongly bent joint the skin bulges by a few millimetres
 against them.
