@@ -1,4 +1,4 @@
-"""The metrics of a grasp, one row each: `measure`, files, messages and tables follow; a test holds docs/metrics.md to it."""
+"""The metrics of a grasp, one row each: `measure`, files, messages and tables follow; a test checks docs/metrics.md."""
 
 from __future__ import annotations
 

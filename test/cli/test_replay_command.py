@@ -114,7 +114,7 @@ def test_the_same_recording_gives_the_same_grasps_whatever_its_storage(replayed,
 
 
 def test_a_cloud_that_is_not_made_whole_in_time_ends_by_the_deadline(bags, tmp_path, capsys, quick):
-    options = ["--limit", "1", *QUICK, "--deadline", "1e-6", "--out", str(tmp_path / "out")]
+    options = ["--limit", "1", *quick, "--deadline", "1e-6", "--out", str(tmp_path / "out")]
     assert main(["replay", str(bags["mcap"]), *options]) == EXIT_TOO_FEW
     out, err = capsys.readouterr()
     assert "0 of 1 grasps (0 tried): the deadline passed before enough grasps were found" in out

@@ -15,15 +15,14 @@ PLANTED = """
 import sys
 sys.path.insert(0, {folder!r})
 import fuzz_targets
-from graspd_core.config import mapping
+from graspd_core.methods import plan_config
 
-def eager(cls, values, where):
+def eager(values, where):
     if "method" in values:
         raise KeyError("planted")
     return values
 
-import graspd_core.config
-graspd_core.config.from_mapping = eager
+plan_config.plan_config = eager
 import runpy
 sys.argv = ["fuzz.py", "--child", "preset", "--seconds", "1", "--out", {out!r}]
 runpy.run_path({file!r}, run_name="__main__")

@@ -106,7 +106,7 @@ def test_a_request_that_is_over_is_answered_while_its_object_is_still_being_read
     threading.Timer(0.2, release.set).start()
     after: list[bool] = []
 
-    def box(resolution: int):
+    def box():
         after.append(read.is_set())
         return load_scene("shape:box")
 
