@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps soak fuzz clean
+.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -16,7 +16,9 @@ setup: $(STAMP)  ## build .venv (Python 3.11 or 3.12; PYTHON=... names one)
 # The directories too: adding or removing a message makes the environment stale.
 INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*) scripts/tf2_msgs/msg/*)
 
-$(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh $(INTERFACES)
+KERNEL := $(wildcard graspd_core/kernel/src/*)
+
+$(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh $(INTERFACES) $(KERNEL)
 	@scripts/setup.sh $(VENV) $(PYTHON)
 	@touch $@
 
@@ -53,6 +55,18 @@ bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of 
 
 soak: setup  ## ten minutes of mixed load on the node: memory, latencies, answers
 	$(RUN)/python benchmarks/soak.py --minutes 10
+
+SANITIZED := build/sanitized/kernel.so
+
+$(SANITIZED): $(KERNEL)
+	@mkdir -p $(@D)
+	$(or $(CXX),c++) -std=c++17 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=undefined -Wno-psabi -fPIC -shared \
+		graspd_core/kernel/src/kernel.cpp -o $@ -pthread
+
+# Leaks are not looked for: Python keeps memory until it ends.
+sanitize: setup $(SANITIZED)  ## the kernel's tests with reads and writes checked (g++ or clang)
+	LD_PRELOAD="$$($(or $(CXX),c++) -print-file-name=libasan.so) $$($(or $(CXX),c++) -print-file-name=libstdc++.so)" \
+		ASAN_OPTIONS=detect_leaks=0 GRASPD_KERNEL=$(SANITIZED) $(RUN)/python -m pytest -q test/kernel
 
 fuzz: setup  ## throw mutated files and messages at the parsers for MINUTES (10), findings to results/fuzz
 	$(RUN)/python benchmarks/fuzz.py --minutes $(or $(MINUTES),10)

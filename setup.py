@@ -1,11 +1,35 @@
-"""The files that live outside the Python packages; names, dependencies and commands are in pyproject.toml."""
+"""The compiled kernel and the files outside the Python packages; names and dependencies are in pyproject.toml."""
 
+import platform
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import Extension, setup
 
 ROOT = Path(__file__).parent
 SHARE = Path("share")
+KERNEL = "graspd_core/kernel"
+# Builds of the kernel: one of them is chosen when it is loaded (graspd_core/kernel/builds.py).
+TARGETS = {"baseline": []}
+if platform.machine() in ("x86_64", "AMD64"):
+    TARGETS |= {"v3": ["-march=x86-64-v3"], "v4": ["-march=x86-64-v4"]}
+
+
+def kernel_build(name: str, target: list[str]) -> Extension:
+    """A shared library that ctypes loads: it needs no Python, so that one wheel fits all versions.
+
+    Without a compiler graspd is installed all the same, and torch does the kernel's work. Fast mathematics is for
+    compiling only: linked with it, a library makes the whole process flush small numbers to zero.
+    """
+    return Extension(
+        f"{KERNEL.replace('/', '.')}.{name}",
+        sources=[f"{KERNEL}/src/kernel.cpp"],
+        depends=[str(path.relative_to(ROOT)) for path in sorted((ROOT / KERNEL / "src").glob("*.hpp"))],
+        extra_compile_args=["-std=c++17", "-O3", "-ffast-math", "-fno-finite-math-only", "-Wno-psabi", *target],
+        extra_link_args=["-pthread"],
+        language="c++",
+        py_limited_api=True,
+        optional=True,
+    )
 
 
 def files_below(source: str, target: Path) -> list[tuple[str, list[str]]]:
@@ -20,6 +44,8 @@ def files_below(source: str, target: Path) -> list[tuple[str, list[str]]]:
 
 setup(
     python_requires=">=3.11,<3.13",
+    ext_modules=[kernel_build(name, target) for name, target in TARGETS.items()],
+    options={"bdist_wheel": {"py_limited_api": "cp311"}},
     data_files=[
         (str(SHARE / "ament_index" / "resource_index" / "packages"), ["resource/graspd_ros"]),
         # The last two for `colcon build --symlink-install`, which runs setup.py beside links to the files named here.

@@ -53,6 +53,12 @@ else:
     pybullet.disconnect(pybullet.connect(pybullet.DIRECT))
     print(version("pybullet"))
 """
+_KERNEL = """
+from graspd_core.kernel.builds import kernel
+found = kernel()
+assert found.library, found.reason
+print(f"{found.name}, {found.library.graspd_lanes()} floats at once")
+"""
 # What ROS is, only the ROS package knows.
 _ROS = "from graspd_ros.probe import probe; print(probe())"
 _HANDS = """
@@ -87,6 +93,7 @@ def run_checks() -> list[Check]:
     probes = [
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
+        ("compiled kernel", _KERNEL, f"torch does its work, 30 times slower: {_SETUP}", False),
         *((name, _import_probe(name, module), _SETUP, True) for name, module in _LIBRARIES.items()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
         ("pybullet", _BULLET, "only benchmarks need it, on Python 3.11: pip install -e '.[bench]'", False),

@@ -126,6 +126,13 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
 
 
+def placed_points(matrix: Float[Tensor, "points columns"]) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"]]:
+    """The points of a `placement` in the frames of their links [m], and their links."""
+    columns = matrix.unflatten(1, (-1, 4))
+    links = columns[..., 3].argmax(1)
+    return columns[torch.arange(len(links), device=links.device), links, :3], links
+
+
 def points_in_base(
     kinematics: Kinematics,
     q: Float[Tensor, "batch joints"],

@@ -30,9 +30,9 @@ from graspd_core.scene.confidence import sample_confidence
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-_REACH_WHEN_FINE = 0.01
+REACH_WHEN_FINE = 0.01
 # Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
-_TASK_POINTS, _FEATURE_PAIRS = 96, 96
+TASK_POINTS, FEATURE_PAIRS = 96, 96
 # Free space that the hand keeps to obstacles [m].
 OBSTACLE_MARGIN = 0.002
 
@@ -117,7 +117,7 @@ def feature_distance(
     with torch.no_grad():
         every = solid_bound(problem.hand.solids, placed.links, in_base)
     count = len(problem.hand.solids.link)
-    pairs = every.flatten(1).topk(min(_FEATURE_PAIRS, every[0].numel()), largest=False).indices
+    pairs = every.flatten(1).topk(min(FEATURE_PAIRS, every[0].numel()), largest=False).indices
     solids = pairs % count
     rows = torch.arange(len(pairs), device=pairs.device)[:, None]
     return pair_distance(problem.hand.solids, placed.links, in_base[rows, pairs // count], solids), solids
@@ -126,9 +126,9 @@ def feature_distance(
 def _nearest_of_group(
     distance: Float[Tensor, "batch pairs"], groups: Int[Tensor, "batch pairs"], count: int
 ) -> Float[Tensor, "batch groups"]:
-    """Least distance per group, infinite where no pair belongs to it."""
-    start = distance.new_full((len(distance), count), torch.inf)
-    return start.scatter_reduce(1, groups, distance, "amin")
+    """Least distance per group, infinite where no pair belongs to it; pairs of no group go to a last, dropped one."""
+    start = distance.new_full((len(distance), count + 1), torch.inf)
+    return start.scatter_reduce(1, groups, distance, "amin")[:, :count]
 
 
 def _wrench_resistance(
@@ -141,9 +141,7 @@ def _wrench_resistance(
     activate: Callable[..., Tensor],
 ) -> Float[Tensor, "batch"]:
     """The loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
-    near = (
-        (distance.detach() - radius[:, None]).abs().topk(min(_TASK_POINTS, distance.shape[-1]), largest=False).indices
-    )
+    near = (distance.detach() - radius[:, None]).abs().topk(min(TASK_POINTS, distance.shape[-1]), largest=False).indices
     rows = torch.arange(len(near), device=near.device)[:, None]
     target, position = problem.object, points[rows, near]
     activation = activate(distance[rows, near], radius)
@@ -191,7 +189,7 @@ def evaluate(
             problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)
         ),
         distance=losses.touch(
-            gap, torch.full_like(problem.hand.reach, _REACH_WHEN_FINE) if fine else problem.hand.reach
+            gap, torch.full_like(problem.hand.reach, REACH_WHEN_FINE) if fine else problem.hand.reach
         ),
         penetration=sunk,
         self_collision=losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -57,17 +58,18 @@ class SphereTensors:
     weight: Float[Tensor, "spheres spheres"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HandTensors:
     """A hand.
 
     Attributes:
+        model: the hand that is laid out.
         kinematics: forward kinematics.
         coarse: the first, evenly spread contact candidates; what most steps look at.
         fine: all contact candidates; what the last steps look at.
         reach: attraction range of each rigid group of links [m].
         solids: collision primitives.
-        group_of_solid: index of each solid's rigid group.
+        group_of_solid: index of each solid's rigid group, one past the last where it has no coarse candidate.
         spheres: for self-collision.
         lower: joint limits [rad] or [m].
         upper: joint limits [rad] or [m].
@@ -75,6 +77,7 @@ class HandTensors:
         joint_scale: travel of each joint that counts as much as one radian, one where it turns [rad] or [m].
     """
 
+    model: HandModel
     kinematics: Kinematics
     coarse: PointSet
     fine: PointSet
@@ -88,7 +91,7 @@ class HandTensors:
     joint_scale: Float[Tensor, "joints"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectTensors:
     """An object.
 
@@ -110,8 +113,12 @@ class ObjectTensors:
     confidence: Float[Tensor, "x y z"] | None
 
 
+@lru_cache(maxsize=8)
 def make_hand_tensors(hand: HandModel, candidates: int, device: str, dtype: torch.dtype) -> HandTensors:
-    """Lay a hand out; the coarse set is the first `candidates` of the contact candidates that it was loaded with."""
+    """Lay a hand out; the coarse set is the first `candidates` of the contact candidates that it was loaded with.
+
+    Kept for the last few hands, which are hashed by identity.
+    """
 
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, device=device, dtype=dtype)
@@ -129,13 +136,15 @@ def make_hand_tensors(hand: HandModel, candidates: int, device: str, dtype: torc
 
     solids = make_collision_tensors(hand, device, dtype)
     group_of_solid = hand.link_group[solids.link.cpu().numpy()]
+    place = np.where(np.isin(group_of_solid, present), np.searchsorted(present, group_of_solid), len(present))
     return HandTensors(
+        model=hand,
         kinematics=make_kinematics(hand, device, dtype),
         coarse=point_set(candidates),
         fine=point_set(len(hand.candidate_link)),
         reach=tensor(np.where(np.isin(present, fingertip_groups(hand)), _REACH_OF_TIPS, _REACH_OF_OTHERS)),
         solids=solids,
-        group_of_solid=index(np.searchsorted(present, group_of_solid)),
+        group_of_solid=index(place),
         spheres=_sphere_tensors(hand, device, dtype),
         lower=tensor(hand.lower),
         upper=tensor(hand.upper),

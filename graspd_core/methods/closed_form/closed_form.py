@@ -12,14 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from graspd_core.methods.closed_form.adam import AdamState, adam_step, initial_state
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.methods.closed_form.compiled_search import minimise_compiled
+from graspd_core.methods.kernel_problem import kernel_problem
 from graspd_core.methods.loop import minimise
 from graspd_core.methods.losses import hard_contact, soft_contact
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
-from graspd_core.methods.poses import Poses, moved_along, pack, unpack
+from graspd_core.methods.poses import Poses, moved_along, unpack
 from graspd_core.methods.problem import Problem, Terms, evaluate, least_distance
 
-_BETA1, _BETA2, _ADAM_EPSILON = 0.9, 0.98, 1e-8
 # Share of the step size that is left at the end of the run.
 _FINAL_RATE = 0.05
 # Fewer rows than this are evaluated among copies of the first: products of one to three rows are summed in another
@@ -28,27 +30,6 @@ _FEWEST_ROWS = 8
 
 # However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
 _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
-
-
-@dataclass(frozen=True)
-class AdamState:
-    """Iterate, moments and best iterate of every start, as rows of one matrix (translation, quaternion, joints).
-
-    The translation is that of `pivot`, the point of the hand that a step of the quaternion leaves where it is: about
-    the origin of a base frame far from the palm, a small turn would throw the fingers off the object.
-    """
-
-    pivot: Float[Tensor, "batch 3"]
-    x: Float[Tensor, "batch variables"]
-    mean: Float[Tensor, "batch variables"]
-    square: Float[Tensor, "batch variables"]
-    radius: Float[Tensor, "batch"]
-    best_x: Float[Tensor, "batch variables"]
-    best_loss: Float[Tensor, "batch"]
-    loss: Float[Tensor, "batch"]
-
-    def __getitem__(self, rows: Tensor) -> AdamState:
-        return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
 
 def weighted(terms: Terms, weights: LossWeights) -> Float[Tensor, "batch"]:
@@ -74,13 +55,9 @@ class ClosedForm:
         return self.config.explore_steps + self.config.refine_steps + self.config.polish_steps
 
     def init(self, problem: Problem, starts: Poses) -> AdamState:
-        x = pack(moved_along(starts, problem.hand.pivot))
         with torch.no_grad():
             nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
-        zeros = torch.zeros_like(x)
-        worst = x.new_full((len(x),), torch.inf)
-        pivot = problem.hand.pivot.expand(len(x), 3)
-        return AdamState(pivot, x, zeros, zeros, nearest.clamp(0.0, self.config.radius_start), x, worst, worst)
+        return initial_state(problem, starts, nearest.clamp(0.0, self.config.radius_start))
 
     def step(self, problem: Problem, state: AdamState, index: int) -> AdamState:
         config = self.config
@@ -105,9 +82,7 @@ class ClosedForm:
         return replace(adam_step(problem, state, gradient, rate, index + 1, config), loss=loss)
 
     def best(self, state: AdamState) -> tuple[Poses, Float[Tensor, "batch"]]:
-        scored = torch.isfinite(state.best_loss)
-        poses = unpack(torch.where(scored[:, None], state.best_x, state.x))
-        return moved_along(poses, -state.pivot), torch.where(scored, state.best_loss, state.loss)
+        return state.best()
 
     def value_and_gradient(
         self,
@@ -134,23 +109,6 @@ class ClosedForm:
         return loss[:rows], torch.where(finite[:, None], gradient, torch.zeros_like(gradient))[:rows]
 
 
-def adam_step(
-    problem: Problem, state: AdamState, gradient: Tensor, rate: float, count: int, config: ClosedFormConfig
-) -> AdamState:
-    """One Adam step (Kingma & Ba 2015) with per-variable rates; joints are projected onto their limits."""
-    mean = _BETA1 * state.mean + (1 - _BETA1) * gradient
-    square = _BETA2 * state.square + (1 - _BETA2) * gradient * gradient
-    direction = (mean / (1 - _BETA1**count)) / ((square / (1 - _BETA2**count)).sqrt() + _ADAM_EPSILON)
-    rates = torch.full_like(state.x[0], config.joint_rate)
-    rates[:3] = config.translation_rate
-    rates[3:7] = config.rotation_rate
-    rates[7:] *= problem.hand.joint_scale
-    x = state.x - rate * rates * direction
-    quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
-    joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper)
-    return replace(state, x=torch.cat([x[:, :3], quaternion, joints], -1), mean=mean, square=square)
-
-
 def plan(task: PlannerInput) -> PlannerOutput:
     """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
     settings = task.config.settings
@@ -158,5 +116,9 @@ def plan(task: PlannerInput) -> PlannerOutput:
     count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
     starts = initial_poses_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
     solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
-    solution = minimise(solver, problem, starts, task.hooks)
+    compiled = kernel_problem(problem)
+    if compiled is None:
+        solution = minimise(solver, problem, starts, task.hooks)
+    else:
+        solution = minimise_compiled(settings, solver.keep, problem, compiled, starts, task.hooks)
     return PlannerOutput(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)

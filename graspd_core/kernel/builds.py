@@ -1,0 +1,111 @@
+"""The compiled kernel: which of its builds this machine can run, and why there may be none.
+
+`GRASPD_KERNEL` chooses: `off` for torch alone, the name of a build or the path of a library for that one, else the best
+that runs here is taken.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from graspd_core.errors import ConfigError
+from graspd_core.kernel.structs import STRUCTURES
+
+# What `setup.py` builds, best first: name of the file, instructions it needs of /proc/cpuinfo.
+BUILDS = {
+    "v4": frozenset({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    "v3": frozenset({"avx2", "fma", "bmi2", "f16c"}),
+    "baseline": frozenset(),
+}
+POLL = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64)
+_INT, _FLOAT, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
+_ARGUMENTS = {
+    "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _AT, _AT, _AT, _INT],
+    "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
+    "graspd_run_steps": [_AT, _AT, _AT, _INT, _INT, _INT, _INT, POLL],
+}
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A build of the kernel, or the reason why there is none.
+
+    Attributes:
+        name: of the build, empty without one.
+        library: its functions; None: torch evaluates.
+        reason: why there is none.
+    """
+
+    name: str
+    library: ctypes.CDLL | None
+    reason: str = ""
+
+
+def kernel() -> Kernel:
+    """The build that this process uses. Raises ConfigError: GRASPD_KERNEL names none."""
+    return _kernel(os.environ.get("GRASPD_KERNEL", ""))
+
+
+@lru_cache
+def _kernel(wanted: str) -> Kernel:
+    if wanted not in ("", "off", *BUILDS) and not Path(wanted).is_file():
+        raise ConfigError(
+            f"GRASPD_KERNEL: {wanted!r}; valid: off, {', '.join(BUILDS)}, the path of a library, or nothing"
+        )
+    if wanted == "off":
+        return Kernel("", None, "GRASPD_KERNEL is off")
+    if wanted not in ("", *BUILDS):
+        return _load(Path(wanted), wanted)
+    reasons = []
+    for name, needed in BUILDS.items():
+        if wanted in ("", name):
+            missing = needed - _instructions()
+            found = Kernel("", None, f"no {min(missing)}") if missing else load(name)
+            if found.library is not None:
+                return found
+            reasons.append(f"{name}: {found.reason}")
+    return Kernel("", None, "; ".join(reasons))
+
+
+def call(function: str, *arguments: object) -> None:
+    """Call a function of `kernel()`. Raises MemoryError: too little memory for its threads."""
+    if getattr(kernel().library, function)(*arguments) != 0:
+        raise MemoryError(f"{function}: too little memory")
+
+
+def load(name: str) -> Kernel:
+    """One build, whether this machine has its instructions or not; without a library where it cannot be loaded."""
+    paths = sorted(Path(__file__).parent.glob(f"{name}.*so"))
+    if not paths:
+        return Kernel("", None, "not built; was there a C++ compiler when graspd was installed?")
+    return _load(paths[0], name)
+
+
+def _load(path: Path, name: str) -> Kernel:
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        return Kernel("", None, str(error))
+    sizes = (ctypes.c_int32 * 64)()
+    count = library.graspd_sizes(sizes)
+    if list(sizes[:count]) != [ctypes.sizeof(structure) for structure in STRUCTURES]:
+        return Kernel("", None, "built from other sources: install graspd again")
+    for function, arguments in _ARGUMENTS.items():
+        getattr(library, function).argtypes = arguments
+    return Kernel(name, library)
+
+
+def _instructions() -> frozenset[str]:
+    """Instruction sets of this machine's processor; empty where they cannot be read."""
+    if platform.machine() != "x86_64":
+        return frozenset()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return frozenset()
+    return frozenset(next((line.split(":")[1] for line in lines if line.startswith("flags")), "").split())

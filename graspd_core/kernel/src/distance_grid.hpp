@@ -1,0 +1,131 @@
+// Signed distance and outward normal from a grid, and their adjoints (mesh/sdf.py, `sample_sdf`).
+//
+// With b the point clamped to the grid, φ and g the interpolated channels there, r = max(φ, 1 mm), o = x - b:
+//     f = o + r g,   distance = φ + |f| - r |g|,   normal = f / |f|.
+#pragma once
+#include "scratch.hpp"
+
+namespace graspd {
+
+constexpr float LEAST_REACH = 1e-3f, TINY = 1e-24f;
+
+// How far u lies from [0, most], whose nearest value is b. Exactly zero inside, where a fused u - b may not be.
+INLINE Floats beyond(Floats u, Floats b, float most) { return (u >= 0.f) & (u <= most) ? Floats{} : u - b; }
+
+// Where each point lies: its cell, its place within, and its offset from the grid.
+static void find_cells(const Grid& grid, int count, Samples& at) {
+    const int row = 4 * grid.nz, plane = row * grid.ny;
+    const float mx = grid.nx - 1, my = grid.ny - 1, mz = grid.nz - 1, inverse = 1.f / grid.spacing;
+    for (int i = 0; i < count; i += LANES) {
+        Floats ux = (load(at.x + i) - grid.origin[0]) * inverse, uy = (load(at.y + i) - grid.origin[1]) * inverse,
+               uz = (load(at.z + i) - grid.origin[2]) * inverse;
+        // A point that is not a number goes to the first node: no read leaves the grid. Its offset keeps the NaN.
+        Floats bx = lesser(greater(ux, all(0)), all(mx)), by = lesser(greater(uy, all(0)), all(my)),
+               bz = lesser(greater(uz, all(0)), all(mz));
+        store(at.ox + i, beyond(ux, bx, mx) * grid.spacing);
+        store(at.oy + i, beyond(uy, by, my) * grid.spacing);
+        store(at.oz + i, beyond(uz, bz, mz) * grid.spacing);
+        Ints kx = __builtin_convertvector(lesser(bx, all(mx - 1)), Ints),
+             ky = __builtin_convertvector(lesser(by, all(my - 1)), Ints),
+             kz = __builtin_convertvector(lesser(bz, all(mz - 1)), Ints);
+        store(at.fx + i, bx - __builtin_convertvector(kx, Floats));
+        store(at.fy + i, by - __builtin_convertvector(ky, Floats));
+        store(at.fz + i, bz - __builtin_convertvector(kz, Floats));
+        *(Ints*)(at.cell + i) = kx * plane + ky * row + kz * 4;
+    }
+}
+
+// The four channels and their slopes at each point, interpolated along y and x first, two neighbours in z at a time.
+static void interpolate(const Grid& grid, int count, Samples& at) {
+    const int row = 4 * grid.nz, plane = row * grid.ny;
+    for (int i = 0; i < count; i++) {
+        const float* node = grid.field + at.cell[i];
+        Eight a = *(const EightUnaligned*)node, b = *(const EightUnaligned*)(node + row);
+        Eight c = *(const EightUnaligned*)(node + plane), d = *(const EightUnaligned*)(node + plane + row);
+        float fx = at.fx[i], fy = at.fy[i], fz = at.fz[i];
+        Eight near_slope = b - a, far_slope = d - c;
+        Eight near = a + fy * near_slope, along_x = c + fy * far_slope - near;
+        Eight value = near + fx * along_x, along_y = near_slope + fx * (far_slope - near_slope);
+        auto low = [](Eight v) { return __builtin_shufflevector(v, v, 0, 1, 2, 3); };
+        auto high = [](Eight v) { return __builtin_shufflevector(v, v, 4, 5, 6, 7); };
+        Four along_z = high(value) - low(value), channels = low(value) + fz * along_z;
+        float* j = at.jacobian + 16 * i;
+        *(Four*)j = channels;
+        *(Four*)(j + 4) = low(along_x) + fz * (high(along_x) - low(along_x));
+        *(Four*)(j + 8) = low(along_y) + fz * (high(along_y) - low(along_y));
+        *(Four*)(j + 12) = along_z;
+        at.phi[i] = channels[0];
+        at.nx[i] = channels[1];
+        at.ny[i] = channels[2];
+        at.nz[i] = channels[3];
+    }
+}
+
+// Distance and unit normal of at.x, at.y, at.z; the rest of the last vector is far from everything.
+static void sample(const Grid& grid, int count, Samples& at) {
+    const int whole = padded(count);
+    find_cells(grid, whole, at);
+    interpolate(grid, count, at);
+    for (int i = count; i < whole; i++) {
+        at.phi[i] = 1e3f;
+        at.nx[i] = 1;
+        at.ny[i] = at.nz[i] = 0;
+    }
+    for (int i = 0; i < whole; i += LANES) {
+        Floats phi = load(at.phi + i), gx = load(at.nx + i), gy = load(at.ny + i), gz = load(at.nz + i);
+        Floats reach = greater(phi, all(LEAST_REACH));
+        Floats x = load(at.ox + i) + reach * gx, y = load(at.oy + i) + reach * gy, z = load(at.oz + i) + reach * gz;
+        Floats squared = x * x + y * y + z * z;
+        Floats inverse = inverse_root(squared > TINY ? squared : all(TINY));
+        store(at.phi + i, phi + squared * inverse - reach * root(gx * gx + gy * gy + gz * gz));
+        store(at.nx + i, x * inverse);
+        store(at.ny + i, y * inverse);
+        store(at.nz + i, z * inverse);
+    }
+}
+
+// Gradients with respect to the points, from the adjoints of their distances and normals.
+static void sample_adjoint(const Grid& grid, int count, Samples& at) {
+    const float inverse = 1.f / grid.spacing;
+    for (int i = 0; i < count; i++) {
+        float a = at.a_phi[i], ax = at.a_nx[i], ay = at.a_ny[i], az = at.a_nz[i];
+        if (a == 0 && ax == 0 && ay == 0 && az == 0) {
+            at.gx[i] = at.gy[i] = at.gz[i] = 0;
+            continue;
+        }
+        const float* j = at.jacobian + 16 * i;
+        float phi = j[0], g0 = j[1], g1 = j[2], g2 = j[3], nx = at.nx[i], ny = at.ny[i], nz = at.nz[i];
+        float ox = at.ox[i], oy = at.oy[i], oz = at.oz[i], reach = phi > LEAST_REACH ? phi : LEAST_REACH;
+        float x = ox + reach * g0, y = oy + reach * g1, z = oz + reach * g2;
+        float shrink = 1.f / sqrtf(x * x + y * y + z * z + TINY), norm = sqrtf(g0 * g0 + g1 * g1 + g2 * g2);
+        float along = nx * ax + ny * ay + nz * az;
+        float sx = a * nx + (ax - nx * along) * shrink, sy = a * ny + (ay - ny * along) * shrink,
+              sz = a * nz + (az - nz * along) * shrink;
+        float a_reach = sx * g0 + sy * g1 + sz * g2 - a * norm, unit = a * reach / (norm + TINY);
+        Four channel = {a + (phi > LEAST_REACH ? a_reach : 0.f), reach * sx - unit * g0, reach * sy - unit * g1,
+                        reach * sz - unit * g2};
+        // Beyond the grid along an axis the interpolated channels stay what they are, inside it the offset does.
+        at.gx[i] = ox != 0 ? sx : sum_four(channel * *(const Four*)(j + 4)) * inverse;
+        at.gy[i] = oy != 0 ? sy : sum_four(channel * *(const Four*)(j + 8)) * inverse;
+        at.gz[i] = oz != 0 ? sz : sum_four(channel * *(const Four*)(j + 12)) * inverse;
+    }
+}
+
+// Trilinear confidence at a point that `find_cells` has placed, and its gradient; constant beyond the grid.
+INLINE float sample_scalar(const Grid& grid, const float* values, const Samples& at, int i, float* gradient) {
+    const int row = grid.nz, plane = row * grid.ny;
+    const float* v = values + at.cell[i] / 4;
+    float fx = at.fx[i], fy = at.fy[i], fz = at.fz[i];
+    float a0 = v[0], a1 = v[1], b0 = v[row], b1 = v[row + 1];
+    float c0 = v[plane], c1 = v[plane + 1], d0 = v[plane + row], d1 = v[plane + row + 1];
+    auto mix = [](float p, float q, float f) { return p + f * (q - p); };
+    float a = mix(a0, a1, fz), b = mix(b0, b1, fz), c = mix(c0, c1, fz), d = mix(d0, d1, fz);
+    float near = mix(a, b, fy), far = mix(c, d, fy);
+    float along_z = mix(mix(a1 - a0, b1 - b0, fy), mix(c1 - c0, d1 - d0, fy), fx);
+    gradient[0] = at.ox[i] != 0 ? 0.f : (far - near) / grid.spacing;
+    gradient[1] = at.oy[i] != 0 ? 0.f : mix(b - a, d - c, fx) / grid.spacing;
+    gradient[2] = at.oz[i] != 0 ? 0.f : along_z / grid.spacing;
+    return mix(near, far, fx);
+}
+
+}  // namespace graspd

@@ -1,0 +1,65 @@
+// The C interface. Functions return 0, or 1 where memory is short; they never throw, and write only where told.
+#include "search.hpp"
+#include "threads.hpp"
+
+using namespace graspd;
+
+namespace {
+template <class Body>
+int32_t guarded(Body body) {
+    try {
+        body();
+        return 0;
+    } catch (const std::exception&) {
+        return 1;
+    }
+}
+}  // namespace
+
+extern "C" {
+
+// Sizes of the structures, for the caller to compare with its own; returns how many there are.
+int32_t graspd_sizes(int32_t* sizes) {
+    int32_t known[] = {sizeof(Hand),      sizeof(Points),  sizeof(Grid),    sizeof(Solids),   sizeof(Spheres), sizeof(Object),
+                       sizeof(Obstacles), sizeof(Weights), sizeof(Problem), sizeof(Schedule), sizeof(State)};
+    memcpy(sizes, known, sizeof known);
+    return sizeof known / sizeof known[0];
+}
+
+int32_t graspd_lanes() { return LANES; }
+
+// Loss, gradient (rows x variables) and unweighted terms (rows x 6) of every row of x.
+int32_t graspd_evaluate(const Problem* p, const Weights* weights, int32_t rows, const float* x, const float* radius,
+                        float delta, int32_t fine, int32_t soft, float* loss, float* gradient, float* terms,
+                        int32_t threads) {
+    return guarded([&] {
+        const int variables = 7 + p->hand.joints;
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
+            Look look = {radius[row], delta, fine != 0, soft != 0};
+            loss[row] = evaluate(*p, *weights, x + row * variables, look, gradient + row * variables, s);
+            memcpy(terms + TERMS * row, s.terms, sizeof s.terms);
+        });
+    });
+}
+
+// Least distance of the coarse candidates of every row to the object.
+int32_t graspd_least_distance(const Problem* p, int32_t rows, const float* x, float* distance, int32_t threads) {
+    return guarded([&] {
+        const int variables = 7 + p->hand.joints;
+        for_rows(*p, rows, threads,
+                 [&](int row, Scratch& s, bool) { distance[row] = least_distance(*p, x + row * variables, s); });
+    });
+}
+
+// Steps [from, to) of every row. `poll` is called with the steps done, every few milliseconds; true stops all.
+int32_t graspd_run_steps(const Problem* p, const Schedule* schedule, const State* state, int32_t rows, int32_t from,
+                         int32_t to, int32_t threads, Stop::Poll poll) {
+    return guarded([&] {
+        Stop stop(poll);
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool caller) {
+            Array<float> gradient(7 + p->hand.joints);
+            run_steps(*p, *schedule, *state, row, from, to, gradient, s, [&] { return stop.go(caller); });
+        });
+    });
+}
+}

@@ -1,0 +1,58 @@
+// Depth of the hand in its support and its neighbours (methods/obstacle_distance.py).
+#pragma once
+#include "terms.hpp"
+
+namespace graspd {
+
+// Balls about the corners of the hand's solids against the support's half-space.
+static float support_depth(const Problem& p, float weight, Scratch& s) {
+    const Obstacles& o = p.obstacles;
+    Samples& at = s.obstacle;
+    float total = 0;
+    for (int i = 0; i < o.corners.count; i++) {
+        float gap = at.x[i] * o.normal[0] + at.y[i] * o.normal[1] + at.z[i] * o.normal[2] - o.offset - o.corner_radius[i];
+        float slope;
+        total += tempered(o.margin - gap, &slope);
+        at.gx[i] = -weight * slope * o.normal[0];
+        at.gy[i] = -weight * slope * o.normal[1];
+        at.gz[i] = -weight * slope * o.normal[2];
+    }
+    if (total != 0) gather_wrenches(o.corners, at, s.wrench);
+    return total;
+}
+
+// Balls about placed points against one neighbour.
+static float neighbour_depth(
+    const Grid& grid, const Points& points, const float* radius, float margin, float weight, Scratch& s) {
+    Samples& at = s.obstacle;
+    sample(grid, points.count, at);
+    float total = 0;
+    for (int i = 0; i < points.count; i++) {
+        float slope;
+        total += tempered(margin - (at.phi[i] - radius[i]), &slope);
+        at.a_phi[i] = -weight * slope;
+        at.a_nx[i] = at.a_ny[i] = at.a_nz[i] = 0;
+    }
+    if (total != 0) {
+        sample_adjoint(grid, points.count, at);
+        gather_wrenches(points, at, s.wrench);
+    }
+    return total;
+}
+
+// Unweighted loss; forces go to the links.
+static float obstacle_depth(const Problem& p, float weight, Scratch& s) {
+    const Obstacles& o = p.obstacles;
+    if (!o.has_support && o.grids == 0) return 0;
+    Samples& at = s.obstacle;
+    float total = 0;
+    place_points(o.corners, s.link, at.x, at.y, at.z);
+    if (o.has_support) total += support_depth(p, weight, s);
+    for (int k = 0; k < o.grids; k++) total += neighbour_depth(o.grid[k], o.corners, o.corner_radius, o.margin, weight, s);
+    if (o.grids == 0) return total;
+    place_points(o.spheres, s.link, at.x, at.y, at.z);
+    for (int k = 0; k < o.grids; k++) total += neighbour_depth(o.grid[k], o.spheres, o.sphere_radius, o.margin, weight, s);
+    return total;
+}
+
+}  // namespace graspd

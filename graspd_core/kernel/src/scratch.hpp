@@ -1,0 +1,97 @@
+// Memory of one thread for one evaluation after the other, laid out once from the problem's sizes.
+#pragma once
+#include <algorithm>
+#include <cstdlib>
+#include <cstring>
+#include <new>
+
+#include "lanes.hpp"
+#include "layout.hpp"
+
+namespace graspd {
+
+// An array of so many, aligned for vectors, zeroed, with room for a vector that begins at its last element.
+template <class T>
+class Array {
+   public:
+    explicit Array(int count) {
+        size_t bytes = (sizeof(T) * (size_t)count + 4 * LANES + 63) / 64 * 64;
+        data_ = (T*)std::aligned_alloc(64, bytes);
+        if (!data_) throw std::bad_alloc();
+        memset((void*)data_, 0, bytes);
+    }
+    ~Array() { std::free(data_); }
+    Array(const Array&) = delete;
+    Array& operator=(const Array&) = delete;
+    operator T*() { return data_; }
+    operator const T*() const { return data_; }
+
+   private:
+    T* data_;
+};
+
+// Points of the object frame, the signed distance and normal there, and what is needed to pull adjoints back.
+struct Samples {
+    explicit Samples(int n)
+        : x(n), y(n), z(n), phi(n), nx(n), ny(n), nz(n), fx(n), fy(n), fz(n), ox(n), oy(n), oz(n), cell(n),
+          jacobian(16 * n), a_phi(n), a_nx(n), a_ny(n), a_nz(n), gx(n), gy(n), gz(n) {}
+    Array<float> x, y, z;        // where [m]
+    Array<float> phi, nx, ny, nz;
+    Array<float> fx, fy, fz;     // place within the cell
+    Array<float> ox, oy, oz;     // offset from the grid [m], zero inside
+    Array<int32_t> cell;         // index of the cell's first node
+    Array<float> jacobian;       // 16 a point: the channels, then their slopes per cell along x, y, z
+    Array<float> a_phi, a_nx, a_ny, a_nz;  // adjoints of distance and normal
+    Array<float> gx, gy, gz;     // gradient with respect to the points
+};
+
+// The candidates that the task looks at, and every disturbance at each.
+struct Task {
+    Task(int n, int directions)
+        : index(n), ax(n), ay(n), az(n), nx(n), ny(n), nz(n), s(n), known(n), cx(n), cy(n), cz(n),
+          normal_speed(n * directions), inverse_speed(n * directions), resisted(n * directions),
+          support(LANES * directions), slope(directions), gax(n), gay(n), gaz(n), gnx(n), gny(n), gnz(n), gs(n) {}
+    Array<int32_t> index;
+    Array<float> ax, ay, az, nx, ny, nz, s;  // arm, normal, activation
+    Array<float> known, cx, cy, cz;          // confidence and its gradient
+    Array<float> normal_speed, inverse_speed, resisted;
+    Array<float> support, slope;
+    Array<float> gax, gay, gaz, gnx, gny, gnz, gs;  // gradients of arm, normal, activation
+    int count = 0;
+};
+
+// A sharp point of the object and the solid that it is near to.
+struct Pair {
+    int32_t solid, feature;
+    float distance, gradient[3], adjoint;
+};
+
+struct Scratch {
+    explicit Scratch(const Problem& p)
+        : link(12 * p.hand.links),
+          wrench(6 * p.hand.links),
+          candidates(padded(std::max(p.coarse.count, p.fine.count))),
+          key(padded(std::max(p.coarse.count, p.fine.count))),
+          task(padded(std::min(p.task_points, std::max(p.coarse.count, p.fine.count))), p.directions),
+          gap(p.hand.groups), gap_at(p.hand.groups), gap_pair(p.hand.groups),
+          solid(12 * p.solids.count),
+          bound(std::max(1, p.solids.count * p.object.feature_stride)),
+          picked(p.feature_pairs), pair(p.feature_pairs),
+          sphere(padded(p.spheres.centers.count)),
+          obstacle(padded(std::max(p.obstacles.corners.count, p.obstacles.spheres.count))) {}
+    Array<float> link;    // T_object_link
+    Array<float> wrench;  // force on each link and its moment about the object frame's origin
+    Samples candidates;
+    Array<float> key;
+    Task task;
+    Array<float> gap;          // of each group
+    Array<int32_t> gap_at, gap_pair;  // candidate or pair that has it
+    Array<float> solid;        // T_object_solid
+    Array<float> bound;
+    Array<int32_t> picked;
+    Array<Pair> pair;
+    Samples sphere, obstacle;
+    float terms[TERMS];
+};
+
+}  // namespace graspd

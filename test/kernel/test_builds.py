@@ -1,0 +1,54 @@
+"""Which build is loaded, and what is said where none is."""
+
+from __future__ import annotations
+
+import ctypes
+
+import pytest
+
+from graspd_core.errors import ConfigError
+from graspd_core.kernel import builds, structs
+
+
+def test_the_best_build_that_runs_here_is_taken(monkeypatch):
+    monkeypatch.delenv("GRASPD_KERNEL", raising=False)
+    runs = [name for name, needed in builds.BUILDS.items() if not needed - builds._instructions()]
+    assert builds.kernel().name == runs[0]
+    assert runs[-1] == "baseline"
+
+
+def test_a_build_is_chosen_by_name_or_path(monkeypatch, tmp_path):
+    monkeypatch.setenv("GRASPD_KERNEL", "baseline")
+    assert builds.kernel().name == "baseline"
+    monkeypatch.setenv("GRASPD_KERNEL", "off")
+    assert (builds.kernel().library, builds.kernel().reason) == (None, "GRASPD_KERNEL is off")
+    other = tmp_path / "other.so"
+    other.write_bytes(b"not a library")
+    monkeypatch.setenv("GRASPD_KERNEL", str(other))
+    assert builds.kernel().library is None
+    assert "other.so" in builds.kernel().reason
+
+
+def test_a_build_that_does_not_exist_is_refused(monkeypatch):
+    monkeypatch.setenv("GRASPD_KERNEL", "v9")
+    with pytest.raises(ConfigError, match=r"GRASPD_KERNEL: 'v9'; valid: off, v4, v3, baseline"):
+        builds.kernel()
+
+
+def test_a_machine_without_the_instructions_gets_the_baseline(monkeypatch):
+    monkeypatch.setattr(builds, "_instructions", frozenset)
+    assert builds._kernel.__wrapped__("").name == "baseline"
+    assert builds._kernel.__wrapped__("v3").reason.startswith("v3: no ")
+
+
+def test_other_structures_are_noticed(monkeypatch):
+    class Grown(ctypes.Structure):
+        _fields_ = [*structs.Weights._fields_, ("more", ctypes.c_float)]
+
+    changed = tuple(Grown if s is structs.Weights else s for s in structs.STRUCTURES)
+    monkeypatch.setattr(builds, "STRUCTURES", changed)
+    assert builds.load("baseline").reason == "built from other sources: install graspd again"
+
+
+def test_a_build_that_was_not_made_says_so():
+    assert builds.load("none").reason.startswith("not built")

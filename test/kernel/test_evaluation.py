@@ -1,0 +1,158 @@
+"""The compiled step against torch: values and gradients on every hand, and what must not matter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from graspd_core.kernel import builds
+from graspd_core.methods.closed_form.closed_form import ClosedForm, weighted
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.methods.closed_form.compiled_search import evaluate_compiled, least_distance_compiled
+from graspd_core.methods.kernel_problem import KernelProblem, kernel_problem
+from graspd_core.methods.losses import hard_contact, soft_contact
+from graspd_core.methods.poses import moved_along, unpack
+from graspd_core.methods.problem import Problem, Terms, evaluate, least_distance
+
+HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
+DELTA = 0.006
+# Each term with a weight that makes its gradient count.
+WEIGHTS = LossWeights(3.0, 1.0, 1.0, 1.0, 0.02, 1.0)
+
+
+def compiled_of(problem: Problem) -> KernelProblem:
+    found = kernel_problem(problem)
+    assert found is not None
+    return found
+
+
+def by_torch(problem, x, radius, *, fine: bool, activate=soft_contact) -> Terms:
+    poses = moved_along(unpack(x), -problem.hand.pivot)
+    return evaluate(
+        problem, poses.translation, poses.quaternion, poses.joints, radius, DELTA, fine=fine, activate=activate
+    )
+
+
+def gradient_of(problem, x, radius, weights: LossWeights, *, fine: bool, activate=soft_contact) -> torch.Tensor:
+    x = x.clone().requires_grad_(True)
+    terms = by_torch(problem, x, radius, fine=fine, activate=activate)
+    return torch.autograd.grad(weighted(terms, weights).sum(), x)[0]
+
+
+@pytest.mark.parametrize("fine", [False, True], ids=["coarse", "fine"])
+@pytest.mark.parametrize("scene", ["box", "mug", "guessed", "crowded"])
+@pytest.mark.parametrize("hand", HANDS)
+def test_it_agrees_with_torch(problem_of, rows_of, hand, scene, fine):
+    problem = problem_of(hand, scene)
+    x = rows_of(hand, scene, problem)
+    # A radius at which no candidate lies exactly on the padded surface: there a gradient may be either side's.
+    radius = torch.linspace(0.0, 0.011, len(x))
+    loss, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, fine=fine)
+    expected = by_torch(problem, x, radius, fine=fine)
+    for name, value in expected._asdict().items():
+        mine = getattr(terms, name)
+        if value is None:
+            assert (mine == 0).all(), name
+        else:
+            assert mine.tolist() == pytest.approx(value.tolist(), rel=2e-4, abs=2e-5), name
+    slope = gradient_of(problem, x, radius, WEIGHTS, fine=fine)
+    error = (gradient - slope).norm(dim=-1) / slope.norm(dim=-1)
+    # float32 sums in another order; where two candidates of a group tie, a row may follow the other one.
+    assert error.median() < 1e-4, error
+    assert error.sort().values[-2] < 1e-2, error
+    assert torch.isfinite(loss).all()
+
+
+@pytest.mark.parametrize("scene", ["box", "crowded"])
+def test_the_gradient_is_that_of_the_value(problem_of, rows_of, scene):
+    """Central differences of the kernel itself, along random directions; kinks are left out by the median."""
+    problem = problem_of("barrett_like", scene)
+    compiled, x = compiled_of(problem), rows_of("barrett_like", scene, problem)
+    radius = torch.full((len(x),), 0.004)
+
+    def value(rows: torch.Tensor) -> torch.Tensor:
+        return evaluate_compiled(compiled, rows, radius, 0.02, WEIGHTS)[0]
+
+    gradient = evaluate_compiled(compiled, x, radius, 0.02, WEIGHTS)[1]
+    errors = []
+    for seed in range(6):
+        along = torch.randn(x.shape, generator=torch.Generator().manual_seed(seed)) * 1e-3
+        along[:, :3] *= 0.1
+        slope = (value(x + along) - value(x - along)) / 2
+        errors.append((slope - (gradient * along).sum(-1)).abs() / (gradient * along).norm(dim=-1))
+    assert torch.stack(errors).median() < 0.02
+
+
+def test_contact_without_a_width_has_no_slope_of_its_own(problem_of, rows_of):
+    problem = problem_of("allegro_right", "box")
+    x, radius = rows_of("allegro_right", "box", problem), torch.full((12,), 0.0031)
+    only = LossWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    _, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, only, soft=False)
+    expected = by_torch(problem, x, radius, fine=False, activate=hard_contact).wrench_resistance
+    assert terms.wrench_resistance.tolist() == pytest.approx(expected.tolist(), rel=1e-4)
+    slope = gradient_of(problem, x, radius, only, fine=False, activate=hard_contact)
+    assert ((gradient - slope).norm(dim=-1) < 1e-3 * slope.norm(dim=-1).clamp_min(1.0)).all()
+
+
+def test_every_build_gives_the_same_up_to_rounding(problem_of, rows_of, monkeypatch):
+    problem = problem_of("leap_right", "mug")
+    x, radius = rows_of("leap_right", "mug", problem), torch.full((12,), 0.003)
+    found = {}
+    for name in builds.BUILDS:
+        if not builds.BUILDS[name] - builds._instructions():
+            monkeypatch.setenv("GRASPD_KERNEL", name)
+            assert builds.kernel().name == name
+            found[name] = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, fine=True)[0].tolist()
+    assert len(found) > 1 or "v3" not in found
+    for loss in found.values():
+        assert loss == pytest.approx(found["baseline"], rel=1e-4)
+
+
+def test_least_distance(problem_of, rows_of):
+    problem = problem_of("allegro_right", "mug")
+    x = rows_of("allegro_right", "mug", problem)
+    poses = moved_along(unpack(x), -problem.hand.pivot)
+    expected = least_distance(problem, poses.translation, poses.quaternion, poses.joints)
+    assert least_distance_compiled(compiled_of(problem), x).tolist() == pytest.approx(expected.tolist(), abs=1e-6)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30])
+@pytest.mark.parametrize("where", ["pose", "field", "radius", "weight"])
+def test_what_is_not_a_number_stays_with_its_row(problem_of, rows_of, bad, where):
+    problem = problem_of("allegro_right", "crowded")
+    x, radius, weights = rows_of("allegro_right", "crowded", problem), torch.full((12,), 0.003), WEIGHTS
+    clean = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, fine=True)
+    if where == "pose":
+        x = x.clone()
+        x[5, 0] = bad
+    elif where == "radius":
+        radius[5] = bad
+    elif where == "weight":
+        weights = replace(WEIGHTS, penetration=bad)
+    else:
+        grid = problem.object.sdf
+        broken = grid.field.clone()
+        broken[0, 10, 10, 10] = bad
+        problem = replace(problem, object=replace(problem.object, sdf=replace(grid, field=broken)))
+    loss, gradient, _ = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, fine=True)
+    if where in ("pose", "radius"):
+        others = torch.arange(12) != 5
+        assert torch.equal(loss[others], clean[0][others])
+        assert torch.equal(gradient[others], clean[1][others])
+    # As in torch: a row that is not finite stands still, and says so by its loss.
+    solver = ClosedForm(replace(ClosedFormConfig(), polish_weights=weights), 12)
+    expected = solver.value_and_gradient(problem, x, radius, DELTA, polish=True)[0]
+    finite = loss.isfinite() & gradient.isfinite().all(-1)
+    assert torch.equal(finite, expected.isfinite())
+
+
+def test_torch_evaluates_what_the_kernel_does_not(problem_of, monkeypatch):
+    problem = problem_of("allegro_right", "box")
+    assert kernel_problem(problem) is not None
+    grid = problem.object.sdf
+    double = replace(problem.object, sdf=grid.to("cpu", torch.float64))
+    assert kernel_problem(replace(problem, object=double)) is None
+    monkeypatch.setenv("GRASPD_KERNEL", "off")
+    assert kernel_problem(problem) is None
