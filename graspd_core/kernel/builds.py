@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +28,8 @@ _INT, _FLOAT, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 _ARGUMENTS = {
     "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _AT, _AT, _AT, _INT],
     "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
+    "graspd_find_pregrasps": [_AT, _AT, _INT, _AT, _AT, _AT, _INT, POLL],
+    "graspd_self_overlap": [_AT, _INT, _AT, _AT, _AT, _INT],
     "graspd_run_steps": [_AT, _AT, _AT, _INT, _INT, _INT, _INT, POLL],
 }
 
@@ -72,9 +75,29 @@ def _kernel(wanted: str) -> Kernel:
     return Kernel("", None, "; ".join(reasons))
 
 
-def call(function: str, *arguments: object) -> None:
-    """Call a function of `kernel()`. Raises MemoryError: too little memory for its threads."""
-    if getattr(kernel().library, function)(*arguments) != 0:
+def call(function: str, *arguments: object, watch: Callable[[int], bool] | None = None) -> None:
+    """Call a function of `kernel()`.
+
+    Args:
+        watch: called from this thread every few milliseconds with the steps done; true ends the call.
+
+    Raises:
+        MemoryError: too little memory for its threads.
+    """
+    failures: list[BaseException] = []
+
+    def poll(done: int) -> int:
+        # What it raises, as at Ctrl-C, cannot pass through C++: it ends the call, and is raised behind it.
+        try:
+            return bool(watch and watch(done))
+        except BaseException as failure:
+            failures.append(failure)
+            return True
+
+    status = getattr(kernel().library, function)(*arguments, *([] if watch is None else [POLL(poll)]))
+    if failures:
+        raise failures[0]
+    if status != 0:
         raise MemoryError(f"{function}: too little memory")
 
 

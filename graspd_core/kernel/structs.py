@@ -113,8 +113,14 @@ class State(ctypes.Structure):
     _fields_ = _of(_POINTER, "x mean square radius best_x best_loss loss")
 
 
+class Pregrasp(ctypes.Structure):
+    """How a pregrasp is sought."""
+
+    _fields_ = [*_of(_FLOAT, "clearance joint_rate base_rate joint_cost base_cost"), ("steps", _INT)]
+
+
 # In the order of `graspd_sizes`.
-STRUCTURES = (Hand, Points, Grid, Solids, Spheres, Object, Obstacles, Weights, Problem, Schedule, State)
+STRUCTURES = (Hand, Points, Grid, Solids, Spheres, Object, Obstacles, Weights, Problem, Schedule, State, Pregrasp)
 
 
 def names_of(structure: type[ctypes.Structure]) -> list[str]:

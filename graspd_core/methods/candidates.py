@@ -12,15 +12,6 @@ from torch import Tensor
 
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
-from graspd_core.methods.grasp_stages import (
-    ContactSet,
-    Squeeze,
-    approach_depth,
-    find_contacts,
-    find_pregrasp,
-    self_overlap,
-    squeeze,
-)
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.obstacle_distance import intrusion
@@ -28,6 +19,9 @@ from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
+from graspd_core.methods.stages.contact_set import ContactSet, find_contacts, self_overlap
+from graspd_core.methods.stages.pregrasp import approach_depth, find_pregrasp
+from graspd_core.methods.stages.squeeze import Squeeze, squeeze
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 

@@ -162,8 +162,9 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
     return SphereTensors(placement(hand.num_links, points, at), radius, pairs)
 
 
+@lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
-    """Lay the scene's object out."""
+    """Lay the scene's object out; kept for the last few scenes, which are hashed by identity."""
     thin = thin_share(scene.object.mesh) > _THIN_WALLED
     sharp = sharp_points(scene.object.mesh, settings.features * 2 if thin else settings.features)
     floor, confidence = settings.confidence_floor, None

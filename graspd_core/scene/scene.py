@@ -72,7 +72,7 @@ class Obstacle:
     sdf: GridSDF
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What a grasp is planned against; all in the object's frame.
 

@@ -25,12 +25,13 @@ from graspd_core.methods.annealing.annealing import (
 from graspd_core.methods.annealing.annealing_config import AnnealingConfig
 from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
 from graspd_core.methods.finger_closing import finger_of
-from graspd_core.methods.grasp_stages import ContactSet, hand_distance
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput, PlannerOutput
 from graspd_core.methods.poses import Poses
+from graspd_core.methods.stages.contact_set import ContactSet
+from graspd_core.methods.stages.pregrasp import hand_distance
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
 

@@ -1,5 +1,5 @@
 // The C interface. Functions return 0, or 1 where memory is short; they never throw, and write only where told.
-#include "search.hpp"
+#include "stages.hpp"
 #include "threads.hpp"
 
 using namespace graspd;
@@ -21,7 +21,8 @@ extern "C" {
 // Sizes of the structures, for the caller to compare with its own; returns how many there are.
 int32_t graspd_sizes(int32_t* sizes) {
     int32_t known[] = {sizeof(Hand),      sizeof(Points),  sizeof(Grid),    sizeof(Solids),   sizeof(Spheres), sizeof(Object),
-                       sizeof(Obstacles), sizeof(Weights), sizeof(Problem), sizeof(Schedule), sizeof(State)};
+                       sizeof(Obstacles), sizeof(Weights), sizeof(Problem), sizeof(Schedule), sizeof(State),
+                       sizeof(Pregrasp)};
     memcpy(sizes, known, sizeof known);
     return sizeof known / sizeof known[0];
 }
@@ -59,6 +60,29 @@ int32_t graspd_run_steps(const Problem* p, const Schedule* schedule, const State
         for_rows(*p, rows, threads, [&](int row, Scratch& s, bool caller) {
             Array<float> gradient(7 + p->hand.joints);
             run_steps(*p, *schedule, *state, row, from, to, gradient, s, [&] { return stop.go(caller); });
+        });
+    });
+}
+
+// Pregrasps (rows x (3 + joints)) of the grasps in x (rows x variables, places those of the base), and how clear each way is.
+int32_t graspd_find_pregrasps(const Problem* p, const Pregrasp* settings, int32_t rows, const float* x, float* out,
+                              float* share, int32_t threads, Stop::Poll poll) {
+    return guarded([&] {
+        Stop stop(poll);
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool caller) {
+            const float* grasp = x + row * (7 + p->hand.joints);
+            share[row] = find_pregrasp(
+                *p, *settings, grasp, out + row * (3 + p->hand.joints), s, [&] { return stop.go(caller); });
+        });
+    });
+}
+
+// Greatest depth of the hand in itself at every row of joints; `checked` is links x solids.
+int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints, const int32_t* checked, float* depth,
+                            int32_t threads) {
+    return guarded([&] {
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
+            depth[row] = self_overlap(*p, joints + row * p->hand.joints, checked, s);
         });
     });
 }

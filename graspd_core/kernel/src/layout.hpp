@@ -94,6 +94,12 @@ struct Schedule {
     int32_t explore_steps, refine_steps, polish_steps, soft;
 };
 
+// How a pregrasp is sought (config/grasp_stages_config.py).
+struct Pregrasp {
+    float clearance, joint_rate, base_rate, joint_cost, base_cost;
+    int32_t steps;
+};
+
 // Rows of one matrix each: `variables` is 7 + joints (place of the pivot, quaternion wxyz, joints).
 struct State {
     float *x, *mean, *square, *radius, *best_x, *best_loss, *loss;

@@ -29,12 +29,12 @@ from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.annealing.annealing_config import AnnealingConfig
 from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
 from graspd_core.methods.finger_closing import link_gaps, make_closing, sphere_overlap
-from graspd_core.methods.grasp_stages import ContactSet, find_contacts
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
+from graspd_core.methods.stages.contact_set import ContactSet, find_contacts
 
 # GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
 _T0, _COOLING, _DIMENSIONS, _FIRST, _LAST = 1e6, 7.0, 8, 30_000, 100_000

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.kernel import structs
-from graspd_core.kernel.builds import POLL, call
+from graspd_core.kernel.builds import call
 from graspd_core.methods.closed_form.adam import AdamState, initial_state
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.methods.kernel_problem import KernelProblem
@@ -81,35 +81,26 @@ class _Follow:
         steps: of a full run.
         done: steps done by all rows.
         interrupted: "", "cancelled" or "deadline".
-        failure: what a hook raised, as of Ctrl-C: it cannot pass through C++, and is raised again behind it.
+        reported: when, a `time.perf_counter()` value.
     """
 
     hooks: Hooks
     steps: int
     done: int = 0
     interrupted: str = ""
-    failure: BaseException | None = None
     reported: float = -float("inf")
 
     def look(self, done: int, loss: Tensor) -> bool:
         """Report that so many steps are done; whether to stop."""
         now = time.perf_counter()
-        try:
-            if self.hooks.stop():
-                self.interrupted = "cancelled"
-            elif now >= self.hooks.deadline:
-                self.interrupted = "deadline"
-            elif now - self.reported >= self.hooks.interval or done == self.steps:
-                self.hooks.report(done, self.steps, float(loss.min()))
-                self.reported = now
-        except BaseException as failure:
-            self.failure = failure
-        return bool(self.interrupted or self.failure)
-
-    def raise_failure(self) -> None:
-        """Raise what a hook raised."""
-        if self.failure:
-            raise self.failure
+        if self.hooks.stop():
+            self.interrupted = "cancelled"
+        elif now >= self.hooks.deadline:
+            self.interrupted = "deadline"
+        elif now - self.reported >= self.hooks.interval or done == self.steps:
+            self.hooks.report(done, self.steps, float(loss.min()))
+            self.reported = now
+        return bool(self.interrupted)
 
 
 def _run_steps(
@@ -119,16 +110,18 @@ def _run_steps(
     begin, end = span
     rows = len(state.x)
     if begin == end or rows == 0 or follow.look(begin, state.loss):
-        follow.raise_failure()
         return
-    poll = POLL(lambda done: follow.look(min(begin + done // rows, end - 1), state.loss))
     pointers = structs.State(**{name: getattr(state, name).data_ptr() for name in structs.names_of(structs.State)})
     arguments = byref(compiled.struct), byref(_schedule(config)), byref(pointers), rows, begin, end
-    call("graspd_run_steps", *arguments, torch.get_num_threads(), poll)
-    if not follow.interrupted and not follow.failure:
+    call(
+        "graspd_run_steps",
+        *arguments,
+        torch.get_num_threads(),
+        watch=lambda done: follow.look(min(begin + done // rows, end - 1), state.loss),
+    )
+    if not follow.interrupted:
         follow.done = end
         follow.look(end, state.loss)
-    follow.raise_failure()
 
 
 def _schedule(config: ClosedFormConfig) -> structs.Schedule:

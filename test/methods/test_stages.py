@@ -7,21 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import nnls
 
 from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import link_poses, point_jacobian
 from graspd_core.mesh.shapes import SPHERE_RADIUS
-from graspd_core.methods.grasp_stages import (
-    balanced_forces,
-    find_contacts,
-    find_pregrasp,
-    hand_distance,
-    joint_torques,
-    self_overlap,
-    squeeze,
-)
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.poses import Poses
+from graspd_core.methods.stages.contact_set import find_contacts, self_overlap
+from graspd_core.methods.stages.pregrasp import find_pregrasp, hand_distance
+from graspd_core.methods.stages.squeeze import _cone_edges, balanced_forces, joint_torques, squeeze
 from graspd_core.se3 import rotation_from_quaternion
 
 FRICTION, LENGTH = 0.5, 0.035
@@ -197,3 +192,38 @@ def test_an_open_hand_is_clear_of_itself_and_crossed_fingers_are_not(problem_of,
     assert overlap[1:].min() < 0.001
     everything = torch.ones_like(torch.as_tensor(hand.adjacent))
     assert not self_overlap(problem, torch.stack(crossed), everything).any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_balanced_forces_are_those_of_non_negative_least_squares(seed):
+    """Against Lawson and Hanson's algorithm on the same system, row by row, with some contacts switched off."""
+    rng = np.random.default_rng(seed)
+    slots = int(rng.integers(2, 16))
+    normals = rng.normal(size=(3, slots, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    arms = 0.03 * normals + 0.005 * rng.normal(size=normals.shape)
+    active = rng.random((3, slots)) < 0.8
+    active[:, :2] = True
+    forces, imbalance = balanced_forces(arms, normals, active, LENGTH, FRICTION)
+    for row in range(3):
+        on = np.flatnonzero(active[row])
+        edges = _cone_edges(normals[row : row + 1, on], FRICTION)[0]
+        torques = np.cross(arms[row, on][:, None], edges) / LENGTH
+        wrenches = np.concatenate([edges, torques], -1).reshape(-1, 6).T
+        count = wrenches.shape[1]
+        system = np.concatenate([wrenches, np.full((1, count), 10.0), 0.5 * np.eye(count)])
+        weights, _ = nnls(system, np.concatenate([np.zeros(6), [10.0], np.zeros(count)]))
+        weights /= weights.sum()
+        expected = np.zeros((slots, 3))
+        expected[on] = (weights.reshape(-1, 8, 1) * edges).sum(1)
+        assert forces[row] == pytest.approx(expected, abs=1e-9)
+        assert imbalance[row] == pytest.approx(np.linalg.norm(wrenches @ weights), abs=1e-9)
+
+
+def test_forces_of_contacts_that_are_not_numbers_are_not_numbers_and_end():
+    normals = np.full((1, 3, 3), np.nan)
+    forces, imbalance = balanced_forces(normals, normals, np.ones((1, 3), dtype=bool), LENGTH, FRICTION)
+    assert np.isnan(forces).any() or np.isnan(imbalance).any()
+    nobody, alone = balanced_forces(normals, normals, np.zeros((1, 3), dtype=bool), LENGTH, FRICTION)
+    assert not nobody.any()
+    assert alone.tolist() == [1.0]

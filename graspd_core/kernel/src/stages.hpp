@@ -1,0 +1,155 @@
+// From an optimised pose to its pregrasp, and how deep a hand lies in itself (methods/stages).
+#pragma once
+#include "search.hpp"
+
+namespace graspd {
+
+// Shares of the way from pregrasp to grasp that are still to go where it is kept clear.
+constexpr int WAY = 3;
+constexpr float TO_GO[WAY] = {1.f, 0.6f, 0.2f};
+
+// The base turned as x[3:7] says, at a place of its own.
+static void turned_base(const float* quaternion, const float* place, float* base) {
+    static const float origin[3] = {0, 0, 0};
+    float x[7] = {place[0], place[1], place[2], quaternion[0], quaternion[1], quaternion[2], quaternion[3]};
+    Hand at_origin = {};
+    at_origin.pivot = origin;
+    base_pose(at_origin, x, base);
+}
+
+// What the search for a pregrasp remembers between its steps; variables are the base's place and the joints.
+struct Opening {
+    explicit Opening(const Problem& p)
+        : variables(3 + p.hand.joints), start(variables), y(variables), at(variables), mean(variables),
+          square(variables), gradient(variables), slope(variables), wanted(WAY * padded(p.coarse.count)) {}
+    int variables;
+    Array<float> start, y, at, mean, square, gradient, slope;
+    Array<float> wanted;  // least distance of every candidate at every share of the way
+};
+
+// The hand `to_go` before the grasp: link poses and the distances of its coarse candidates.
+static void place_on_way(const Problem& p, const float* quaternion, float to_go, Opening& o, Scratch& s) {
+    for (int i = 0; i < o.variables; i++) o.at[i] = to_go * o.y[i] + (1 - to_go) * o.start[i];
+    float base[12];
+    turned_base(quaternion, o.at, base);
+    place_links(p.hand, base, o.at + 3, s.link);
+    place_points(p.coarse, s.link, s.candidates.x, s.candidates.y, s.candidates.z);
+    sample(p.object.grid, p.coarse.count, s.candidates);
+}
+
+// Adds the slope of one place on the way: candidates nearer than wanted, and obstacles.
+static void add_way_slope(const Problem& p, const float* wanted, float to_go, Opening& o, Scratch& s) {
+    Samples& at = s.candidates;
+    bool any = false;
+    for (int i = 0; i < p.coarse.count; i++) {
+        float missing = (wanted[i] - at.phi[i]) * MILLIMETRES;
+        any |= !(missing <= 0);
+        at.a_phi[i] = missing <= 0 ? 0.f : -2.f * MILLIMETRES * missing / p.coarse.count;
+        at.a_nx[i] = at.a_ny[i] = at.a_nz[i] = 0;
+    }
+    for (int i = 0; i < 6 * p.hand.links; i++) s.wrench[i] = 0;
+    if (any) {
+        sample_adjoint(p.object.grid, p.coarse.count, at);
+        gather_wrenches(p.coarse, at, s.wrench);
+    }
+    float blocked = obstacle_depth(p, 1.f, s);
+    if (!any && blocked == 0) return;
+    for (int i = 0; i < o.variables; i++) o.slope[i] = 0;
+    pull_back_joints(p.hand, s.link, s.wrench, o.slope + 3);
+    for (int i = 0; i < 3; i++) o.slope[i] = s.wrench[i];
+    for (int i = 0; i < o.variables; i++) o.gradient[i] += to_go * o.slope[i];
+}
+
+// A step of Adam whose rate fades; a slope that is not a number counts as none.
+static void opening_step(const Hand& hand, const Pregrasp& settings, int count, Opening& o) {
+    const float first = 1.f / (1.f - powf(BETA1, count)), second = 1.f / (1.f - powf(BETA2, count));
+    const float fade = 1.f - 0.9f * count / settings.steps;
+    for (int i = 0; i < o.variables; i++) {
+        float g = std::isfinite(o.gradient[i]) ? o.gradient[i] : 0.f;
+        o.mean[i] = BETA1 * o.mean[i] + (1 - BETA1) * g;
+        o.square[i] = BETA2 * o.square[i] + (1 - BETA2) * g * g;
+        float rate = i < 3 ? settings.base_rate : settings.joint_rate * hand.joint_scale[i - 3];
+        o.y[i] -= fade * rate * (o.mean[i] * first) / (sqrtf(o.square[i] * second) + ADAM_EPSILON);
+        if (i >= 3) o.y[i] = std::min(std::max(o.y[i], hand.lower[i - 3]), hand.upper[i - 3]);
+    }
+}
+
+// x: the base's place, quaternion and joints of a grasp; `out` gets place and joints of the pregrasp. Returns the least
+// distance on the way over what it should be there, one where all is clear.
+template <class Go>
+static float find_pregrasp(const Problem& p, const Pregrasp& settings, const float* x, float* out, Scratch& s, Go go) {
+    const Hand& hand = p.hand;
+    const int stride = padded(p.coarse.count);
+    Opening o(p);
+    for (int i = 0; i < o.variables; i++) o.start[i] = o.y[i] = i < 3 ? x[i] : x[4 + i];
+    place_on_way(p, x + 3, 0.f, o, s);
+    // Where the grasp itself sinks in, the way out starts from that depth.
+    for (int k = 0; k < WAY; k++)
+        for (int i = 0; i < p.coarse.count; i++)
+            o.wanted[k * stride + i] = std::min(s.candidates.phi[i], 0.f) * (1 - TO_GO[k]) + TO_GO[k] * settings.clearance;
+    for (int count = 1; count <= settings.steps && go(); count++) {
+        for (int i = 0; i < o.variables; i++) {
+            float scale = i < 3 ? 1.f : hand.joint_scale[i - 3];
+            float cost = i < 3 ? settings.base_cost : settings.joint_cost / (scale * scale);
+            o.gradient[i] = 2 * cost * (o.y[i] - o.start[i]);
+        }
+        for (int k = 0; k < WAY; k++) {
+            place_on_way(p, x + 3, TO_GO[k], o, s);
+            add_way_slope(p, o.wanted + k * stride, TO_GO[k], o, s);
+        }
+        opening_step(hand, settings, count, o);
+    }
+    float worst = -INFINITY;
+    for (int k = 0; k < WAY; k++) {
+        place_on_way(p, x + 3, TO_GO[k], o, s);
+        for (int i = 0; i < p.coarse.count; i++) {
+            float missing = o.wanted[k * stride + i] - s.candidates.phi[i];
+            worst = missing <= worst ? worst : missing;
+        }
+    }
+    for (int i = 0; i < o.variables; i++) out[i] = o.y[i];
+    return 1.f - worst / settings.clearance;
+}
+
+// Greatest depth of a fine candidate in a solid that `checked` (links x solids) asks about; zero where there is none.
+static float self_overlap(const Problem& p, const float* joints, const int32_t* checked, Scratch& s) {
+    const float standing[7] = {0, 0, 0, 1, 0, 0, 0};
+    const Solids& solids = p.solids;
+    Samples& at = s.candidates;
+    float base[12];
+    turned_base(standing + 3, standing, base);
+    place_links(p.hand, base, joints, s.link);
+    place_points(p.fine, s.link, at.x, at.y, at.z);
+    Floats deepest = {};
+    for (int k = 0; k < solids.count; k++) {
+        float t[12];
+        compose(s.link + 12 * solids.link[k], solids.pose + 12 * k, t);
+        const float *core = solids.core + 3 * k, radius = solids.radius[k];
+        for (int run = 0; run < p.fine.runs; run++) {
+            if (!checked[p.fine.run_link[run] * solids.count + k]) continue;
+            const int end = p.fine.run_start[run + 1];
+            for (int i = p.fine.run_start[run]; i < end; i += LANES) {
+                Floats x = load_unaligned(at.x + i) - t[3], y = load_unaligned(at.y + i) - t[7],
+                       z = load_unaligned(at.z + i) - t[11];
+                Floats a = magnitude(t[0] * x + t[4] * y + t[8] * z), b = magnitude(t[1] * x + t[5] * y + t[9] * z),
+                       c = magnitude(t[2] * x + t[6] * y + t[10] * z);
+                if (solids.round[k]) {
+                    a = root(a * a + b * b);
+                    b = Floats{};
+                }
+                a -= core[0];
+                b -= core[1];
+                c -= core[2];
+                Floats u = greater(a, Floats{}), v = greater(b, Floats{}), w = greater(c, Floats{});
+                Floats depth = radius - root(u * u + v * v + w * w) - lesser(greater(greater(a, b), c), Floats{});
+                for (int j = end - i; j < LANES; j++) depth[j] = 0;  // of the next run
+                deepest = greater(depth, deepest);
+            }
+        }
+    }
+    float depth = 0;
+    for (int j = 0; j < LANES; j++) depth = std::max(depth, deepest[j]);
+    return depth;
+}
+
+}  // namespace graspd

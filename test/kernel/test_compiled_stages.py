@@ -1,0 +1,75 @@
+"""Pregrasps and self-overlap by the kernel, against torch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from graspd_core.config import GraspStagesConfig
+from graspd_core.methods.poses import Poses, moved_along, unpack
+from graspd_core.methods.stages.contact_set import self_overlap
+from graspd_core.methods.stages.pregrasp import find_pregrasp
+
+HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
+
+
+@pytest.fixture
+def torch_alone(monkeypatch):
+    return lambda: monkeypatch.setenv("GRASPD_KERNEL", "off")
+
+
+def grasps_of(problem, rows) -> Poses:
+    return moved_along(unpack(rows), -problem.hand.pivot)
+
+
+@pytest.mark.parametrize("scene", ["mug", "crowded"])
+@pytest.mark.parametrize("hand", HANDS)
+def test_a_few_steps_are_torchs_and_all_come_as_far(problem_of, rows_of, torch_alone, hand, scene):
+    problem = problem_of(hand, scene)
+    poses = grasps_of(problem, rows_of(hand, scene, problem))
+    few, whole = GraspStagesConfig(open_steps=2), GraspStagesConfig()
+    mine, mine_share = find_pregrasp(problem, poses, few)
+    end, end_share = find_pregrasp(problem, poses, whole)
+    torch_alone()
+    theirs, their_share = find_pregrasp(problem, poses, few)
+    _, far_share = find_pregrasp(problem, poses, whole)
+    # Adam's first steps go by the sign of a slope, which rounding decides where it is next to nothing.
+    assert ((mine.translation - theirs.translation).abs() < 1e-4).float().mean() > 0.85
+    assert ((mine.joints - theirs.joints).abs() < 2e-3).float().mean() > 0.95
+    assert (mine_share - their_share).abs().median() < 0.01
+    assert (end_share - far_share).abs().median() < 0.05
+    assert ((end.joints >= problem.hand.lower) & (end.joints <= problem.hand.upper)).all()
+
+
+def test_it_stops_when_asked(problem_of, rows_of):
+    problem = problem_of("allegro_right", "crowded")
+    poses = grasps_of(problem, rows_of("allegro_right", "crowded", problem))
+    opened, _ = find_pregrasp(problem, poses, GraspStagesConfig(open_steps=10_000_000), lambda: True)
+    assert torch.isfinite(opened.joints).all()
+
+
+def test_a_pose_that_is_not_a_number_stays_alone(problem_of, rows_of):
+    problem = problem_of("leap_right", "box")
+    x = rows_of("leap_right", "box", problem)
+    clean, _ = find_pregrasp(problem, grasps_of(problem, x), GraspStagesConfig())
+    x = x.clone()
+    x[4, 2] = torch.nan
+    opened, share = find_pregrasp(problem, grasps_of(problem, x), GraspStagesConfig())
+    others = torch.arange(len(x)) != 4
+    assert torch.equal(opened.joints[others], clean.joints[others])
+    assert share.isfinite().tolist() == others.tolist()
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_overlap_is_torchs(problem_of, hands, torch_alone, hand):
+    problem = problem_of(hand, "box")
+    share = torch.rand(24, len(problem.hand.lower), generator=torch.Generator().manual_seed(0))
+    joints = problem.hand.lower + share * (problem.hand.upper - problem.hand.lower)
+    adjacent = torch.as_tensor(hands[hand].adjacent)
+    mine = self_overlap(problem, joints, adjacent)
+    everything = self_overlap(problem, joints, torch.ones_like(adjacent))
+    torch_alone()
+    assert mine.tolist() == pytest.approx(self_overlap(problem, joints, adjacent).tolist(), abs=1e-6)
+    assert not everything.any()
+    if hand.startswith("allegro"):
+        assert mine.max() > 0.002
