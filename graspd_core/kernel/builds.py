@@ -26,7 +26,7 @@ BUILDS = {
 POLL = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64)
 _INT, _FLOAT, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 _ARGUMENTS = {
-    "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _AT, _AT, _AT, _INT],
+    "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _INT, _AT, _AT, _AT, _INT],
     "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
     "graspd_find_pregrasps": [_AT, _AT, _INT, _AT, _AT, _AT, _INT, POLL],
     "graspd_self_overlap": [_AT, _INT, _AT, _AT, _AT, _INT],

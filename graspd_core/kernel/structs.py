@@ -92,7 +92,7 @@ class Problem(ctypes.Structure):
         ("obstacles", Obstacles),
         *_of(_INT, "directions task_points feature_pairs"),
         ("direction", _POINTER),
-        *_of(_FLOAT, "friction fine_reach"),
+        *_of(_FLOAT, "friction sharp_reach"),
     ]
 
 
@@ -103,7 +103,7 @@ class Schedule(ctypes.Structure):
         ("weights", Weights),
         ("polish_weights", Weights),
         *_of(_FLOAT, "delta_start delta_end radius_start translation_rate rotation_rate joint_rate"),
-        *_of(_INT, "explore_steps refine_steps polish_steps soft"),
+        *_of(_INT, "explore_steps refine_steps polish_steps soft sharp_refining"),
     ]
 
 

@@ -19,7 +19,7 @@ from graspd_core.kernel import structs
 from graspd_core.kernel.builds import kernel
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.methods.obstacle_distance import ObstacleTensors
-from graspd_core.methods.problem import FEATURE_PAIRS, OBSTACLE_MARGIN, REACH_WHEN_FINE, TASK_POINTS, Problem
+from graspd_core.methods.problem import FEATURE_PAIRS, OBSTACLE_MARGIN, REACH_WHEN_SHARP, TASK_POINTS, Problem
 from graspd_core.methods.problem_tensors import HandTensors, ObjectTensors, PointSet
 
 # Vectors of the widest target, and floats that it may read past the last that counts.
@@ -86,7 +86,7 @@ def kernel_problem(problem: Problem) -> KernelProblem | None:
         feature_pairs=FEATURE_PAIRS,
         direction=own.floats(problem.directions),
         friction=problem.friction,
-        fine_reach=REACH_WHEN_FINE,
+        sharp_reach=REACH_WHEN_SHARP,
         **hand,
     )
     return KernelProblem(struct, (hand_arrays, object_arrays, own))

@@ -30,7 +30,7 @@ from graspd_core.scene.confidence import sample_confidence
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-REACH_WHEN_FINE = 0.01
+REACH_WHEN_SHARP = 0.01
 # Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
 TASK_POINTS, FEATURE_PAIRS = 96, 96
 # Free space that the hand keeps to obstacles [m].
@@ -161,12 +161,14 @@ def evaluate(
     delta: float,
     *,
     fine: bool = False,
+    sharp: bool = False,
     activate: Callable[..., Tensor] = losses.soft_contact,
 ) -> Terms:
     """All loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
 
     Args:
-        fine: look at all candidates and all sharp points.
+        fine: look at all candidates.
+        sharp: look at all sharp points, and draw in only what is all but there.
         activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
     """
     points = problem.hand.fine if fine else problem.hand.coarse
@@ -174,11 +176,11 @@ def evaluate(
     distance, normal = sample_sdf(problem.object.sdf, placed.points)
     gap = (distance - radius[:, None])[:, points.groups].amin(-1)
     sunk = losses.penetration(distance, radius)
-    features = problem.object.features if fine else problem.object.features[: problem.object.coarse_features]
+    features = problem.object.features if sharp else problem.object.features[: problem.object.coarse_features]
     if len(features):
-        sharp, solids = feature_distance(problem, features, placed)
-        sunk = sunk + losses.penetration(sharp, torch.zeros_like(radius))
-        gap = torch.minimum(gap, _nearest_of_group(sharp, problem.hand.group_of_solid[solids], gap.shape[-1]))
+        edge, solids = feature_distance(problem, features, placed)
+        sunk = sunk + losses.penetration(edge, torch.zeros_like(radius))
+        gap = torch.minimum(gap, _nearest_of_group(edge, problem.hand.group_of_solid[solids], gap.shape[-1]))
     spheres = place_points(problem.hand.spheres.matrix, placed.links)
     obstacle = None
     if problem.obstacles is not None:
@@ -189,7 +191,7 @@ def evaluate(
             problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)
         ),
         distance=losses.touch(
-            gap, torch.full_like(problem.hand.reach, REACH_WHEN_FINE) if fine else problem.hand.reach
+            gap, torch.full_like(problem.hand.reach, REACH_WHEN_SHARP) if sharp else problem.hand.reach
         ),
         penetration=sunk,
         self_collision=losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight),

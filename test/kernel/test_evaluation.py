@@ -12,12 +12,14 @@ from graspd_core.methods.closed_form.closed_form import ClosedForm, weighted
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.methods.closed_form.compiled_search import evaluate_compiled, least_distance_compiled
 from graspd_core.methods.kernel_problem import KernelProblem, kernel_problem
-from graspd_core.methods.losses import hard_contact, soft_contact
+from graspd_core.methods.losses import hard_contact
 from graspd_core.methods.poses import moved_along, unpack
 from graspd_core.methods.problem import Problem, Terms, evaluate, least_distance
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 DELTA = 0.006
+# Exploring, refining among sharp points, polishing.
+LOOKS = ({}, {"sharp": True}, {"sharp": True, "fine": True})
 # Each term with a weight that makes its gradient count.
 WEIGHTS = LossWeights(3.0, 1.0, 1.0, 1.0, 0.02, 1.0)
 
@@ -28,36 +30,34 @@ def compiled_of(problem: Problem) -> KernelProblem:
     return found
 
 
-def by_torch(problem, x, radius, *, fine: bool, activate=soft_contact) -> Terms:
+def by_torch(problem, x, radius, **look) -> Terms:
     poses = moved_along(unpack(x), -problem.hand.pivot)
-    return evaluate(
-        problem, poses.translation, poses.quaternion, poses.joints, radius, DELTA, fine=fine, activate=activate
-    )
+    return evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, DELTA, **look)
 
 
-def gradient_of(problem, x, radius, weights: LossWeights, *, fine: bool, activate=soft_contact) -> torch.Tensor:
+def gradient_of(problem, x, radius, weights: LossWeights, **look) -> torch.Tensor:
     x = x.clone().requires_grad_(True)
-    terms = by_torch(problem, x, radius, fine=fine, activate=activate)
+    terms = by_torch(problem, x, radius, **look)
     return torch.autograd.grad(weighted(terms, weights).sum(), x)[0]
 
 
-@pytest.mark.parametrize("fine", [False, True], ids=["coarse", "fine"])
+@pytest.mark.parametrize("look", LOOKS, ids=["coarse", "sharp", "fine"])
 @pytest.mark.parametrize("scene", ["box", "mug", "guessed", "crowded"])
 @pytest.mark.parametrize("hand", HANDS)
-def test_it_agrees_with_torch(problem_of, rows_of, hand, scene, fine):
+def test_it_agrees_with_torch(problem_of, rows_of, hand, scene, look):
     problem = problem_of(hand, scene)
     x = rows_of(hand, scene, problem)
     # A radius at which no candidate lies exactly on the padded surface: there a gradient may be either side's.
     radius = torch.linspace(0.0, 0.011, len(x))
-    loss, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, fine=fine)
-    expected = by_torch(problem, x, radius, fine=fine)
+    loss, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, **look)
+    expected = by_torch(problem, x, radius, **look)
     for name, value in expected._asdict().items():
         mine = getattr(terms, name)
         if value is None:
             assert (mine == 0).all(), name
         else:
             assert mine.tolist() == pytest.approx(value.tolist(), rel=2e-4, abs=2e-5), name
-    slope = gradient_of(problem, x, radius, WEIGHTS, fine=fine)
+    slope = gradient_of(problem, x, radius, WEIGHTS, **look)
     error = (gradient - slope).norm(dim=-1) / slope.norm(dim=-1)
     # float32 sums in another order; where two candidates of a group tie, a row may follow the other one.
     assert error.median() < 1e-4, error
@@ -90,9 +90,9 @@ def test_contact_without_a_width_has_no_slope_of_its_own(problem_of, rows_of):
     x, radius = rows_of("allegro_right", "box", problem), torch.full((12,), 0.0031)
     only = LossWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     _, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, only, soft=False)
-    expected = by_torch(problem, x, radius, fine=False, activate=hard_contact).wrench_resistance
+    expected = by_torch(problem, x, radius, activate=hard_contact).wrench_resistance
     assert terms.wrench_resistance.tolist() == pytest.approx(expected.tolist(), rel=1e-4)
-    slope = gradient_of(problem, x, radius, only, fine=False, activate=hard_contact)
+    slope = gradient_of(problem, x, radius, only, activate=hard_contact)
     assert ((gradient - slope).norm(dim=-1) < 1e-3 * slope.norm(dim=-1).clamp_min(1.0)).all()
 
 
@@ -104,7 +104,7 @@ def test_every_build_gives_the_same_up_to_rounding(problem_of, rows_of, monkeypa
         if not builds.BUILDS[name] - builds._instructions():
             monkeypatch.setenv("GRASPD_KERNEL", name)
             assert builds.kernel().name == name
-            found[name] = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, fine=True)[0].tolist()
+            found[name] = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, **LOOKS[2])[0].tolist()
     assert len(found) > 1 or "v3" not in found
     for loss in found.values():
         assert loss == pytest.approx(found["baseline"], rel=1e-4)
@@ -123,7 +123,7 @@ def test_least_distance(problem_of, rows_of):
 def test_what_is_not_a_number_stays_with_its_row(problem_of, rows_of, bad, where):
     problem = problem_of("allegro_right", "crowded")
     x, radius, weights = rows_of("allegro_right", "crowded", problem), torch.full((12,), 0.003), WEIGHTS
-    clean = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, fine=True)
+    clean = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, **LOOKS[2])
     if where == "pose":
         x = x.clone()
         x[5, 0] = bad
@@ -136,14 +136,14 @@ def test_what_is_not_a_number_stays_with_its_row(problem_of, rows_of, bad, where
         broken = grid.field.clone()
         broken[0, 10, 10, 10] = bad
         problem = replace(problem, object=replace(problem.object, sdf=replace(grid, field=broken)))
-    loss, gradient, _ = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, fine=True)
+    loss, gradient, _ = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, **LOOKS[2])
     if where in ("pose", "radius"):
         others = torch.arange(12) != 5
         assert torch.equal(loss[others], clean[0][others])
         assert torch.equal(gradient[others], clean[1][others])
     # As in torch: a row that is not finite stands still, and says so by its loss.
     solver = ClosedForm(replace(ClosedFormConfig(), polish_weights=weights), 12)
-    expected = solver.value_and_gradient(problem, x, radius, DELTA, polish=True)[0]
+    expected = solver.value_and_gradient(problem, x, radius, DELTA, **LOOKS[2])[0]
     finite = loss.isfinite() & gradient.isfinite().all(-1)
     assert torch.equal(finite, expected.isfinite())
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from graspd_core.methods.closed_form.closed_form import ClosedForm
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, rows_kept
 from graspd_core.methods.closed_form.compiled_search import minimise_compiled
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.kernel_problem import kernel_problem
@@ -126,3 +126,12 @@ def test_what_a_hook_raises_passes_through(problem, starts):
 
     with pytest.raises(KeyboardInterrupt):
         search(problem, starts, config=LONG, stop=stop)
+
+
+def test_dropping_by_halves_and_sharp_refining_are_torchs(problem, starts):
+    config = ClosedFormConfig(explore_steps=3, refine_steps=1, polish_steps=1, drops=3, sharp_refining=True)
+    assert [rows_kept(config, 1, rows, index) for rows, index in ((8, 1), (4, 2), (2, 3), (1, 4))] == [4, 2, 1, 1]
+    mine = search(problem, starts, keep=2, config=config)
+    theirs = minimise(ClosedForm(config, 2), problem, starts, Hooks())
+    assert mine.loss.tolist() == pytest.approx(theirs.loss.tolist(), rel=0.02)
+    assert pack(mine.poses).numpy() == pytest.approx(pack(theirs.poses).numpy(), abs=1e-3)

@@ -84,10 +84,10 @@ def test_the_hard_solver_looks_no_farther_than_the_end_width(hand, scenes, probl
     config = replace(DEFAULT, activation="hard", weights=only_task)
     x = pack(replace(starts, translation=starts.translation + 0.2))
     radius = x.new_zeros(len(x))
-    hard = ClosedForm(config, 2).value_and_gradient(problem, x, radius, config.delta_end, polish=False)[1]
+    hard = ClosedForm(config, 2).value_and_gradient(problem, x, radius, config.delta_end, fine=False, sharp=False)[1]
     soft = ClosedForm(replace(config, activation="soft"), 2)
     assert hard.abs().max() == 0
-    assert soft.value_and_gradient(problem, x, radius, config.delta_start, polish=False)[1].abs().max() > 0
+    assert soft.value_and_gradient(problem, x, radius, config.delta_start, fine=False, sharp=False)[1].abs().max() > 0
 
 
 @pytest.mark.parametrize("preset", ["closed_form_hard_contact", "closed_form_no_coarse_to_fine"])

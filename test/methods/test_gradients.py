@@ -80,7 +80,7 @@ def random_poses(hand, scene, count: int, dtype: torch.dtype = torch.float64) ->
 
 
 def terms_at(problem, x: Tensor, fine: bool) -> Terms:
-    return evaluate(problem, x[:, :3], x[:, 3:7], x[:, 7:], x.new_full((len(x),), RADIUS), DELTA, fine=fine)
+    return evaluate(problem, x[:, :3], x[:, 3:7], x[:, 7:], x.new_full((len(x),), RADIUS), DELTA, fine=fine, sharp=fine)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,8 @@ p = draw_starts(scene, hand, 2, 0, "cpu", torch.float64)
 arguments = (problem, p.translation, p.quaternion, p.joints, torch.zeros(2, dtype=torch.float64), 0.004)
 traced = torch.compile(evaluate, backend="eager", fullgraph=True)
 for fine in (False, True):
-    for a, b in zip(traced(*arguments, fine=fine), evaluate(*arguments, fine=fine), strict=True):
+    look = {"fine": fine, "sharp": fine}
+    for a, b in zip(traced(*arguments, **look), evaluate(*arguments, **look), strict=True):
         torch.testing.assert_close(a, b)
 """
 

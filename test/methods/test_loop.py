@@ -102,7 +102,14 @@ def test_the_loss_is_that_of_the_poses_returned(problem, starts):
     p = solution.poses
     with torch.no_grad():
         terms = evaluate(
-            problem, p.translation, p.quaternion, p.joints, torch.zeros_like(solution.loss), CONFIG.delta_end, fine=True
+            problem,
+            p.translation,
+            p.quaternion,
+            p.joints,
+            torch.zeros_like(solution.loss),
+            CONFIG.delta_end,
+            fine=True,
+            sharp=True,
         )
     # Same numbers through the same code: rounding only.
     assert weighted(terms, CONFIG.polish_weights).tolist() == pytest.approx(solution.loss.tolist(), rel=1e-9)

@@ -106,7 +106,9 @@ def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, f
     x = pack(draw_starts(scenes["box"], hand, 6, 3, "cpu", DOUBLE))
 
     def term(y: torch.Tensor) -> torch.Tensor:
-        obstacle = evaluate(built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01, fine=fine).obstacle
+        obstacle = evaluate(
+            built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01, fine=fine, sharp=fine
+        ).obstacle
         assert obstacle is not None
         return obstacle
 

@@ -96,6 +96,7 @@ held = partial(Case, base=HOLDING, hand="parallel_gripper", count=1, verify="sta
 table = Case(scene="table")
 CASES = {
     "closed_form.keep_per_grasp": Case(1.0, (("closed_form.keep_per_grasp", 0.1),), count=10),
+    "closed_form.drops": Case(3, (("closed_form.keep_per_grasp", 0.1), ("closed_form.explore_steps", 6)), count=10),
     "closed_form.obstacle_factor": table,
     "problem.confidence_floor": table,
     "closed_form.weights.obstacle": table,

@@ -31,12 +31,12 @@ int32_t graspd_lanes() { return LANES; }
 
 // Loss, gradient (rows x variables) and unweighted terms (rows x 6) of every row of x.
 int32_t graspd_evaluate(const Problem* p, const Weights* weights, int32_t rows, const float* x, const float* radius,
-                        float delta, int32_t fine, int32_t soft, float* loss, float* gradient, float* terms,
+                        float delta, int32_t fine, int32_t sharp, int32_t soft, float* loss, float* gradient, float* terms,
                         int32_t threads) {
     return guarded([&] {
         const int variables = 7 + p->hand.joints;
         for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
-            Look look = {radius[row], delta, fine != 0, soft != 0};
+            Look look = {radius[row], delta, fine != 0, sharp != 0, soft != 0};
             loss[row] = evaluate(*p, *weights, x + row * variables, look, gradient + row * variables, s);
             memcpy(terms + TERMS * row, s.terms, sizeof s.terms);
         });

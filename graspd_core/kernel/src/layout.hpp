@@ -83,7 +83,7 @@ struct Problem {
     Obstacles obstacles;
     int32_t directions, task_points, feature_pairs;
     const float* direction;  // directions x 6
-    float friction, fine_reach;
+    float friction, sharp_reach;
 };
 
 // How the search steps (closed_form_config.py).
@@ -91,7 +91,7 @@ struct Schedule {
     Weights weights, polish_weights;
     float delta_start, delta_end, radius_start;
     float translation_rate, rotation_rate, joint_rate;
-    int32_t explore_steps, refine_steps, polish_steps, soft;
+    int32_t explore_steps, refine_steps, polish_steps, soft, sharp_refining;
 };
 
 // How a pregrasp is sought (config/grasp_stages_config.py).

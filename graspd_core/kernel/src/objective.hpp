@@ -6,10 +6,11 @@
 
 namespace graspd {
 
-// How one evaluation looks: padding and contact width [m], and the coarse or the fine set of points.
+// How one evaluation looks: padding and contact width [m]; all candidates; all sharp points, with a short reach; whether
+// contact fades over its width.
 struct Look {
     float radius, delta;
-    bool fine, soft;
+    bool fine, sharp, soft;
 };
 
 // The weighted loss at x; fills `gradient` (7 + joints) and s.terms (unweighted, in the order of `Weights`).
@@ -26,9 +27,9 @@ static float evaluate(const Problem& p, const Weights& w, const float* x, Look l
 
     float sunk = candidate_penetration(points.count, look.radius, w.penetration, at, s.key);
     find_gaps(hand, points, look.radius, s);
-    int features = look.fine ? p.object.feature_count : p.object.coarse_features;
+    int features = look.sharp ? p.object.feature_count : p.object.coarse_features;
     int pairs = sharp_points(p, features, w.penetration, &sunk, s);
-    float distance = touch(hand, look.fine ? p.fine_reach : 0.f, w.distance, s);
+    float distance = touch(hand, look.sharp ? p.sharp_reach : 0.f, w.distance, s);
     float resistance = wrench_resistance(p, points, look.radius, look.delta, look.soft, w.wrench_resistance, s);
 
     sample_adjoint(p.object.grid, points.count, at);

@@ -89,10 +89,10 @@ static void find_gaps(const Hand& hand, const Points& points, float radius, Scra
 }
 
 // Attraction of every group to the surface, saturating beyond its reach; its slope goes to who has the least distance.
-static float touch(const Hand& hand, float fine_reach, float weight, Scratch& s) {
+static float touch(const Hand& hand, float sharp_reach, float weight, Scratch& s) {
     float total = 0;
     for (int g = 0; g < hand.groups; g++) {
-        float size = fabsf(s.gap[g]), reach = fine_reach > 0 ? fine_reach : hand.reach[g];
+        float size = fabsf(s.gap[g]), reach = sharp_reach > 0 ? sharp_reach : hand.reach[g];
         float inverse = 1.f / (size + reach), slope = reach * inverse * reach * inverse;
         total += size * reach * inverse;
         float adjoint = weight * PER_CENTIMETRE / hand.groups * slope * (s.gap[g] < 0 ? -1.f : s.gap[g] > 0 ? 1.f : 0.f);

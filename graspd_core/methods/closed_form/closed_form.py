@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.methods.closed_form.adam import AdamState, adam_step, initial_state
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights, rows_kept
 from graspd_core.methods.closed_form.compiled_search import minimise_compiled
 from graspd_core.methods.kernel_problem import kernel_problem
 from graspd_core.methods.loop import minimise
@@ -61,14 +61,18 @@ class ClosedForm:
 
     def step(self, problem: Problem, state: AdamState, index: int) -> AdamState:
         config = self.config
-        if index == config.explore_steps and self.keep < len(state.x):
-            state = state[state.loss.argsort()[: self.keep]]
+        kept = rows_kept(config, self.keep, len(state.x), index)
+        if kept < len(state.x):
+            state = state[state.loss.argsort()[:kept]]
         remaining = max(0.0, 1.0 - index / max(config.explore_steps, 1))
         delta = config.delta_end * (config.delta_start / config.delta_end) ** remaining
         if config.activation == "hard":
             delta = config.delta_end
         polish = index >= config.explore_steps + config.refine_steps
-        loss, gradient = self.value_and_gradient(problem, state.x, state.radius * remaining, delta, polish)
+        sharp = polish or (config.sharp_refining and index >= config.explore_steps)
+        loss, gradient = self.value_and_gradient(
+            problem, state.x, state.radius * remaining, delta, fine=polish, sharp=sharp
+        )
         if polish or (config.polish_steps == 0 and remaining == 0.0):
             better = loss < state.best_loss
             state = replace(
@@ -90,7 +94,9 @@ class ClosedForm:
         x: Float[Tensor, "batch variables"],
         radius: Float[Tensor, "batch"],
         delta: float,
-        polish: bool,
+        *,
+        fine: bool,
+        sharp: bool,
     ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"]]:
         """Loss per start and its gradient; a start whose gradient is not finite stands still."""
         rows = len(x)
@@ -99,10 +105,9 @@ class ClosedForm:
         radius = torch.cat([radius, radius[:1].expand(short)])
         poses = moved_along(unpack(x), -problem.hand.pivot)
         activate = soft_contact if self.config.activation == "soft" else hard_contact
-        terms = evaluate(
-            problem, poses.translation, poses.quaternion, poses.joints, radius, delta, fine=polish, activate=activate
-        )
-        loss = weighted(terms, self.config.polish_weights if polish else self.config.weights)
+        looked = {"fine": fine, "sharp": sharp, "activate": activate}
+        terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, **looked)
+        loss = weighted(terms, self.config.polish_weights if sharp else self.config.weights)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         finite = torch.isfinite(gradient).all(-1) & torch.isfinite(loss)
         loss = torch.where(finite, loss.detach(), torch.full_like(loss, torch.inf))

@@ -38,6 +38,8 @@ class ClosedFormConfig:
         refine_steps: steps with those that are kept.
         polish_steps: last steps, with all candidates and the object's sharp points.
         keep_per_grasp: starts kept after exploring, for each grasp asked for.
+        drops: times that exploring drops starts, evenly spread, each time the same share of those left.
+        sharp_refining: whether refining already looks at all sharp points, with the weights of polishing.
         activation: whether contact fades over its width or, for the ablation, ends at `delta_end`.
         delta_start: width of the soft contact at the start [m].
         delta_end: width of the soft contact at the end [m].
@@ -56,6 +58,8 @@ class ClosedFormConfig:
     refine_steps: int = 80
     polish_steps: int = 50
     keep_per_grasp: float = 2.0
+    drops: int = 1
+    sharp_refining: bool = False
     activation: Literal["soft", "hard"] = "soft"
     delta_start: float = 0.02
     delta_end: float = 0.004
@@ -70,6 +74,15 @@ class ClosedFormConfig:
             wrench_resistance=6.0, distance=300.0, penetration=10.0, self_collision=100.0, obstacle=10.0
         )
     )
+
+
+def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> int:
+    """How many of so many rows go on before step `index`; `keep` are left when exploring ends."""
+    at = [round(settings.explore_steps * drop / settings.drops) for drop in range(1, settings.drops + 1)]
+    if index not in at or keep >= rows:
+        return rows
+    left = len(at) - at.index(index)
+    return round(rows * (keep / rows) ** (1 / left))
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from ctypes import byref
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -17,7 +18,7 @@ from torch import Tensor
 from graspd_core.kernel import structs
 from graspd_core.kernel.builds import call
 from graspd_core.methods.closed_form.adam import AdamState, initial_state
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights, rows_kept
 from graspd_core.methods.kernel_problem import KernelProblem
 from graspd_core.methods.loop import Hooks, Solution
 from graspd_core.methods.poses import Poses, moved_along, pack
@@ -32,6 +33,7 @@ def evaluate_compiled(
     weights: LossWeights,
     *,
     fine: bool = False,
+    sharp: bool = False,
     soft: bool = True,
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"], Terms]:
     """Weighted loss of every row, its gradient, and the terms; the rows are `AdamState.x`."""
@@ -39,7 +41,7 @@ def evaluate_compiled(
     loss, gradient, terms = torch.empty(len(x)), torch.empty_like(x), torch.empty(len(x), len(Terms._fields))
     given = byref(problem.struct), byref(structs.Weights(**asdict(weights))), len(x), x.data_ptr(), radius.data_ptr()
     found = loss.data_ptr(), gradient.data_ptr(), terms.data_ptr()
-    call("graspd_evaluate", *given, delta, fine, soft, *found, torch.get_num_threads())
+    call("graspd_evaluate", *given, delta, fine, sharp, soft, *found, torch.get_num_threads())
     return loss, gradient, Terms(*terms.T)
 
 
@@ -62,12 +64,14 @@ def minimise_compiled(
     """
     x = pack(moved_along(starts, problem.hand.pivot))
     state = initial_state(problem, starts, least_distance_compiled(compiled, x).clamp(0.0, config.radius_start))
-    explored, steps = config.explore_steps, config.explore_steps + config.refine_steps + config.polish_steps
+    steps = config.explore_steps + config.refine_steps + config.polish_steps
     follow = _Follow(hooks, steps)
-    _run_steps(compiled, config, state, (0, explored), follow)
-    if keep < len(x) and explored < steps:
-        state = state[state.loss.argsort(stable=True)[:keep]]
-    _run_steps(compiled, config, state, (explored, steps), follow)
+    drops = [index for index in range(1, steps) if rows_kept(config, keep, len(x), index) < len(x)]
+    for begin, end in pairwise([0, *drops, steps]):
+        kept = rows_kept(config, keep, len(state.x), begin)
+        if kept < len(state.x):
+            state = state[state.loss.argsort(stable=True)[:kept]]
+        _run_steps(compiled, config, state, (begin, end), follow)
     poses, loss = state.best()
     return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), follow.done, follow.interrupted)
 
@@ -109,7 +113,7 @@ def _run_steps(
     """The steps of a span, of every row of the state, in place; returns within milliseconds of an interruption."""
     begin, end = span
     rows = len(state.x)
-    if begin == end or rows == 0 or follow.look(begin, state.loss):
+    if rows == 0 or follow.interrupted or follow.look(begin, state.loss):
         return
     pointers = structs.State(**{name: getattr(state, name).data_ptr() for name in structs.names_of(structs.State)})
     arguments = byref(compiled.struct), byref(_schedule(config)), byref(pointers), rows, begin, end
