@@ -1,4 +1,4 @@
-"""Signed distance on a grid: built exactly at the nodes, sampled by trilinear interpolation.
+"""Signed distance on a grid: exact at the nodes near the surface, sampled by trilinear interpolation.
 
 Negative inside, metres. Gradient: autograd of `sample_sdf` gives the derivative of the interpolated distance, which
 jumps between cells; the returned normal is interpolated by itself from exact directions and is the smoother of the two.
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from graspd_core.mesh.surface_queries import closest_points, make_surface
+from graspd_core.mesh.surface_queries import Surface, closest_points, make_surface
 from graspd_core.mesh.topology import is_closed
 from graspd_core.mesh.winding_number import winding_inside
 from graspd_core.se3 import EPSILON, safe_norm
@@ -29,6 +29,11 @@ NEAR_SURFACE = 1e-3
 # by half a millimetre in the mean at 5 cm and by 1.3 at 8, by 10 and 20 at worst. Nothing touches there, and every cell
 # that is saved makes those at the surface finer.
 PADDING = 0.015
+
+# Nodes up to this many cells from the surface have the exact distance: all eight nodes of every cell that it crosses.
+BAND = 3**0.5
+# Nodes a side of a block, of which the middle one is exact; how often nodes look at their neighbours' closest points.
+_BLOCK, _SWEEPS = 3, 3
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,9 @@ def build_sdf(
     """Sample a mesh's signed distance on at most `resolution`³ nodes, laid out by `grid_layout`.
 
     The sign is the generalised winding number's, so open, overlapping, doubled and inverted surfaces are welcome; a
-    surface that encloses nothing has φ ≥ 0 everywhere (`is_solid` tells). Distances at the nodes are exact.
+    surface that encloses nothing has φ ≥ 0 everywhere (`is_solid` tells). Distances up to √3 cells (`BAND`) are exact.
+    Beyond, a node's direction is that to a point of the surface that is not always its closest: |φ| is never too small,
+    and too large by at most half a cell, by 0.03 in the mean (tested on the shapes; ten scans: 0.43 and 0.02).
 
     Args:
         resolution: nodes along each side of a cube; another object has as many in all, and the finer cells.
@@ -89,11 +96,11 @@ def build_sdf(
     # Queries are about the centre: Open3D counts in float32.
     centred = TriangleMesh(mesh.vertices - centre, mesh.faces)
     axes = [x + layout.spacing * np.arange(n) for x, n in zip(layout.origin - centre, layout.counts, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    closest, normals = closest_points(make_surface(centred), nodes.reshape(-1, 3))
-    offset = nodes - closest.reshape(nodes.shape)
-    inside = _inside(centred, nodes, np.linalg.norm(offset, axis=-1), layout.spacing)
-    field = _field(offset, normals.reshape(nodes.shape), inside, layout.spacing)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"))
+    closest, normals = _closest_to_nodes(make_surface(centred), nodes, layout.spacing)
+    offset = nodes - closest
+    inside = _inside(centred, nodes, _length(offset), layout.spacing)
+    field = _field(offset, normals, inside, layout.spacing)
     half = (np.array(layout.counts) - 1) * layout.spacing / 2
     return GridSDF(
         *(torch.as_tensor(x, dtype=dtype, device=device) for x in (field, layout.origin, layout.spacing, half))
@@ -146,43 +153,91 @@ def is_solid(sdf: GridSDF) -> bool:
     return bool((sdf.field[0] < 0).any())
 
 
+def _closest_to_nodes(
+    surface: Surface, nodes: Float[np.ndarray, "3 x y z"], spacing: float
+) -> tuple[Float[np.ndarray, "3 x y z"], Float[np.ndarray, "3 x y z"]]:
+    """Points of the surface, exactly the closest ones within `BAND`, and the normals of their faces, zero beyond it.
+
+    The middle node of each block is exact too. Its distance less the way to a node bounds the node's distance from
+    below, which tells what can lie in the band. The other nodes start with the point of their middle node.
+    """
+    counts = nodes.shape[1:]
+    middles = [np.minimum(np.arange(_BLOCK // 2, n + _BLOCK // 2, _BLOCK), n - 1) for n in counts]
+    middle_of = np.ix_(*(np.arange(n) // _BLOCK for n in counts))
+    lattice = nodes[:, *np.ix_(*middles)]
+    found, _ = closest_points(surface, lattice.reshape(3, -1).T)
+    found = found.T.reshape(lattice.shape)
+    bound = _length(lattice - found)[middle_of] - _length(nodes - lattice[:, *middle_of])
+    near = bound <= BAND * spacing
+    closest = found[:, *middle_of]
+    normals = np.zeros_like(closest)
+    exact, faces = closest_points(surface, nodes[:, near].T)
+    closest[:, near], normals[:, near] = exact.T, faces.T
+    squared = ((nodes - closest) ** 2).sum(0)
+    # Nothing is nearer than the exact points, not by rounding either.
+    squared[near] = 0.0
+    for _ in range(_SWEEPS):
+        _sweep(nodes, closest, squared)
+    return closest, normals
+
+
+def _sweep(
+    nodes: Float[np.ndarray, "3 x y z"], closest: Float[np.ndarray, "3 x y z"], squared: Float[np.ndarray, "x y z"]
+) -> None:
+    """Give each node, in place, the point of its neighbour where that is nearer to it, along each axis and back."""
+    for axis in range(3):
+        # Views with this axis first: what is written to them is written to the arrays.
+        at, to, best = np.moveaxis(nodes, axis + 1, 1), np.moveaxis(closest, axis + 1, 1), np.moveaxis(squared, axis, 0)
+        for here, there in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
+            offered = to[:, there]
+            distance = ((at[:, here] - offered) ** 2).sum(0)
+            nearer = distance < best[here]
+            # `offered` and the target overlap: fancy indexing copies what is read before anything is written.
+            to[:, here][:, nearer] = offered[:, nearer]
+            best[here][nearer] = distance[nearer]
+
+
 def _inside(
-    mesh: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], distance: Float[np.ndarray, "x y z"], spacing: float
+    mesh: TriangleMesh, nodes: Float[np.ndarray, "3 x y z"], distance: Float[np.ndarray, "x y z"], spacing: float
 ) -> Bool[np.ndarray, "x y z"]:
     """The nodes' side of the surface.
 
     Around a closed surface the winding number is constant wherever one can walk without crossing it, and two
     neighbouring nodes that are both half a cell away have none of it between them: one question answers for each such
-    region. Through the holes of an open surface the number changes in mid-air, so every node is asked.
+    region. So near, distances are exact. Through the holes of an open surface the number changes in mid-air, so every
+    node is asked.
     """
     from scipy.ndimage import label
 
     if not is_closed(mesh):
-        return winding_inside(mesh, nodes.reshape(-1, 3)).reshape(distance.shape)
+        return winding_inside(mesh, nodes.reshape(3, -1).T).reshape(distance.shape)
     labelled: Any = label(distance > 0.51 * spacing)
     region, regions = labelled
     asked = region == 0
     _, first = np.unique(region, return_index=True)
     asked.ravel()[first] = True
     inside = np.zeros(distance.shape, dtype=bool)
-    inside[asked] = winding_inside(mesh, nodes[asked])
+    inside[asked] = winding_inside(mesh, nodes[:, asked].T)
     answers = np.zeros(regions + 1, dtype=bool)
     answers[region.ravel()[first]] = inside.ravel()[first]
     return np.where(region > 0, answers[region], inside)
 
 
 def _field(
-    offset: Float[np.ndarray, "x y z 3"],
-    normals: Float[np.ndarray, "x y z 3"],
+    offset: Float[np.ndarray, "3 x y z"],
+    normals: Float[np.ndarray, "3 x y z"],
     inside: Bool[np.ndarray, "x y z"],
     spacing: float,
 ) -> Float[np.ndarray, "4 x y z"]:
     """φ and its unit gradient (x − c)/φ; on the surface the gradient is the face's normal, turned outwards."""
-    distance = np.linalg.norm(offset, axis=-1)
+    distance = _length(offset)
     phi = np.where(inside, -distance, distance)
     far = distance > NEAR_SURFACE * spacing
-    direction = offset / np.where(far, phi, 1.0)[..., None]
-    # An inverted mesh shows in its far nodes: there the face's normal points against the direction.
-    agree = np.sign((direction * normals).sum(-1)[far].sum()) or 1.0
-    gradient = np.where(far[..., None], direction, agree * normals)
-    return np.moveaxis(np.concatenate([phi[..., None], gradient], -1), -1, 0)
+    direction = offset / np.where(far, phi, 1.0)
+    # An inverted mesh shows beside its surface: there the face's normal points against the direction.
+    agree = np.sign((direction * normals).sum(0)[far].sum()) or 1.0
+    return np.concatenate([phi[None], np.where(far, direction, agree * normals)])
+
+
+def _length(vectors: Float[np.ndarray, "3 *grid"]) -> Float[np.ndarray, "*grid"]:
+    return np.sqrt((vectors**2).sum(0))

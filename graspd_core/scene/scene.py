@@ -167,8 +167,8 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
     near, far = near_object(model)
 
     def build() -> cache.Arrays:
-        # A second or two of Python's own work, beside the optimiser.
-        parts = run_isolated(convex_parts, near.mesh)
+        # Some tenths of a second of Python's own work, beside the optimiser.
+        parts = run_isolated(convex_parts, near.mesh, object_sdf(near))
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
     def valid(arrays: cache.Arrays) -> bool:

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.hands.primitive_sdf import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+from graspd_core.mesh import sdf as sdf_module
 from graspd_core.mesh.mesh_files import check_mesh
-from graspd_core.mesh.sdf import PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf
+from graspd_core.mesh.sdf import BAND, PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf
 from graspd_core.mesh.shapes import (
     BOX_HALF,
     CAPSULE_HALF,
@@ -20,9 +21,12 @@ from graspd_core.mesh.shapes import (
     MUG_RADIUS,
     MUG_WALL,
     PLATE_HALF,
+    SHAPES,
     SPHERE_RADIUS,
     make_shape,
 )
+from graspd_core.mesh.surface_queries import closest_points, make_surface
+from graspd_core.mesh.winding_number import winding_inside
 from graspd_core.se3 import random_rotations
 from graspd_core.types import TriangleMesh
 
@@ -62,6 +66,46 @@ def test_grid_is_the_exact_distance_to_a_fraction_of_a_cell(name, seed):
     assert (found - exact).abs().max() < 0.87 * sdf.spacing
     assert (found - exact).abs().mean() < 0.06 * sdf.spacing
     assert torch.allclose(normal.norm(dim=-1), torch.ones_like(exact), atol=1e-6)
+
+
+def open_mug() -> TriangleMesh:
+    mug = make_shape("mug")
+    bottom = mug.vertices[mug.faces][:, :, 2].max(1) < mug.vertices[:, 2].min() + 1e-6
+    return TriangleMesh(mug.vertices, mug.faces[~bottom])
+
+
+@pytest.mark.parametrize("resolution", [9, 30, 48])
+@pytest.mark.parametrize("name", [*SHAPES, "open mug"])
+def test_nodes_are_exact_near_the_surface_and_off_by_half_a_cell_at_most(name, resolution):
+    mesh = open_mug() if name == "open mug" else make_shape(name)
+    sdf = build_sdf(mesh, resolution=resolution, dtype=torch.float64)
+    counts, cell = sdf.field.shape[1:], float(sdf.spacing)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), -1).reshape(-1, 3)
+    nodes = sdf.origin.numpy() + cell * index
+    closest, _ = closest_points(make_surface(mesh), nodes)
+    exact = np.linalg.norm(nodes - closest, axis=1)
+    found = sdf.field[0].numpy().ravel()
+    assert ((found < 0) == (winding_inside(mesh, nodes) & (exact > 0))).all()
+    # Open3D counts in float32 about the centre: 1e-7 m.
+    error = np.abs(found) - exact
+    assert np.abs(error[exact <= BAND * cell]).max() < 1e-7
+    assert error.min() > -1e-7
+    assert error.max() < 0.5 * cell
+    assert error.mean() < 0.03 * cell
+
+
+def test_few_nodes_are_searched_for_exactly(monkeypatch):
+    asked = 0
+
+    def counted(surface, points):
+        nonlocal asked
+        asked += len(points)
+        return closest_points(surface, points)
+
+    monkeypatch.setattr(sdf_module, "closest_points", counted)
+    sdf = build_sdf(make_shape("torus"))
+    # One in 27, and those of the band.
+    assert asked < 0.3 * sdf.field[0].numel()
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -151,9 +195,7 @@ def test_the_mug_is_hollow_and_its_handle_is_joined():
 
 
 def test_mug_without_its_bottom_cap_stays_hollow():
-    mug = make_shape("mug")
-    bottom = mug.vertices[mug.faces][:, :, 2].max(1) < mug.vertices[:, 2].min() + 1e-6
-    sdf = build_sdf(TriangleMesh(mug.vertices, mug.faces[~bottom]), resolution=64)
+    sdf = build_sdf(open_mug(), resolution=64)
     found = phi(sdf, [(0, 0, 0.02), (0, MUG_RADIUS - MUG_WALL / 2, 0)])
     assert found[0] > 0.02
     assert found[1] < 0

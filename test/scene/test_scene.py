@@ -120,6 +120,12 @@ def test_an_unwritable_disk_is_done_without(tmp_path, monkeypatch):
     assert sample_sdf(load_scene("shape:torus", resolution=16).sdf, torch.zeros(1, 3))[0] > 0
 
 
+def test_parts_are_made_by_the_grid_of_the_scene(monkeypatch):
+    thing = load_scene("shape:l_block").object
+    monkeypatch.setattr("graspd_core.mesh.sdf.closest_points", lambda *_: pytest.fail("built another grid"))
+    assert len(object_parts(thing)) == 2
+
+
 def test_parts_are_remembered():
     thing = load_scene("shape:l_block", resolution=16).object
     parts = object_parts(thing)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from graspd_core.mesh.convex_parts import convex_parts
+from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import MUG_HALF, MUG_WALL, make_shape
 from graspd_core.trials.hold_trial import DIRECTIONS, start_penetration
 from graspd_core.trials.world import PROTOCOLS, World, at_friction, build_world
@@ -94,7 +95,7 @@ def test_a_squeeze_presses_with_the_actuators_force(world):
 
 def test_a_finger_fits_into_the_hollow_of_a_mug(gripper, cube):
     mug = replace(cube, mesh=make_shape("mug"))
-    parts = convex_parts(mug.mesh)
+    parts = convex_parts(mug.mesh, build_sdf(mug.mesh))
     assert len(parts) > 1
     world = build_world(gripper, mug, parts, STANDARD)
     # Fingers side by side within the cup (30 mm wide, both 20 mm thick together, inner radius 36 mm), upside down, so
