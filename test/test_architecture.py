@@ -41,10 +41,6 @@ METAPHORS = set(
         "trust",
     ]
 )
-# Functions beyond that which are still to be split; the list may only shrink.
-STILL_TO_SPLIT = {
-    "graspd_core/hands/default_postures.py: _around_ball",
-}
 
 BASE = {"types", "errors", "se3", "config", "paths", "runtime"}
 PERCEPTION = BASE | {"mesh", "pointcloud", "segmentation", "reconstruction", "scene"}
@@ -233,8 +229,7 @@ def test_functions_stay_small():
     large = {
         k: v for path in sources() for k, v in large_functions(str(path.relative_to(ROOT)), path.read_text()).items()
     }
-    assert {name: large[name] for name in sorted(set(large) - STILL_TO_SPLIT)} == {}
-    assert STILL_TO_SPLIT - set(large) == set(), "split by now: take them off the list"
+    assert large == {}
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,8 @@ from graspd_core.hands.primitive_surface import surface_points
 _ALIKE = 0.42
 # Directions within this cosine of each other are the same; a thumb's are not those of the fingers.
 _SAME_WAY = 0.7
+# From this cosine to the normal of a plane on, a finger stands up from it.
+_UPRIGHT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,10 @@ def find_fingers(hand: HandModel) -> Fingers:
         roots.append(root)
     links, tips = np.array([chain[0] for chain in chains]), np.array(points)
     local = np.einsum("tji,tj->ti", rotations[links], tips - translations[links])
-    mates, bend = _mates(hand, local, links, units(tips - np.array(roots), 1e-6), wrist)
+    straight = units(tips - np.array(roots), 1e-6)
+    mates, bend = _mates(hand, local, links, straight, wrist)
+    if mates.sum() == 2 and len(mates) == 3 and _stand_up(np.array(roots), straight[mates]):
+        mates, bend = np.zeros(3, dtype=bool), np.zeros(3)
     return Fingers(local, links, np.array(roots), tips, palm, np.array(wrist, dtype=int), mates, bend)
 
 
@@ -124,9 +129,19 @@ def _mates(
     sweep = units(point_jacobian(hand, q, points, links) @ travel, 5e-4)
     alike = (sweep @ sweep.T > _SAME_WAY) & (straight @ straight.T > _SAME_WAY)
     mates = alike[alike.sum(1).argmax()]
-    if np.linalg.norm(sweep.mean(0)) <= _ALIKE or (len(points) > 1 and mates.sum() <= max(1, len(points) / 2)):
+    few = mates.sum() <= (max(1, len(points) / 2) if len(points) > 1 else 0)
+    if few or np.linalg.norm(sweep.mean(0)) <= _ALIKE:
         return np.zeros(len(points), dtype=bool), np.zeros(3)
     return mates, units(sweep[mates].mean(0), 0.0)
+
+
+def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
+    """Whether two fingers stand on the plane of all three's roots, as a gripper's against its third.
+
+    A human-like hand's lie in it: those two with a thumb.
+    """
+    across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
+    return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 
 
 def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
@@ -156,6 +171,13 @@ def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:
 def straight_joints(hand: HandModel) -> Float[np.ndarray, "joints"]:
     """Joints at zero, or as near as they come."""
     return np.clip(0.0, hand.lower, hand.upper)
+
+
+def middle_joints(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "joints"]:
+    """Joints at mid-range, those that carry the palm straight."""
+    middle = 0.5 * (hand.lower + hand.upper)
+    middle[fingers.wrist] = straight_joints(hand)[fingers.wrist]
+    return middle
 
 
 def units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
