@@ -89,8 +89,9 @@ class TrialResult:
     Attributes:
         name: of the trial.
         passed: whether the object stayed within the limits.
-        displacement: greatest travel of the object's centre of mass from where the hand should have had it [m].
-        rotation: greatest turn of the object from its start [rad].
+        displacement: greatest travel of the object's centre of mass from where the hand should have had it [m], until
+            the trial ended: it ends when the answer is known, unless the full length was asked for.
+        rotation: greatest turn of the object from its start [rad], likewise.
         reason: why the trial failed, empty when it passed.
     """
 

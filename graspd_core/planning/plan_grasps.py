@@ -47,8 +47,8 @@ def plan_grasps(
         hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
         count, seed: verified grasps wanted; same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
-        verify: physics of the trials, "standard" or "hard", or "none"; a grasp is verified when it passes every trial
-            that applies to the scene.
+        verify: the trials, "standard" or "hard", "full" or "hard_full" for their full length, or "none"; a grasp is
+            verified when it passes every trial that applies to the scene.
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
         progress: called from this thread with `Progress` values.

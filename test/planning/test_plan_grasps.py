@@ -216,7 +216,7 @@ def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkey
         ({"count": 0}, "count: 0"),
         ({"count": 2000}, "1 to 1024"),
         ({"seed": -1}, "seed: -1"),
-        ({"verify": "maybe"}, "'maybe'; valid: standard, hard, none"),
+        ({"verify": "maybe"}, "'maybe'; valid: standard, hard, full, hard_full, none"),
         ({"deadline": -1.0}, "deadline: -1.0"),
         ({"deadline": float("nan")}, "deadline: nan"),
         ({"device": "abacus"}, "'abacus'; valid on this machine: cpu"),
