@@ -9,6 +9,7 @@ frozen, and 0.15 s are over before a slow slip shows. Same hand, object and phys
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.scene.far_objects import moved_grasp
-from graspd_core.trials.early_stop import CHECK_EVERY
-from graspd_core.trials.hold_trial import DIRECTIONS, close_hand, diverged
+from graspd_core.trials.early_stop import CHECK_EVERY, CREEPING, ObjectState
+from graspd_core.trials.hold_trial import DIRECTIONS, close_hand, diverged, moved, object_state
 from graspd_core.trials.world import Protocol, World, trial_data
 from graspd_core.types import Grasp
 
@@ -60,21 +61,27 @@ def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool])
     """Simulate 2 s, or until the displacement is known or the object lost; returns the displacement then [m]."""
     import mujoco
 
-    checks, centers = round(DURATION / protocol.timestep / CHECK_EVERY), [world.center_of_mass]
+    checks, states = round(DURATION / protocol.timestep / CHECK_EVERY), list[ObjectState]()
+    travel = 0.0
     for _ in range(checks):
         if stop():
             break
         mujoco.mj_step(world.model, data, CHECK_EVERY)
-        centers.append(data.xipos[world.object_body].copy())
-        if diverged(data) or not np.linalg.norm(centers[-1] - world.center_of_mass) < LOST:
+        states.append(object_state(world, data))
+        travel = moved(world, states[-1])[0]
+        if diverged(data) or not travel < LOST:
             return LOST
-        if len(centers) > 2 * _WINDOW + 1 and not protocol.full_length:
-            end, before = (_end(centers[: len(centers) - back], checks) for back in (0, _WINDOW))
-            if _SAFETY * np.linalg.norm(end - before) < TOLERANCE:
-                return min(float(np.linalg.norm(end - world.center_of_mass)), LOST)
-    return float(np.linalg.norm(centers[-1] - world.center_of_mass))
+        if not protocol.full_length and (end := _end(states, checks)) is not None:
+            return min(math.dist(end, world.center_of_mass), LOST)
+    return travel
 
 
-def _end(centers: list[Float[np.ndarray, "3"]], checks: int) -> Float[np.ndarray, "3"]:
-    """Where the centre of mass will be at the end if it goes on as in the last window; soft contacts creep evenly."""
-    return centers[-1] + (centers[-1] - centers[-1 - _WINDOW]) * (checks + 1 - len(centers)) / _WINDOW
+def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | None:
+    """Where the centre of mass will be at the end, as soft contacts creep evenly; None where that is not known."""
+    recent = states[-2 * _WINDOW - 1 :]
+    if len(recent) <= 2 * _WINDOW or not all(s.speed < CREEPING.speed and s.spin < CREEPING.spin for s in recent):
+        return None
+    first, middle, last = (np.asarray(state.center) for state in (recent[0], recent[_WINDOW], recent[-1]))
+    left = (checks - len(states)) / _WINDOW
+    end, before = last + left * (last - middle), middle + (left + 1) * (middle - first)
+    return end if _SAFETY * np.linalg.norm(end - before) < TOLERANCE else None

@@ -11,6 +11,7 @@ answer is known (`early_stop`), unless the protocol asks for the full length.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -20,9 +21,8 @@ from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.trials.early_stop import (
     CHECK_EVERY,
     LOOK_EVERY,
-    ObjectPose,
+    ObjectState,
     answer_known,
-    drift,
     stop_rule,
 )
 from graspd_core.trials.world import Protocol, World, trial_data
@@ -88,7 +88,9 @@ def step_until_known(
     """
     import mujoco
 
-    rule, done, poses = stop_rule(protocol), 0, {}
+    rule, done = stop_rule(protocol), 0
+    looks = 1 + rule.window // LOOK_EVERY if rule else 0
+    recent = deque[ObjectState](maxlen=looks)
     while done < steps:
         if done % CHECK_EVERY == 0 and stop():
             return STOPPED
@@ -101,25 +103,29 @@ def step_until_known(
             return reason
         if rule is None:
             continue
-        now = poses[done] = object_pose(world, data)
-        before = poses.get(done - rule.window)
-        if done >= rule.first and before is not None:
-            ahead = drift(rule, before, now, steps - done)
-            if answer_known(protocol, *moved(world, now), ahead):
-                return breach(world, data, protocol, worst)
+        recent.append(object_state(world, data))
+        ripe = done >= rule.first and len(recent) == looks
+        if ripe and answer_known(rule, protocol, recent, moved(world, recent[-1]), steps - done):
+            return breach(world, data, protocol, worst)
     return ""
 
 
-def object_pose(world: World, data: Any) -> ObjectPose:
-    """Where the object is."""
+def object_state(world: World, data: Any) -> ObjectState:
+    """Where the object is, and how fast."""
     turn = world.object_address + 3
-    return ObjectPose(tuple(data.xipos[world.object_body].tolist()), tuple(data.qpos[turn : turn + 4].tolist()))
+    x, y, z, *spin = data.qvel[world.object_velocity : world.object_velocity + 6].tolist()
+    return ObjectState(
+        center=tuple(data.xipos[world.object_body].tolist()),
+        quaternion_wxyz=tuple(data.qpos[turn : turn + 4].tolist()),
+        speed=math.hypot(x, y, z),
+        spin=math.hypot(*spin),
+    )
 
 
-def moved(world: World, pose: ObjectPose) -> tuple[float, float]:
+def moved(world: World, state: ObjectState) -> tuple[float, float]:
     """Travel [m] of the object's centre of mass, and the object's turn [rad], from the start of the trial."""
-    w, x, y, z = pose.quaternion_wxyz
-    return math.dist(pose.center, world.center_of_mass), 2 * math.atan2(math.hypot(x, y, z), abs(w))
+    w, x, y, z = state.quaternion_wxyz
+    return math.dist(state.center, world.center_of_mass), 2 * math.atan2(math.hypot(x, y, z), abs(w))
 
 
 def close_hand(
@@ -220,7 +226,7 @@ def diverged(data: Any) -> bool:
 
 def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
     """Update the worst travel and turn; name the limit that is broken, if any."""
-    travel, turn = moved(world, object_pose(world, data))
+    travel, turn = moved(world, object_state(world, data))
     if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
         worst[:] = np.inf
         return "the simulation diverged"

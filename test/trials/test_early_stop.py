@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -25,9 +26,9 @@ from graspd_core.trials.early_stop import (
     CREEPING,
     FIRM,
     LOOK_EVERY,
-    ObjectPose,
+    SLIPPERY,
+    ObjectState,
     answer_known,
-    drift,
     stop_rule,
 )
 from graspd_core.trials.gravity_trial import TOLERANCE, gravity_trial
@@ -64,43 +65,58 @@ def steps(monkeypatch) -> list[int]:
 
 def test_rules_follow_from_friction():
     assert stop_rule(PROTOCOLS["standard"]) is FIRM
-    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.3)) is FIRM
+    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.3)) is SLIPPERY
     assert stop_rule(at_friction(PROTOCOLS["standard"], 0.1)) is CREEPING
     assert stop_rule(PROTOCOLS["hard"]) is CREEPING
     assert stop_rule(PROTOCOLS["full"]) is stop_rule(PROTOCOLS["hard_full"]) is None
-    for rule in (FIRM, CREEPING):
+    for rule in (FIRM, SLIPPERY, CREEPING):
         assert not any(number % LOOK_EVERY for number in (rule.first, rule.window, CHECK_EVERY))
         assert rule.first > rule.window
 
 
-@given(speed=st.floats(0.01, 10.0), done=st.integers(0, 499), spin=st.floats(0.0, 10.0))
+SLOW = replace(PROTOCOLS["standard"], max_displacement=0.005, max_rotation=math.radians(5))
+
+
+@given(speed=st.floats(0.01, 10.0), done=st.integers(0, 490), spin=st.floats(0.0, 10.0))
 def test_what_moves_evenly_to_a_limit_is_never_known_to_hold(speed, done, spin):
-    # Speeds as shares of the limits over 500 steps.
-    protocol, rule = PROTOCOLS["standard"], FIRM
+    # Speeds as shares of the limits over 500 steps of 4 ms; the limits are such that all but the fastest are at rest.
+    ends, rule = (speed * SLOW.max_displacement, spin * SLOW.max_rotation), FIRM
 
-    def pose(step: int) -> ObjectPose:
-        half = spin * protocol.max_rotation * step / 500 / 2
-        return ObjectPose(
-            (speed * protocol.max_displacement * step / 500, 0.0, 0.0), (np.cos(half), 0.0, np.sin(half), 0.0)
-        )
+    def state(step: int) -> ObjectState:
+        travel, turn = (end * step / 500 for end in ends)
+        turned = (math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0)
+        return ObjectState((travel, 0.0, 0.0), turned, ends[0] / 2, ends[1] / 2)
 
-    now = pose(done + rule.window)
-    turn, travel = spin * protocol.max_rotation * (done + rule.window) / 500, now.center[0]
-    known = answer_known(protocol, travel, turn, drift(rule, pose(done), now, 500 - done - rule.window))
+    now = done + rule.window
+    states = [state(step) for step in range(done, now + 1, LOOK_EVERY)]
+    known = answer_known(rule, SLOW, states, (ends[0] * now / 500, ends[1] * now / 500), 500 - now)
     if speed >= 1 or spin >= 1:
         assert not known
-    elif max(speed, spin) * rule.safety < 0.99 and done + rule.window <= 500:
+    elif max(speed, spin) * rule.safety < 0.99:
         assert known
+
+
+REST = ObjectState((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0, 0.0)
+
+
+def test_what_jitters_on_the_spot_is_not_at_rest():
+    # Contacts that throw the object to and fro sooner or later throw it out.
+    assert answer_known(FIRM, STANDARD, [REST, REST, REST], (0.0, 0.0), 400)
+    assert not answer_known(FIRM, STANDARD, [REST, replace(REST, speed=0.006), REST], (0.0, 0.0), 400)
+    assert not answer_known(FIRM, STANDARD, [REST, replace(REST, spin=0.09), REST], (0.0, 0.0), 400)
+    assert not answer_known(SLIPPERY, STANDARD, [REST, REST, replace(REST, speed=0.003)], (0.0, 0.0), 400)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_never_known(bad):
-    still = ObjectPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    lost = ObjectPose((bad, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    assert answer_known(STANDARD, 0.0, 0.0, drift(FIRM, still, still, 100))
-    assert not answer_known(STANDARD, 0.0, 0.0, drift(FIRM, still, lost, 100))
-    assert not answer_known(STANDARD, bad, 0.0, (0.0, 0.0))
-    assert not answer_known(STANDARD, 0.0, bad, (0.0, 0.0))
+    for lost in (
+        replace(REST, center=(bad, 0.0, 0.0)),
+        replace(REST, speed=bad),
+        replace(REST, spin=bad),
+    ):
+        assert not answer_known(FIRM, STANDARD, [REST, lost], (0.0, 0.0), 100)
+    assert not answer_known(FIRM, STANDARD, [REST, REST], (bad, 0.0), 100)
+    assert not answer_known(FIRM, STANDARD, [REST, REST], (0.0, bad), 100)
 
 
 @pytest.mark.parametrize("protocol", [STANDARD, at_friction(STANDARD, 0.3), HARD], ids=["standard", "slippery", "hard"])
@@ -128,21 +144,19 @@ def test_a_firm_grasp_takes_a_fraction_of_the_steps(gripper, cube, closing, step
     assert 200 + 6 * FIRM.first <= sum(steps) <= long / 5
 
 
-@pytest.mark.parametrize(("speed", "held"), [(0.02, True), (0.027, False)])
+@pytest.mark.parametrize(("speed", "held"), [(0.002, True), (0.0027, False)])
 def test_a_slow_creep_that_breaks_a_limit_late_is_not_verified(speed, held, gripper, cube, closing):
-    # In honey an object that nothing holds drifts evenly: 4 cm in 2 s, or 5 cm after 1.85 s.
+    # In a fluid thicker than honey an object that nothing holds drifts evenly: 4 mm in 2 s, or 5 mm after 1.85 s.
     world = build_world(gripper, cube, (cube.mesh,), STANDARD)
-    world.model.opt.viscosity = 1.0
-    adrift, by_one = closing(0.0, 0.0, (0.0, 0.0), height=FAR), STANDARD.pull * cube.mass
-    reached = hold_trial(world, adrift, replace(full(STANDARD), hold_time=0.4, max_displacement=1.0)).displacement
-    world.model.opt.viscosity = 0.0
-    assert reached > 0.1  # free, it falls 80 cm in that time; honey slows it
-    world.model.opt.viscosity = by_one / (3 * np.pi * 0.04 * speed)
-    late, early = (hold_trial(world, adrift, protocol) for protocol in (full(STANDARD), STANDARD))
+    world.model.opt.viscosity = STANDARD.pull * cube.mass / (3 * np.pi * 0.04 * speed)
+    adrift, protocol = closing(0.0, 0.0, (0.0, 0.0), height=FAR), replace(STANDARD, max_displacement=0.005)
+    late, early = (hold_trial(world, adrift, p) for p in (full(protocol), protocol))
     assert late.passed == early.passed == held
     if not held:
         assert early == late
-        assert hold_trial(world, adrift, replace(full(STANDARD), hold_time=1.7)).passed
+        # Most of the way it is within the limit, and slower than what is called at rest.
+        assert hold_trial(world, adrift, replace(full(protocol), hold_time=1.7)).passed
+        assert speed < FIRM.speed
 
 
 # Too far below for any hand that holds the object, which rests on a plane of its own.
