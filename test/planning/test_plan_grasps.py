@@ -62,12 +62,10 @@ def test_the_full_length_gives_the_verdicts_of_the_usual_trials_and_is_not_audit
     monkeypatch.setattr(audit, "AUDITED", 1)
     full = plan_grasps(scene, hand, count=2, seed=3, preset="fast", verify="full")
     early = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
-    assert [(g.score, g.verdict, g.reason) for g in full.grasps] == [
-        (g.score, g.verdict, g.reason) for g in early.grasps
-    ]
-    assert all(
-        a.trials[0].displacement >= b.trials[0].displacement for a, b in zip(full.grasps, early.grasps, strict=True)
-    )
+    late, soon = ([(g.score, g.verdict, g.reason) for g in run.grasps] for run in (full, early))
+    assert late == soon
+    holds = [(a.trials[0], b.trials[0]) for a, b in zip(full.grasps, early.grasps, strict=True)]
+    assert all(a.displacement >= b.displacement for a, b in holds)
     assert [grasp.trials for grasp in early.grasps] == [grasp.trials for grasp in result.grasps]
     assert (full.audits, early.audits) == (AuditCount(0, 0), AuditCount(2, 0))
 
