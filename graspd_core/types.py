@@ -89,8 +89,9 @@ class TrialResult:
     Attributes:
         name: of the trial.
         passed: whether the object stayed within the limits.
-        displacement: greatest travel of the object's centre of mass from where the hand should have had it [m].
-        rotation: greatest turn of the object from its start [rad].
+        displacement: greatest travel of the object's centre of mass from where the hand should have had it [m], until
+            the trial ended: it ends when the answer is known, unless the full length was asked for.
+        rotation: greatest turn of the object from its start [rad], likewise.
         reason: why the trial failed, empty when it passed.
     """
 
@@ -212,10 +213,21 @@ class Timing:
 
 
 @dataclass(frozen=True)
+class AuditCount:
+    """How many verified grasps were tried once more at full length, and how many of them failed there."""
+
+    audited: int = 0
+    disagreed: int = 0
+
+    def __add__(self, other: AuditCount) -> AuditCount:
+        return AuditCount(self.audited + other.audited, self.disagreed + other.disagreed)
+
+
+@dataclass(frozen=True)
 class GraspResult:
     """What a run gives back: an outcome, always, and the grasps in rank order, verified ones first.
 
-    `support` is what the object stood on, None where it floated.
+    `support` is what the object stood on, None where it floated. `audits` counts checks of trials that stop early.
     """
 
     outcome: Outcome
@@ -226,3 +238,4 @@ class GraspResult:
     message: str = ""
     warnings: tuple[str, ...] = field(default=())
     support: Plane | None = None
+    audits: AuditCount = AuditCount()

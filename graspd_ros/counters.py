@@ -50,6 +50,8 @@ class Counters:
     def planned(self, result: GraspResult, latency: float) -> None:
         """A run ended `latency` seconds after its request came."""
         with self._lock:
+            self._counts["audited"] += result.audits.audited
+            self._counts["audits_disagreed"] += result.audits.disagreed
             self._last |= {"last_latency": latency, "last_first_verified": result.timing.first_verified}
 
     def clear(self) -> None:

@@ -26,6 +26,8 @@ class Health:
         accepted, succeeded, partial, failed, cancelled, superseded, refused: requests since the start, by their end.
         verified: grasps since the start that held in the trial.
         rejected: grasps since the start that did not.
+        audited: verified grasps since the start that were tried once more at full length.
+        audits_disagreed: those of them that failed there.
         failed_in_a_row: requests that failed since the last that did not.
         last_latency: seconds from the last answered request to its answer, None before the first.
         last_first_verified: seconds from that request to its first verified grasp, None where there was none.
@@ -51,6 +53,8 @@ class Health:
     refused: int = 0
     verified: int = 0
     rejected: int = 0
+    audited: int = 0
+    audits_disagreed: int = 0
     failed_in_a_row: int = 0
     last_latency: float | None = None
     last_first_verified: float | None = None
@@ -133,6 +137,8 @@ def _values(health: Health, memory: int) -> dict[str, str]:
         "requests refused": str(health.refused),
         "grasps verified": str(health.verified),
         "grasps failed": str(health.rejected),
+        "grasps audited": str(health.audited),
+        "audits that disagreed": str(health.audits_disagreed),
         "last error": health.last_error,
         "clouds received": str(health.clouds_received),
         "clouds superseded": str(health.clouds_superseded),

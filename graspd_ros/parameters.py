@@ -73,7 +73,11 @@ class Settings:
     hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
     device: str = _setting("cpu", "torch device of the optimiser", check=_check_device, read_only=True)
     torch_threads: int = _setting(
-        1, "threads of the optimiser; more than 1 costs time on a shared machine", low=1, high=64, read_only=True
+        1,
+        "threads of the optimiser and the trials; more than 1 costs time on a shared machine",
+        low=1,
+        high=64,
+        read_only=True,
     )
     queue_size: int = _setting(4, "requests that may wait", low=0, high=64, read_only=True)
     busy_policy: str = _setting("queue", "what a request does while the node is busy", choices=BusyPolicy)

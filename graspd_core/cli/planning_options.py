@@ -33,7 +33,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
     parser.add_argument("--robust", action="store_true", help="grasps that hold out of place too come first")
     parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
-    parser.add_argument("--threads", type=int, default=1, help="torch threads (default 1)")
+    parser.add_argument("--threads", type=int, default=1, help="of the optimiser and the trials (default 1)")
 
 
 def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:

@@ -28,5 +28,5 @@ __all__ = [
     "load_scene_config",
 ]
 
-Verify = Literal["standard", "hard", "none"]
+Verify = Literal["standard", "hard", "full", "hard_full", "none"]
 VERIFICATIONS: tuple[str, ...] = typing.get_args(Verify)

@@ -50,6 +50,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
         "method": result.method,
         "versions": _versions(),
         "timing": dataclasses.asdict(result.timing),
+        "audits": dataclasses.asdict(result.audits),
         "grasps": [_grasp(rank, grasp, hand) for rank, grasp in enumerate(result.grasps)],
     }
 

@@ -40,15 +40,14 @@ def plan_grasps(
     progress: ProgressHook | None = None,
     stop: StopHook | None = None,
 ) -> GraspResult:
-    """Plan grasps and try them in rank order until `count` of them hold; those that failed a trial come last.
+    """Plan grasps and try them in rank order until `count` pass all trials of the scene; those that fail come last.
 
     Args:
         scene: from `load_scene` or `scene_from_views`; where the preset asks for another grid, that is built.
         hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
         count, seed: verified grasps wanted; same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
-        verify: physics of the trials, "standard" or "hard", or "none"; a grasp is verified when it passes every trial
-            that applies to the scene.
+        verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
         progress: called from this thread with `Progress` values.
@@ -76,7 +75,8 @@ def plan_grasps(
     timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     moved = tuple(moved_grasp(grasp, far) for grasp in grasps)
-    return GraspResult(outcome, moved, timing, seed, config.method, message, scene.object.warnings, support)
+    warnings = scene.object.warnings
+    return GraspResult(outcome, moved, timing, seed, config.method, message, warnings, support, found.audits)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

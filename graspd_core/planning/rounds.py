@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.candidates import find_candidates
@@ -11,9 +11,16 @@ from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.run_clock import Run
-from graspd_core.planning.verification import Parts, VerificationContext, make_trial_context, measured, run_trials
+from graspd_core.planning.verification import (
+    Parts,
+    TriedGrasps,
+    VerificationContext,
+    make_trial_context,
+    measured,
+    run_trials,
+)
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Grasp, Stage, Verdict
+from graspd_core.types import AuditCount, Grasp, Stage, Verdict
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
@@ -44,6 +51,7 @@ class RoundsResult:
         context: what grasps are tried with; None where none was tried.
         optimise_time: spent in the method [s].
         first: when the first grasp was verified, a `time.perf_counter()` value.
+        audits: of its trials.
     """
 
     began: float
@@ -51,6 +59,7 @@ class RoundsResult:
     context: VerificationContext | None = None
     optimise_time: float = 0.0
     first: float | None = None
+    audits: AuditCount = field(default_factory=AuditCount)
 
     @property
     def good(self) -> int:
@@ -87,16 +96,16 @@ def run_rounds(
         with enough_memory(f"{wanted} grasps at once"):
             found = find_candidates(scene, hand, count=wanted, seed=seeded, config=config, hooks=hooks, device=device)
         state = replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
-        new, first = (), None
+        tried = TriedGrasps()
         if parts is None:
-            new = measured(scene, hand, found.grasps[:wanted])
+            tried = TriedGrasps(measured(scene, hand, found.grasps[:wanted]))
         elif found.grasps:
             if state.context is None:
                 state = replace(state, context=make_trial_context(run, scene, hand, parts, verify))
             if state.context is not None:
-                new, first = run_trials(run, state.context, found.grasps, wanted, good)
-        grasps = tuple(sorted((*state.grasps, *new), key=lambda g: g.verdict is Verdict.FAILED))
-        state = replace(state, grasps=grasps, first=state.first or first)
+                tried = run_trials(run, state.context, found.grasps, wanted, good)
+        grasps = tuple(sorted((*state.grasps, *tried.grasps), key=lambda g: g.verdict is Verdict.FAILED))
+        state = replace(state, grasps=grasps, first=state.first or tried.first, audits=state.audits + tried.audits)
         if state.good >= count or run.over():
             break
     return state

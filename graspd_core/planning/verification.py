@@ -6,18 +6,25 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, repeat
+
+import torch
 
 from graspd_core.config import RobustConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_context
 from graspd_core.planning.run_clock import Run
+from graspd_core.planning.trial_threads import results_in_order
 from graspd_core.scene.scene import Scene, object_parts
+from graspd_core.trials.audit import audited_trials
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
-from graspd_core.trials.trial_registry import TrialContext, build_worlds, grasp_trials
+from graspd_core.trials.trial_registry import TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, at_friction
-from graspd_core.types import Grasp, GraspMetrics, Stage, TriangleMesh, Verdict
+from graspd_core.types import AuditCount, Grasp, GraspMetrics, Stage, StopHook, TriangleMesh, Verdict
 
 Parts = Future[tuple[TriangleMesh, ...]]
 
@@ -78,33 +85,50 @@ def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tu
     return tuple(replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in candidates)
 
 
+@dataclass(frozen=True)
+class TriedGrasps:
+    """What the trials of some candidates came to.
+
+    Attributes:
+        grasps: those that were tried, verified ones first.
+        first: when the first of them had passed, a `time.perf_counter()` value.
+        audits: how many were tried once more at full length.
+    """
+
+    grasps: tuple[Grasp, ...] = ()
+    first: float | None = None
+    audits: AuditCount = field(default_factory=AuditCount)
+
+
 def run_trials(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
-) -> tuple[tuple[Grasp, ...], float | None]:
+) -> TriedGrasps:
     """Try candidates in rank order until `count` are verified; `before` are already.
 
-    Returns:
-        The grasps that were tried, verified ones first, and when the first of them had passed.
+    On as many threads as torch may use in the calling one; verdicts and order do not depend on their number.
     """
     verified: list[Grasp] = []
     failed: list[Grasp] = []
-    first = None
-    for index, grasp in enumerate(candidates):
-        if len(verified) == count or run.over():
-            break
-        tried = replace(grasp, trials=grasp_trials(context.trials, grasp, run.over))
-        passed = tried.verdict is Verdict.VERIFIED
-        if run.over() and not passed:
-            # A trial that was cut short says nothing of the grasp.
-            break
-        tried = replace(tried, metrics=measure(context.metrics, grasp.grasp))
-        if passed:
-            first = first or time.perf_counter()
-            verified.append(tried)
-        else:
-            failed.append(tried)
-        run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified))
-    return (*verified, *failed), first
+    first, audits = None, AuditCount()
+    trials = results_in_order(run, partial(audited_trials, context.trials), candidates, torch.get_num_threads())
+    with closing(trials):
+        for index, (results, audit) in enumerate(trials):
+            tried = replace(candidates[index], trials=results)
+            passed = tried.verdict is Verdict.VERIFIED
+            if run.over() and not passed:
+                # A trial that was cut short says nothing of the grasp.
+                break
+            audits += audit
+            tried = replace(tried, metrics=measure(context.metrics, tried.grasp))
+            if passed:
+                first = first or time.perf_counter()
+                verified.append(tried)
+            else:
+                failed.append(tried)
+            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified))
+            if len(verified) == count:
+                break
+    return TriedGrasps((*verified, *failed), first, audits)
 
 
 def rank_by_robustness(
@@ -120,11 +144,16 @@ def rank_by_robustness(
     # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
     errors = pose_errors((_NOISE, seed), config.trials)
     protocol = replace(context.trials.protocol, hold_time=config.hold_time)
-    for index, grasp in enumerate(verified):
-        share = None if run.over() else noisy_share(context.trials.alone, grasp, protocol, errors, stop=run.over)
-        metrics = GraspMetrics({**(grasp.metrics or {}), "robustness": share})
-        measured.append(replace(grasp, metrics=metrics))
-        run.report(Stage.VERIFY, index + 1, len(verified), 0.0, len(verified))
+
+    def share_held(grasp: Grasp, stop: StopHook) -> float | None:
+        return noisy_share(context.trials.alone, grasp, protocol, errors, stop=stop)
+
+    with closing(results_in_order(run, share_held, verified, torch.get_num_threads())) as shares:
+        # None for those that the end of the run leaves over.
+        for index, (grasp, share) in enumerate(zip(verified, chain(shares, repeat(None)), strict=False)):
+            metrics = GraspMetrics({**(grasp.metrics or {}), "robustness": share})
+            measured.append(replace(grasp, metrics=metrics))
+            run.report(Stage.VERIFY, index + 1, len(verified), 0.0, len(verified))
     return (*most_robust_first(measured), *grasps[len(verified) :])
 
 

@@ -1,7 +1,8 @@
 """The hold trial: close on a free object, pull it along ±x, ±y, ±z in turn, and see whether it stays.
 
 After DexGraspBench's floating protocol, re-implemented from its parameters. Travel and turn of the object are measured
-from its pose at the start of the trial, so that what the closing fingers do to it counts too.
+from its pose at the start of the trial, so that what the closing fingers do to it counts too. A pull ends when its
+answer is known (`early_stop`), unless the protocol asks for the full length.
 """
 
 # mujoco is a compiled module without stubs.
@@ -9,17 +10,27 @@ from its pose at the start of the trial, so that what the closing fingers do to 
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from graspd_core.scene.far_objects import moved_grasp
-from graspd_core.trials.world import Protocol, World
+from graspd_core.trials.early_stop import (
+    CHECK_EVERY,
+    LOOK_EVERY,
+    ObjectState,
+    answer_known,
+    stop_rule,
+)
+from graspd_core.trials.world import Protocol, World, trial_data
 from graspd_core.types import Grasp, Posture, TrialResult
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
-_CHECK_EVERY = 25
+# Why a trial failed that its caller ended.
+STOPPED = "stopped before the trial ended"
 
 
 def hold_trial(
@@ -28,7 +39,8 @@ def hold_trial(
     """Run one hold trial of `protocol`; ends at the first breach.
 
     Returns:
-        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions.
+        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions, until
+        the pulls ended: an object that still creeps when a pull's answer is known would go farther by its full length.
         A simulation that diverges, or has more contacts than memory, is a failure with that reason.
     """
     import mujoco
@@ -50,27 +62,81 @@ def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, sto
     """Why the grasp does not hold, empty if it does; `worst` travel [m] and turn [rad] are brought up to date."""
     import mujoco
 
-    data = mujoco.MjData(world.model)
-    reason = close_hand(world, data, grasp, protocol, worst)
-    if reason:
-        return reason
-    held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
-    mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
-    mass = float(world.model.body_mass[world.object_body])
-    for direction in DIRECTIONS:
-        mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
-        data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
-        for _ in range(round(protocol.hold_time / protocol.timestep / _CHECK_EVERY)):
-            if stop():
-                return "stopped before the trial ended"
-            mujoco.mj_step(world.model, data, _CHECK_EVERY)
-            reason = breach(world, data, protocol, worst)
+    with trial_data(world) as data:
+        reason = close_hand(world, data, grasp, protocol, worst, stop=stop)
+        if reason:
+            return reason
+        held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+        mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mass = float(world.model.body_mass[world.object_body])
+        steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
+        for direction in DIRECTIONS:
+            mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+            data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
+            reason = step_until_known(world, data, protocol, worst, steps, stop=stop)
             if reason:
-                return f"{reason} under a pull along {axis_name(direction)}"
+                return reason if reason == STOPPED else f"{reason} under a pull along {axis_name(direction)}"
+        return ""
+
+
+def step_until_known(
+    world: World, data: Any, protocol: Protocol, worst: np.ndarray, steps: int, *, stop: Callable[[], bool]
+) -> str:
+    """Simulate what acts now for `steps` steps, or until it is known that the object stays within the limits.
+
+    `worst` travel [m] and turn [rad] are brought up to date. Returns why the trial is over, empty if it is not.
+    """
+    import mujoco
+
+    rule, done = stop_rule(protocol), 0
+    looks = 1 + rule.window // LOOK_EVERY if rule else 0
+    recent = deque[ObjectState](maxlen=looks)
+    while done < steps:
+        if done % CHECK_EVERY == 0 and stop():
+            return STOPPED
+        count = min(LOOK_EVERY, steps - done)
+        mujoco.mj_step(world.model, data, count)
+        done += count
+        checked = done % CHECK_EVERY == 0 or done == steps
+        reason = breach(world, data, protocol, worst) if checked else ""
+        if reason:
+            return reason
+        if rule is None:
+            continue
+        recent.append(object_state(world, data))
+        ripe = done >= rule.first and len(recent) == looks
+        if ripe and answer_known(rule, protocol, recent, moved(world, recent[-1]), steps - done):
+            return breach(world, data, protocol, worst)
     return ""
 
 
-def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst: np.ndarray) -> str:
+def object_state(world: World, data: Any) -> ObjectState:
+    """Where the object is, and how fast."""
+    turn = world.object_address + 3
+    x, y, z, *spin = data.qvel[world.object_velocity : world.object_velocity + 6].tolist()
+    return ObjectState(
+        center=tuple(data.xipos[world.object_body].tolist()),
+        quaternion_wxyz=tuple(data.qpos[turn : turn + 4].tolist()),
+        speed=math.hypot(x, y, z),
+        spin=math.hypot(*spin),
+    )
+
+
+def moved(world: World, state: ObjectState) -> tuple[float, float]:
+    """Travel [m] of the object's centre of mass, and the object's turn [rad], from the start of the trial."""
+    w, x, y, z = state.quaternion_wxyz
+    return math.dist(state.center, world.center_of_mass), 2 * math.atan2(math.hypot(x, y, z), abs(w))
+
+
+def close_hand(
+    world: World,
+    data: Any,
+    grasp: Grasp,
+    protocol: Protocol,
+    worst: np.ndarray,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> str:
     """From the pregrasp over the grasp to the squeeze; returns why the trial is over, empty if it is not.
 
     `worst` travel [m] and turn [rad] of the object are brought up to date.
@@ -87,6 +153,8 @@ def close_hand(world: World, data: Any, grasp: Grasp, protocol: Protocol, worst:
         "squeezing": (grasp.grasp, grasp.squeeze),
     }.items():
         reason = _move(world, data, start, end, protocol, worst)
+        if not reason and stop():
+            return STOPPED
         if reason:
             return f"{reason} while {stage}"
     return ""
@@ -131,7 +199,7 @@ def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Proto
     for step in range(1, steps + 1):
         set_targets(data, start, end, step / steps)
         mujoco.mj_step(world.model, data)
-        if step % _CHECK_EVERY == 0:
+        if step % CHECK_EVERY == 0:
             reason = breach(world, data, protocol, worst)
             if reason:
                 return reason
@@ -158,12 +226,10 @@ def diverged(data: Any) -> bool:
 
 def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
     """Update the worst travel and turn; name the limit that is broken, if any."""
-    pose = data.qpos[world.object_address : world.object_address + 7]
-    if diverged(data) or not np.isfinite(pose).all():
+    travel, turn = moved(world, object_state(world, data))
+    if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
         worst[:] = np.inf
         return "the simulation diverged"
-    travel = float(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))
-    turn = 2.0 * float(np.arctan2(np.linalg.norm(pose[4:]), abs(pose[3])))
     worst[:] = np.maximum(worst, [travel, turn])
     return broken_limit(protocol, travel, turn)
 

@@ -25,11 +25,19 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.trials.hold_trial import breach, gave_up, set_hand_pose, set_joints, set_targets
-from graspd_core.trials.world import Protocol, World
+from graspd_core.trials.early_stop import CHECK_EVERY
+from graspd_core.trials.hold_trial import (
+    STOPPED,
+    breach,
+    gave_up,
+    set_hand_pose,
+    set_joints,
+    set_targets,
+    step_until_known,
+)
+from graspd_core.trials.world import Protocol, World, trial_data
 from graspd_core.types import Grasp, Posture, TrialResult
 
-_CHECK_EVERY = 25
 _COMING, _CLOSING, _LIFTING = "while the hand came", "while closing", "while lifting"
 # Shares of each way at which the hand's commanded postures are held against the obstacles.
 _SHARES = (0.0, 0.25, 0.5, 0.75)
@@ -91,16 +99,35 @@ def lift_trial(
 def _lift(
     world: World, hand: HandModel, grasp: Grasp, protocol: Protocol, settings: LiftSettings, stop: Callable[[], bool]
 ) -> TrialResult:
+    with trial_data(world) as data:
+        begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
+        reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
+        if reason:
+            return TrialResult("lift", False, 0.0, 0.0, reason)
+        set_hand_pose(world, data, begin)
+        worst = np.zeros(2)
+        reason = _raise(world, data, begin, grasp, protocol, settings, worst=worst, stop=stop)
+        if not reason:
+            steps = round(settings.hold_time / protocol.timestep)
+            reason = _said(step_until_known(world, data, protocol, worst, steps, stop=stop), "while held up")
+        return TrialResult("lift", not reason, float(worst[0]), float(worst[1]), reason)
+
+
+def _raise(
+    world: World,
+    data: Any,
+    begin: Posture,
+    grasp: Grasp,
+    protocol: Protocol,
+    settings: LiftSettings,
+    *,
+    worst: np.ndarray,
+    stop: Callable[[], bool],
+) -> str:
+    """Come, close, squeeze and lift; returns why the trial is over, empty if it is not. Brings `worst` up to date."""
     import mujoco
 
-    data = mujoco.MjData(world.model)
-    begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
-    reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
-    if reason:
-        return TrialResult("lift", False, 0.0, 0.0, reason)
-    away = (begin.position - grasp.pregrasp.position) / settings.retreat
-    set_hand_pose(world, data, begin)
-    worst, touched = np.zeros(2), False
+    away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
         steps = round(duration / protocol.timestep)
         for step in range(1, steps + 1):
@@ -111,24 +138,27 @@ def _lift(
             if not touched and name in (_COMING, _CLOSING):
                 touched = _touches(world, data)
                 _rest(world, data)
-            if step % _CHECK_EVERY == 0 or step == steps:
+            if step % CHECK_EVERY == 0 or step == steps:
                 reason = breach(world, data, protocol, worst)
                 if reason or stop():
-                    said = f"{reason} {name}" if reason else "stopped before the trial ended"
-                    return TrialResult("lift", False, float(worst[0]), float(worst[1]), said)
-    return TrialResult("lift", True, float(worst[0]), float(worst[1]))
+                    return _said(reason or STOPPED, name)
+    return ""
+
+
+def _said(reason: str, stage: str) -> str:
+    """A reason with the stage that it came in; empty without one."""
+    return f"{reason} {stage}" if reason and reason != STOPPED else reason
 
 
 def _stages(
     begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
 ) -> tuple[tuple[str, Posture, Posture, float], ...]:
-    """Name, first and last posture and duration [s] of every stage, in order."""
+    """Name, first and last posture and duration [s] of every stage but the last, the hold, in order."""
     return (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
         (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
         ("while squeezing", grasp.grasp, grasp.squeeze, protocol.stage_time),
         (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
-        ("while held up", grasp.squeeze, grasp.squeeze, settings.hold_time),
     )
 
 

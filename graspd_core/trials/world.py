@@ -12,7 +12,9 @@ published parameters. Nothing here is differentiable and nothing is shared with 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -60,6 +62,7 @@ class Protocol:
         max_displacement: allowed travel of the object's centre of mass [m].
         max_rotation: allowed turn of the object [rad].
         max_start_penetration: deeper starts are refused [m].
+        full_length: whether every hold lasts to its end, not only until the answer is known (`early_stop`).
     """
 
     friction: tuple[float, float, float] = (0.6, 0.02, 1e-4)
@@ -77,11 +80,15 @@ class Protocol:
     max_displacement: float = 0.05
     max_rotation: float = float(np.deg2rad(15.0))
     max_start_penetration: float = 0.01
+    full_length: bool = False
 
 
+_HARD = Protocol(friction=(0.3, 0.002, 1e-4), noslip_iterations=0, impratio=1.0)
 PROTOCOLS: dict[str, Protocol] = {
     "standard": Protocol(),
-    "hard": Protocol(friction=(0.3, 0.002, 1e-4), noslip_iterations=0, impratio=1.0),
+    "hard": _HARD,
+    "full": Protocol(full_length=True),
+    "hard_full": replace(_HARD, full_length=True),
 }
 
 
@@ -112,6 +119,7 @@ class World:
         up: unit direction against gravity; None where there is none.
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
+        spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
     """
 
     model: Any
@@ -126,6 +134,25 @@ class World:
     up: Float[np.ndarray, "3"] | None = None
     coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     mimics: tuple[Mimic, ...] = ()
+    spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
+
+
+@contextmanager
+def trial_data(world: World) -> Iterator[Any]:
+    """The `mujoco.MjData` of one trial, at the model's initial state. Safe from any thread: each trial has its own.
+
+    That of a trial that ended is used again, since it takes about a millisecond to make. One that MuJoCo broke off in
+    is not: its memory may be half in use.
+    """
+    import mujoco
+
+    try:
+        data = world.spare.pop()
+        mujoco.mj_resetData(world.model, data)
+    except IndexError:
+        data = mujoco.MjData(world.model)
+    yield data
+    world.spare.append(data)
 
 
 def build_world(

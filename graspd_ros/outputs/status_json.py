@@ -67,6 +67,7 @@ def result_event(result: GraspResult) -> dict[str, Any]:
         "grasps": len(result.grasps),
         "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
         "timing": dataclasses.asdict(result.timing),
+        "audits": dataclasses.asdict(result.audits),
         "best": None if best is None else _summary(best),
     }
 

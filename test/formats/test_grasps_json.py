@@ -47,6 +47,7 @@ TOP = {
     "method",
     "versions",
     "timing",
+    "audits",
     "grasps",
 }
 HAND = {"name", "urdf", "base_link", "joint_names", "mimic", "mount"}

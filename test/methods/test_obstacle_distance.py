@@ -106,9 +106,8 @@ def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, f
     x = pack(draw_starts(scenes["box"], hand, 6, 3, "cpu", DOUBLE))
 
     def term(y: torch.Tensor) -> torch.Tensor:
-        obstacle = evaluate(
-            built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01, fine=fine, sharp=fine
-        ).obstacle
+        look = {"fine": fine, "sharp": fine}
+        obstacle = evaluate(built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01, **look).obstacle
         assert obstacle is not None
         return obstacle
 

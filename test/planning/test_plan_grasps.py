@@ -15,8 +15,9 @@ from graspd_core.planning import verification
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.scene.load_scene import load_scene
+from graspd_core.trials import audit
 from graspd_core.trials.trial_registry import TRIALS
-from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
+from graspd_core.types import AuditCount, Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,18 @@ def test_grasps_called_verified_have_passed_and_come_first(result):
         assert hold.passed == (grasp.verdict is Verdict.VERIFIED) == (grasp.reason == "")
         assert grasp.metrics is not None
         assert grasp.contacts
+
+
+def test_the_full_length_gives_the_verdicts_of_the_usual_trials_and_is_not_audited(scene, hand, result, monkeypatch):
+    monkeypatch.setattr(audit, "AUDITED", 1)
+    full = plan_grasps(scene, hand, count=2, seed=3, preset="fast", verify="full")
+    early = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
+    late, soon = ([(g.score, g.verdict, g.reason) for g in run.grasps] for run in (full, early))
+    assert late == soon
+    holds = [(a.trials[0], b.trials[0]) for a, b in zip(full.grasps, early.grasps, strict=True)]
+    assert all(a.displacement >= b.displacement for a, b in holds)
+    assert [grasp.trials for grasp in early.grasps] == [grasp.trials for grasp in result.grasps]
+    assert (full.audits, early.audits) == (AuditCount(0, 0), AuditCount(2, 0))
 
 
 def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result):
@@ -216,7 +229,7 @@ def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkey
         ({"count": 0}, "count: 0"),
         ({"count": 2000}, "1 to 1024"),
         ({"seed": -1}, "seed: -1"),
-        ({"verify": "maybe"}, "'maybe'; valid: standard, hard, none"),
+        ({"verify": "maybe"}, "'maybe'; valid: standard, hard, full, hard_full, none"),
         ({"deadline": -1.0}, "deadline: -1.0"),
         ({"deadline": float("nan")}, "deadline: nan"),
         ({"device": "abacus"}, "'abacus'; valid on this machine: cpu"),

@@ -14,6 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
+from graspd_core.types import AuditCount, GraspResult, Outcome, Timing
+from graspd_ros.counters import Counters
 from graspd_ros.diagnostics import Health, health_message, resident_memory
 
 GOOD = Health(name="/graspd", hand="allegro_right", ready=True, worker_alive=True, queue_size=4)
@@ -75,6 +77,15 @@ def test_figures_are_readable_and_absent_where_unknown():
     assert (found["grasps verified"], found["clouds superseded"]) == ("12", "5")
     assert found["memory [MB]"] == "300"
     assert values(GOOD, memory=0)["memory [MB]"] == ""
+
+
+def test_audits_of_all_runs_are_counted():
+    counters = Counters()
+    for audits in (AuditCount(2, 0), AuditCount(), AuditCount(1, 1)):
+        counters.planned(GraspResult(Outcome.SUCCEEDED, (), Timing(), 0, "closed_form", audits=audits), 1.0)
+    health = counters.health(name="/graspd", hand="allegro_right", ready=True, worker_alive=True)
+    assert (health.audited, health.audits_disagreed) == (3, 1)
+    assert (values(health)["grasps audited"], values(health)["audits that disagreed"]) == ("3", "1")
 
 
 WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS strings end at a zero

@@ -127,7 +127,7 @@ def assert_every_start_moves(problem: Problem, starts: Poses, delta: float) -> N
     """Where a loss or a slope is no number, the solver says infinity and zero, so that such a start stands still."""
     for polish in (False, True):
         solver, radius = ClosedForm(SHORT, BATCH), torch.zeros(BATCH)
-        loss, gradient = solver.value_and_gradient(problem, pack(starts), radius, delta, polish)
+        loss, gradient = solver.value_and_gradient(problem, pack(starts), radius, delta, fine=polish, sharp=polish)
         assert torch.isfinite(loss).all()
         assert (gradient.norm(dim=-1) > 0).all()
 
@@ -146,7 +146,8 @@ def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):
     """Distance zero and normal zero at every node: nothing to hold, and nothing to divide by."""
     flat = replace(sound.object.sdf, field=torch.zeros_like(sound.object.sdf.field))
     nothing = replace(sound, object=replace(sound.object, sdf=flat))
-    loss, gradient = ClosedForm(SHORT, BATCH).value_and_gradient(nothing, pack(starts), torch.zeros(BATCH), 0.01, True)
+    solver, radius = ClosedForm(SHORT, BATCH), torch.zeros(BATCH)
+    loss, gradient = solver.value_and_gradient(nothing, pack(starts), radius, 0.01, fine=True, sharp=True)
     assert torch.isfinite(loss).all()
     assert torch.isfinite(gradient).all()
 
@@ -154,9 +155,8 @@ def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):
 def test_a_closed_hand_on_the_centre_of_mass_gives_no_nan(sound, starts):
     """Contacts at the centre of mass have no arm, and disturbances no speed there."""
     at_centre = starts.translation * 0 + sound.object.center
-    terms = evaluate(
-        sound, at_centre, starts.quaternion, starts.joints, torch.zeros(BATCH), 0.004, fine=True, sharp=True
-    )
+    look = {"fine": True, "sharp": True}
+    terms = evaluate(sound, at_centre, starts.quaternion, starts.joints, torch.zeros(BATCH), 0.004, **look)
     assert all(torch.isfinite(term).all() for term in terms if term is not None)
 
 

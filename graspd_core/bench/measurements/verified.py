@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from typing import Any
 
 from graspd_core.bench.measurements.measurement import Cell
@@ -40,6 +41,7 @@ def run_verified(cell: Cell) -> dict[str, Any]:
         "first_verified": told.first,
         "rounds": told.rounds,
         "outcome": result.outcome.name,
+        "audits": asdict(result.audits),
         "cpu": {"total": taken["cpu"]},
         "wall": {"total": taken["wall"], "optimise": result.timing.optimise, "verify": result.timing.verify},
         "grasps": [{"verdict": str(grasp.verdict), "reason": grasp.reason} for grasp in result.grasps],

@@ -1,0 +1,138 @@
+"""Trials on several threads: the same results in the same order as on one."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+import torch
+
+from graspd_core.config import RobustConfig
+from graspd_core.hands.library import load_hand
+from graspd_core.methods.candidates import find_candidates
+from graspd_core.methods.loop import Hooks
+from graspd_core.methods.plan_config import load_preset
+from graspd_core.metrics.metrics_context import make_metrics_context
+from graspd_core.planning.run_clock import Run
+from graspd_core.planning.trial_threads import results_in_order
+from graspd_core.planning.verification import VerificationContext, rank_by_robustness, run_trials
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import object_parts
+from graspd_core.trials import audit
+from graspd_core.trials.noisy_trial import displaced, pose_errors
+from graspd_core.trials.trial_registry import build_worlds
+from graspd_core.trials.world import PROTOCOLS
+from graspd_core.types import Grasp, StopHook, Verdict
+
+
+def a_run(stop: StopHook | None = None) -> Run:
+    return Run(time.perf_counter(), None, None, stop)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts the number of torch's threads back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_results_come_in_the_order_of_the_items(number):
+    items = list(range(20))
+    assert list(results_in_order(a_run(), lambda item, stop: item * 2, items, number)) == [2 * item for item in items]
+    assert list(results_in_order(a_run(), lambda item, stop: item, [], number)) == []
+
+
+def test_the_second_is_worked_on_while_the_first_is_unfinished():
+    second_done = threading.Event()
+
+    def work(item: int, stop: StopHook) -> int:
+        if item == 1:
+            second_done.set()
+        assert second_done.wait(60)
+        return item
+
+    assert list(results_in_order(a_run(), work, [0, 1], 2)) == [0, 1]
+
+
+def test_who_has_enough_ends_the_work_that_was_begun_ahead():
+    begun, ended = threading.Event(), []
+
+    def work(item: int, stop: StopHook) -> int:
+        if item > 0:
+            begun.set()
+            while not stop():
+                time.sleep(0.001)
+            ended.append(item)
+        return item
+
+    with closing(results_in_order(a_run(), work, list(range(50)), 2)) as results:
+        assert next(results) == 0
+        assert begun.wait(60)
+    # None is still at work, and none was begun afterwards.
+    assert 1 <= len(ended) <= 3
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("graspd-trials")]
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_end_of_the_run_ends_the_work_and_its_hook_is_asked_by_one_thread(number):
+    over, askers = threading.Event(), set()
+
+    def hook() -> bool:
+        askers.add(threading.get_ident())
+        return over.is_set()
+
+    def work(item: int, stop: StopHook) -> int:
+        over.set()
+        while not stop():
+            time.sleep(0.001)
+        return item
+
+    results = list(results_in_order(a_run(hook), work, list(range(50)), number))
+    assert results in ([], [0])
+    assert askers == {threading.get_ident()}
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_an_exception_of_the_work_reaches_the_caller(number):
+    def work(item: int, stop: StopHook) -> int:
+        raise ZeroDivisionError(item)
+
+    with pytest.raises(ZeroDivisionError, match="0"):
+        list(results_in_order(a_run(), work, [0, 1, 2], number))
+
+
+@pytest.fixture(scope="module")
+def candidates() -> tuple[VerificationContext, tuple[Grasp, ...]]:
+    """Grasps of a box, good and bad by turns, and what they are tried with."""
+    config, hand = load_preset("fast"), load_hand("allegro_right")
+    scene = load_scene("shape:box", resolution=config.resolution)
+    found = find_candidates(scene, hand, count=4, seed=0, config=config, hooks=Hooks()).grasps[:4]
+    errors = pose_errors(1, len(found))
+    moved = [displaced(g, *e, scene.object.center_of_mass) for g, e in zip(found, errors, strict=True)]
+    worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
+    context = VerificationContext(worlds, make_metrics_context(scene.object, hand))
+    return context, tuple(g for pair in zip(moved, found, strict=True) for g in pair)
+
+
+def test_verdicts_order_and_audits_do_not_depend_on_the_number_of_threads(candidates, threads, monkeypatch):
+    monkeypatch.setattr(audit, "AUDITED", 2)
+    context, grasps = candidates
+    outcomes = []
+    for number in (1, 2, 3):
+        torch.set_num_threads(number)
+        run = a_run()
+        tried = run_trials(run, context, grasps, 3, 0)
+        ranked = rank_by_robustness(run, context, tried.grasps, RobustConfig(trials=2, hold_time=0.2), 0)
+        assert sum(grasp.verdict is Verdict.VERIFIED for grasp in tried.grasps) == 3
+        figures = [(g.score, g.trials, dict(g.metrics or {})) for g in (*tried.grasps, *ranked)]
+        outcomes.append((figures, tried.audits))
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+    assert outcomes[0][1].audited > 0
+    assert outcomes[0][1].disagreed == 0
+    # As many data as threads, kept for all of it.
+    assert 1 <= len(context.trials.alone.spare) <= 3

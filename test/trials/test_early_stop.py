@@ -1,0 +1,236 @@
+"""Trials that stop early give the verdict of the full length, sooner."""
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graspd_core.hands.library import load_hand
+from graspd_core.methods.candidates import find_candidates
+from graspd_core.methods.loop import Hooks
+from graspd_core.methods.plan_config import load_preset
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Scene, object_parts
+from graspd_core.trials.early_stop import (
+    CHECK_EVERY,
+    CREEPING,
+    FIRM,
+    LOOK_EVERY,
+    SLIPPERY,
+    ObjectState,
+    answer_known,
+    stop_rule,
+)
+from graspd_core.trials.gravity_trial import TOLERANCE, gravity_trial
+from graspd_core.trials.hold_trial import hold_trial
+from graspd_core.trials.lift_trial import lift_trial
+from graspd_core.trials.noisy_trial import displaced, pose_errors
+from graspd_core.trials.world import PROTOCOLS, Protocol, World, at_friction, build_world, trial_data
+from graspd_core.types import Grasp, Plane
+
+# On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
+SOFT = {"slide_stiffness": 500.0, "slide_damping": 10.0}
+STANDARD, HARD = (replace(PROTOCOLS[name], **SOFT) for name in ("standard", "hard"))
+FAR = -0.145
+
+
+def full(protocol: Protocol) -> Protocol:
+    return replace(protocol, full_length=True)
+
+
+@pytest.fixture
+def steps(monkeypatch) -> list[int]:
+    """Steps of every call of MuJoCo from now on."""
+    import mujoco
+
+    counts, step = [], mujoco.mj_step
+
+    def counted(model: Any, data: Any, nstep: int = 1) -> None:
+        counts.append(nstep)
+        step(model, data, nstep)
+
+    monkeypatch.setattr(mujoco, "mj_step", counted)
+    return counts
+
+
+def test_rules_follow_from_friction():
+    assert stop_rule(PROTOCOLS["standard"]) is FIRM
+    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.3)) is SLIPPERY
+    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.1)) is CREEPING
+    assert stop_rule(PROTOCOLS["hard"]) is CREEPING
+    assert stop_rule(PROTOCOLS["full"]) is stop_rule(PROTOCOLS["hard_full"]) is None
+    for rule in (FIRM, SLIPPERY, CREEPING):
+        assert not any(number % LOOK_EVERY for number in (rule.first, rule.window, CHECK_EVERY))
+        assert rule.first > rule.window
+
+
+SLOW = replace(PROTOCOLS["standard"], max_displacement=0.005, max_rotation=math.radians(5))
+
+
+@given(speed=st.floats(0.01, 10.0), done=st.integers(0, 490), spin=st.floats(0.0, 10.0))
+def test_what_moves_evenly_to_a_limit_is_never_known_to_hold(speed, done, spin):
+    # Speeds as shares of the limits over 500 steps of 4 ms; the limits are such that all but the fastest are at rest.
+    ends, rule = (speed * SLOW.max_displacement, spin * SLOW.max_rotation), FIRM
+
+    def state(step: int) -> ObjectState:
+        travel, turn = (end * step / 500 for end in ends)
+        turned = (math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0)
+        return ObjectState((travel, 0.0, 0.0), turned, ends[0] / 2, ends[1] / 2)
+
+    now = done + rule.window
+    states = [state(step) for step in range(done, now + 1, LOOK_EVERY)]
+    known = answer_known(rule, SLOW, states, (ends[0] * now / 500, ends[1] * now / 500), 500 - now)
+    if speed >= 1 or spin >= 1:
+        assert not known
+    elif max(speed, spin) * rule.safety < 0.99:
+        assert known
+
+
+REST = ObjectState((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0, 0.0)
+
+
+def test_what_jitters_on_the_spot_is_not_at_rest():
+    # Contacts that throw the object to and fro sooner or later throw it out.
+    assert answer_known(FIRM, STANDARD, [REST, REST, REST], (0.0, 0.0), 400)
+    assert not answer_known(FIRM, STANDARD, [REST, replace(REST, speed=0.006), REST], (0.0, 0.0), 400)
+    assert not answer_known(FIRM, STANDARD, [REST, replace(REST, spin=0.09), REST], (0.0, 0.0), 400)
+    assert not answer_known(SLIPPERY, STANDARD, [REST, REST, replace(REST, speed=0.003)], (0.0, 0.0), 400)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_is_never_known(bad):
+    for lost in (
+        replace(REST, center=(bad, 0.0, 0.0)),
+        replace(REST, speed=bad),
+        replace(REST, spin=bad),
+    ):
+        assert not answer_known(FIRM, STANDARD, [REST, lost], (0.0, 0.0), 100)
+    assert not answer_known(FIRM, STANDARD, [REST, REST], (bad, 0.0), 100)
+    assert not answer_known(FIRM, STANDARD, [REST, REST], (0.0, bad), 100)
+
+
+@pytest.mark.parametrize("protocol", [STANDARD, at_friction(STANDARD, 0.3), HARD], ids=["standard", "slippery", "hard"])
+def test_verdicts_are_those_of_the_full_length_from_held_to_lost(protocol, gripper, cube, closing):
+    world = build_world(gripper, cube, (cube.mesh,), protocol)
+    # 0.5 N per millimetre and side: from nothing, over creeping and slipping, to several times Coulomb's limit.
+    squeezes = [0.0252, 0.0256, 0.026, 0.0262, 0.0264, 0.0266, 0.0268, 0.0272, 0.028, 0.03, 0.034, 0.04]
+    grasps = [closing(0.015, 0.025, (s, s)) for s in squeezes] + [closing(0.015, 0.025, (0.04, 0.04), height=FAR)]
+    early = [hold_trial(world, grasp, protocol) for grasp in grasps]
+    late = [hold_trial(world, grasp, full(protocol)) for grasp in grasps]
+    assert [hold.passed for hold in early] == [hold.passed for hold in late]
+    assert {hold.passed for hold in late} == {True, False}
+    # Limits are checked when they were: a failure has the same reason.
+    assert [hold.reason for hold in early] == [hold.reason for hold in late]
+    assert all(a.displacement <= b.displacement for a, b in zip(early, late, strict=True))
+
+
+def test_a_firm_grasp_takes_a_fraction_of_the_steps(gripper, cube, closing, steps):
+    world, grasp = build_world(gripper, cube, (cube.mesh,), STANDARD), closing(0.015, 0.025, (0.04, 0.04))
+    assert hold_trial(world, grasp, full(STANDARD)).passed
+    long = sum(steps)
+    assert long == 200 + 6 * 500
+    steps.clear()
+    assert hold_trial(world, grasp, STANDARD).passed
+    assert 200 + 6 * FIRM.first <= sum(steps) <= long / 5
+
+
+@pytest.mark.parametrize(("speed", "held"), [(0.002, True), (0.0027, False)])
+def test_a_slow_creep_that_breaks_a_limit_late_is_not_verified(speed, held, gripper, cube, closing):
+    # In a fluid thicker than honey an object that nothing holds drifts evenly: 4 mm in 2 s, or 5 mm after 1.85 s.
+    world = build_world(gripper, cube, (cube.mesh,), STANDARD)
+    world.model.opt.viscosity = STANDARD.pull * cube.mass / (3 * np.pi * 0.04 * speed)
+    adrift, protocol = closing(0.0, 0.0, (0.0, 0.0), height=FAR), replace(STANDARD, max_displacement=0.005)
+    late, early = (hold_trial(world, adrift, p) for p in (full(protocol), protocol))
+    assert late.passed == early.passed == held
+    if not held:
+        assert early == late
+        # Most of the way it is within the limit, and slower than what is called at rest.
+        assert hold_trial(world, adrift, replace(full(protocol), hold_time=1.7)).passed
+        assert speed < FIRM.speed
+
+
+# Too far below for any hand that holds the object, which rests on a plane of its own.
+TABLE = Plane(np.array([0.0, 0.0, 1.0]), -1.0)
+
+
+@pytest.fixture(scope="module")
+def real() -> tuple[Scene, Any, list[Grasp]]:
+    """Grasps that the method found on a mug-sized box, and each once more out of place."""
+    config, hand = load_preset("fast"), load_hand("allegro_right")
+    scene = load_scene("shape:box", resolution=config.resolution)
+    found = find_candidates(scene, hand, count=3, seed=0, config=config, hooks=Hooks()).grasps[:3]
+    center = scene.object.center_of_mass
+    return scene, hand, [*found, *(displaced(g, *e, center) for g, e in zip(found, pose_errors(1, 3), strict=True))]
+
+
+@pytest.mark.parametrize("name", ["standard", "hard"])
+def test_real_grasps_have_the_verdict_of_the_full_length(name, real):
+    scene, hand, grasps = real
+    protocol = PROTOCOLS[name]
+    world = build_world(hand, scene.object, object_parts(scene.object), protocol)
+    early, late = ([hold_trial(world, g, p) for g in grasps] for p in (protocol, full(protocol)))
+    assert [(hold.passed, hold.reason) for hold in early] == [(hold.passed, hold.reason) for hold in late]
+
+
+def test_a_lift_ends_early_with_the_same_verdict(real, steps):
+    scene, hand, grasps = real
+    protocol = PROTOCOLS["standard"]
+    world = build_world(hand, scene.object, object_parts(scene.object), protocol, TABLE)
+    early, late = [], []
+    for verdicts, trial_protocol in ((early, protocol), (late, full(protocol))):
+        for grasp in grasps:
+            steps.clear()
+            lift = lift_trial(world, hand, grasp, trial_protocol)
+            verdicts.append((lift.passed, lift.reason, sum(steps)))
+    assert [verdict[:2] for verdict in early] == [verdict[:2] for verdict in late]
+    assert {passed for passed, *_ in late} == {True, False}
+    assert all(a[2] <= b[2] - 500 for a, b in zip(early, late, strict=True) if b[0])
+
+
+def test_gravity_is_known_to_its_tolerance(gripper, cube, closing, steps):
+    world = build_world(gripper, cube, (cube.mesh,), STANDARD)
+    firm = closing(0.015, 0.025, (0.04, 0.04))
+    early, few = gravity_trial(world, firm, STANDARD), sum(steps)
+    late = gravity_trial(world, firm, full(STANDARD))
+    assert early == pytest.approx(late, abs=TOLERANCE)
+    assert few < (sum(steps) - few) / 2
+    # Nothing holds it: five directions lose it, the sixth rests it on the palm.
+    lost = closing(0.015, 0.025, (0.04, 0.04), height=FAR)
+    assert gravity_trial(world, lost, STANDARD) == pytest.approx(gravity_trial(world, lost, full(STANDARD)), abs=1e-9)
+
+
+@pytest.fixture
+def worlds(gripper, cube) -> Callable[[], World]:
+    return lambda: build_world(gripper, cube, (cube.mesh,), STANDARD)
+
+
+def test_kept_data_give_the_figures_of_fresh_data_bit_for_bit(worlds, closing):
+    # Weak holds, whose slipping amplifies any difference; a lost object; one that is pushed into.
+    squeezes = (0.0262, 0.04, 0.0264, 0.0262)
+    grasps = [closing(0.015, 0.025, (s, s)) for s in squeezes]
+    grasps[2:2] = [closing(0.034, 0.034, (0.04, 0.04)), closing(0.015, 0.025, (0.04, 0.04), height=FAR)]
+    kept = worlds()
+    with_kept = [hold_trial(kept, grasp, STANDARD) for grasp in grasps]
+    assert len(kept.spare) == 1
+    assert with_kept == [hold_trial(worlds(), grasp, STANDARD) for grasp in grasps]
+    assert with_kept[0] == with_kept[-1]
+
+
+def test_data_of_a_trial_that_broke_off_are_not_used_again(worlds):
+    world = worlds()
+    with trial_data(world) as first, trial_data(world) as second:
+        assert first is not second
+    assert len(world.spare) == 2
+    with pytest.raises(RuntimeError), trial_data(world):
+        raise RuntimeError
+    assert len(world.spare) == 1
