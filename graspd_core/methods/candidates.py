@@ -27,6 +27,8 @@ from graspd_core.types import Contact, Grasp, Posture
 
 # A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
 _DEEPEST = 0.0015
+# Poses made into grasps at once; each takes a megabyte on the way.
+_AT_ONCE = 128
 # What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
 _KNOCK_COST = 100.0
 
@@ -66,6 +68,17 @@ def assemble(
     How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
     to its pregrasp is refused by a trial before its first step.
     """
+    grasps: list[Grasp] = []
+    for first in range(0, len(poses.translation), _AT_ONCE):
+        rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
+        grasps += _assemble(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+    return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
+
+
+def _assemble(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool]
+) -> list[Grasp]:
+    """`assemble` for so many poses as memory is there for, in any order."""
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
@@ -81,10 +94,8 @@ def assemble(
         depth = intrusion(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
         knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
-    order = scores.argsort(descending=True)
-    return tuple(
-        _grasp(hand, int(i), poses, opened, pressed, contact_set, float(scores[i])) for i in order if scores[i] > -1e3
-    )
+    kept = torch.nonzero(scores > -1e3).flatten().tolist()
+    return [_grasp(hand, i, poses, opened, pressed, contact_set, float(scores[i])) for i in kept]
 
 
 def score(

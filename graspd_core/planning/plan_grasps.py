@@ -37,6 +37,7 @@ def plan_grasps(
     verify: str = "standard",
     deadline: float | None = None,
     device: str = "cpu",
+    measure: bool = True,
     progress: ProgressHook | None = None,
     stop: StopHook | None = None,
 ) -> GraspResult:
@@ -50,6 +51,7 @@ def plan_grasps(
         verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
+        measure: whether grasps get their metrics, those that failed a trial excepted; it takes longer than a trial.
         progress: called from this thread with `Progress` values.
         stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
 
@@ -68,15 +70,16 @@ def plan_grasps(
         message = out_of_reach(scene, hand)
         rounds = [] if message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device)
+    found = run_rounds(
+        run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device, measure=measure
+    )
     grasps = found.grasps
     if found.context and config.robust.rank:
         grasps = rank_by_robustness(run, found.context, grasps, config.robust, seed)
     timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    moved = tuple(moved_grasp(grasp, far) for grasp in grasps)
-    warnings = scene.object.warnings
-    return GraspResult(outcome, moved, timing, seed, config.method, message, warnings, support, found.audits)
+    grasps, warnings = tuple(moved_grasp(grasp, far) for grasp in grasps), scene.object.warnings
+    return GraspResult(outcome, grasps, timing, seed, config.method, message, warnings, support, found.audits)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

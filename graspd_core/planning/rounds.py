@@ -78,6 +78,7 @@ def run_rounds(
     seed: int,
     verify: str,
     device: str,
+    measure: bool = True,
 ) -> RoundsResult:
     """Find candidates and try them, round by round, until `count` of them are good.
 
@@ -98,10 +99,11 @@ def run_rounds(
         state = replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
         tried = TriedGrasps()
         if parts is None:
-            tried = TriedGrasps(measured(scene, hand, found.grasps[:wanted]))
+            untried = found.grasps[:wanted]
+            tried = TriedGrasps(measured(scene, hand, untried) if measure else untried)
         elif found.grasps:
             if state.context is None:
-                state = replace(state, context=make_trial_context(run, scene, hand, parts, verify))
+                state = replace(state, context=make_trial_context(run, scene, hand, parts, verify, measure=measure))
             if state.context is not None:
                 tried = run_trials(run, state.context, found.grasps, wanted, good)
         grasps = tuple(sorted((*state.grasps, *tried.grasps), key=lambda g: g.verdict is Verdict.FAILED))

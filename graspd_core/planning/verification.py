@@ -43,10 +43,10 @@ _NOISE = 0x6E6F697365
 
 @dataclass(frozen=True)
 class VerificationContext:
-    """What the grasps of a run are tried and measured with."""
+    """What the grasps of a run are tried with, and measured with; None: they are not measured."""
 
     trials: TrialContext
-    metrics: MetricsContext
+    metrics: MetricsContext | None
 
 
 def parts_in_background(run: Run, scene: Scene) -> Parts:
@@ -67,7 +67,7 @@ def parts_in_background(run: Run, scene: Scene) -> Parts:
 
 
 def make_trial_context(
-    run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str
+    run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str, *, measure: bool
 ) -> VerificationContext | None:
     """The contexts, as soon as the parts are there; None where the run ended first."""
     while not run.over() and not wait([parts], timeout=_POLL).done:
@@ -76,7 +76,7 @@ def make_trial_context(
         return None
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     worlds = build_worlds(scene, hand, parts.result(), protocol)
-    return VerificationContext(worlds, make_metrics_context(scene.object, hand))
+    return VerificationContext(worlds, make_metrics_context(scene.object, hand) if measure else None)
 
 
 def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
@@ -119,13 +119,12 @@ def run_trials(
                 # A trial that was cut short says nothing of the grasp.
                 break
             audits += audit
-            tried = replace(tried, metrics=measure(context.metrics, tried.grasp))
-            if passed:
-                first = first or time.perf_counter()
-                verified.append(tried)
-            else:
-                failed.append(tried)
-            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified))
+            first = first or (time.perf_counter() if passed else None)
+            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed)
+            # Behind the report: measuring takes longer than a trial. What failed is not measured.
+            if passed and context.metrics is not None:
+                tried = replace(tried, metrics=measure(context.metrics, tried.grasp))
+            (verified if passed else failed).append(tried)
             if len(verified) == count:
                 break
     return TriedGrasps((*verified, *failed), first, audits)

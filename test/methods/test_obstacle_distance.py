@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -106,8 +107,8 @@ def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, f
     x = pack(draw_starts(scenes["box"], hand, 6, 3, "cpu", DOUBLE))
 
     def term(y: torch.Tensor) -> torch.Tensor:
-        look = {"fine": fine, "sharp": fine}
-        obstacle = evaluate(built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01, **look).obstacle
+        look = partial(evaluate, fine=fine, sharp=fine)
+        obstacle = look(built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01).obstacle
         assert obstacle is not None
         return obstacle
 

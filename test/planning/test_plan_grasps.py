@@ -19,6 +19,9 @@ from graspd_core.trials import audit
 from graspd_core.trials.trial_registry import TRIALS
 from graspd_core.types import AuditCount, Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 
+# A search that nobody waits for.
+ENDLESS = replace(load_preset("fast"), settings=replace(load_preset("fast").settings, refine_steps=10**7))
+
 
 @pytest.fixture(scope="module")
 def hand():
@@ -147,10 +150,10 @@ def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
             steps.append(report.step)
             stop.set()
 
-    cancelled = plan_grasps(scene, hand, count=8, preset="accurate", progress=progress, stop=stop.is_set)
+    cancelled = plan_grasps(scene, hand, count=8, preset=ENDLESS, progress=progress, stop=stop.is_set)
     assert cancelled.outcome is Outcome.CANCELLED
     assert cancelled.grasps == ()
-    assert steps == [1]
+    assert len(steps) == 1
 
 
 def test_cancelling_while_verifying_keeps_what_is_verified(scene, hand):
@@ -169,7 +172,7 @@ def test_cancelling_while_verifying_keeps_what_is_verified(scene, hand):
 @pytest.mark.parametrize("verify", ["standard", "none"])
 def test_a_deadline_is_kept(scene, hand, result, verify: str):
     told: list[Progress] = []
-    late = plan_grasps(scene, hand, count=2, preset="accurate", deadline=0.2, verify=verify, progress=told.append)
+    late = plan_grasps(scene, hand, count=2, preset=ENDLESS, deadline=0.2, verify=verify, progress=told.append)
     assert late.outcome is Outcome.DEADLINE
     assert late.grasps == ()
     # Neither are all steps done, nor is any grasp tried.

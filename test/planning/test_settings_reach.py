@@ -120,7 +120,7 @@ CASES = {
     "rounds.first_budget": Case(1.0, verify="standard", brief=True),
     "robust.rank": held(),
     "robust.trials": held(),
-    "robust.hold_time": held(0.4),
+    "robust.hold_time": Case(0.4, HOLDING, hand="parallel_gripper", count=1, verify="full"),
 }
 
 

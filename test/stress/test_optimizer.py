@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -100,8 +101,9 @@ def test_single_and_double_precision_agree_on_a_step(scene, hand, sound, starts)
     x = pack(starts)
     for polish in (False, True):
         radius = torch.full((BATCH,), 0.01)
-        loss, gradient = ClosedForm(SHORT, BATCH).value_and_gradient(sound, x, radius, 0.01, polish)
-        exact, slope = ClosedForm(SHORT, BATCH).value_and_gradient(double, x.double(), radius.double(), 0.01, polish)
+        solver, look = ClosedForm(SHORT, BATCH), {"fine": polish, "sharp": polish}
+        loss, gradient = solver.value_and_gradient(sound, x, radius, 0.01, **look)
+        exact, slope = solver.value_and_gradient(double, x.double(), radius.double(), 0.01, **look)
         # A few hundred products of seven digits each.
         assert loss.tolist() == pytest.approx(exact.tolist(), rel=1e-4)
         error = (gradient.double() - slope).norm(dim=-1) / slope.norm(dim=-1)
@@ -155,8 +157,8 @@ def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):
 def test_a_closed_hand_on_the_centre_of_mass_gives_no_nan(sound, starts):
     """Contacts at the centre of mass have no arm, and disturbances no speed there."""
     at_centre = starts.translation * 0 + sound.object.center
-    look = {"fine": True, "sharp": True}
-    terms = evaluate(sound, at_centre, starts.quaternion, starts.joints, torch.zeros(BATCH), 0.004, **look)
+    look = partial(evaluate, fine=True, sharp=True)
+    terms = look(sound, at_centre, starts.quaternion, starts.joints, torch.zeros(BATCH), 0.004)
     assert all(torch.isfinite(term).all() for term in terms if term is not None)
 
 

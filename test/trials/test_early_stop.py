@@ -165,12 +165,13 @@ TABLE = Plane(np.array([0.0, 0.0, 1.0]), -1.0)
 
 @pytest.fixture(scope="module")
 def real() -> tuple[Scene, Any, list[Grasp]]:
-    """Grasps that the method found on a mug-sized box, and each once more out of place."""
+    """Grasps that the method found on a mug-sized box, each once more out of place, and a hand that stays open."""
     config, hand = load_preset("fast"), load_hand("allegro_right")
     scene = load_scene("shape:box", resolution=config.resolution)
     found = find_candidates(scene, hand, count=3, seed=0, config=config, hooks=Hooks()).grasps[:3]
     center = scene.object.center_of_mass
-    return scene, hand, [*found, *(displaced(g, *e, center) for g, e in zip(found, pose_errors(1, 3), strict=True))]
+    away = [displaced(g, *e, center) for g, e in zip(found, pose_errors(1, 3), strict=True)]
+    return scene, hand, [*found, *away, replace(found[0], grasp=found[0].pregrasp, squeeze=found[0].pregrasp)]
 
 
 @pytest.mark.parametrize("name", ["standard", "hard"])

@@ -101,7 +101,7 @@ class _Follow:
             self.interrupted = "cancelled"
         elif now >= self.hooks.deadline:
             self.interrupted = "deadline"
-        elif now - self.reported >= self.hooks.interval or done == self.steps:
+        elif done > 0 and (now - self.reported >= self.hooks.interval or done == self.steps):
             self.hooks.report(done, self.steps, float(loss.min()))
             self.reported = now
         return bool(self.interrupted)
