@@ -63,8 +63,7 @@ def plan_grasps(
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = Run(time.perf_counter(), deadline, progress, stop)
     support, message, far, rounds = scene.support, "", np.zeros(3), []
-    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing.
-    if not run.over():
+    if not run.over():  # else it begins nothing
         scene, far = planning_scene(scene, config.resolution)
         hand = with_candidates(hand, config.problem.fine_candidates)
         message = out_of_reach(scene, hand)
@@ -73,11 +72,11 @@ def plan_grasps(
     found = run_rounds(
         run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device, measure=measure
     )
-    grasps = _ranked(run, found, config, seed)
-    timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
+    moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
+    timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    moved, warnings = tuple(moved_grasp(grasp, far) for grasp in grasps), scene.object.warnings
-    return GraspResult(outcome, moved, timing, seed, config.method, message, warnings, support, found.audits)
+    model = scene.object
+    return GraspResult(outcome, moved, timing, seed, config.method, message, model.warnings, support, found.audits)
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
