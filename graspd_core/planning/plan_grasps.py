@@ -23,7 +23,6 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated, start_worker_process
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing
 
 
@@ -122,6 +121,8 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
     done in a child process, since threads beside would stand still meanwhile.
     """
+    from graspd_core.scene.scene_from_views import scene_from_views
+
     start_worker_process()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
     scene = run_isolated(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
