@@ -24,7 +24,7 @@ from graspd_core.runtime.worker_process import run_isolated, start_worker_proces
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
 from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.types import GraspResult, ProgressHook, Stage, StopHook, Timing
+from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing
 
 
 def plan_grasps(
@@ -73,13 +73,18 @@ def plan_grasps(
     found = run_rounds(
         run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device, measure=measure
     )
-    grasps = found.grasps
-    if found.context and config.robust.rank:
-        grasps = rank_by_robustness(run, found.context, grasps, config.robust, seed)
+    grasps = _ranked(run, found, config, seed)
     timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    grasps, warnings = tuple(moved_grasp(grasp, far) for grasp in grasps), scene.object.warnings
-    return GraspResult(outcome, grasps, timing, seed, config.method, message, warnings, support, found.audits)
+    moved, warnings = tuple(moved_grasp(grasp, far) for grasp in grasps), scene.object.warnings
+    return GraspResult(outcome, moved, timing, seed, config.method, message, warnings, support, found.audits)
+
+
+def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
+    """The grasps of the rounds, those first that hold out of place where the settings ask for it."""
+    if found.context is None or not config.robust.rank:
+        return found.grasps
+    return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

@@ -76,9 +76,14 @@ class ClosedFormConfig:
     )
 
 
+def drop_steps(settings: ClosedFormConfig) -> list[int]:
+    """The steps before which exploring drops starts."""
+    return [round(settings.explore_steps * drop / settings.drops) for drop in range(1, settings.drops + 1)]
+
+
 def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> int:
     """How many of so many rows go on before step `index`; `keep` are left when exploring ends."""
-    at = [round(settings.explore_steps * drop / settings.drops) for drop in range(1, settings.drops + 1)]
+    at = drop_steps(settings)
     if index not in at or keep >= rows:
         return rows
     left = len(at) - at.index(index)

@@ -18,7 +18,7 @@ from torch import Tensor
 from graspd_core.kernel import structs
 from graspd_core.kernel.builds import call
 from graspd_core.methods.closed_form.adam import AdamState, initial_state
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights, rows_kept
+from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights, drop_steps, rows_kept
 from graspd_core.methods.kernel_problem import KernelProblem
 from graspd_core.methods.loop import Hooks, Solution
 from graspd_core.methods.poses import Poses, moved_along, pack
@@ -66,8 +66,7 @@ def minimise_compiled(
     state = initial_state(problem, starts, least_distance_compiled(compiled, x).clamp(0.0, config.radius_start))
     steps = config.explore_steps + config.refine_steps + config.polish_steps
     follow = _Follow(hooks, steps)
-    drops = [index for index in range(1, steps) if rows_kept(config, keep, len(x), index) < len(x)]
-    for begin, end in pairwise([0, *drops, steps]):
+    for begin, end in pairwise(sorted({0, *drop_steps(config), steps})):
         kept = rows_kept(config, keep, len(state.x), begin)
         if kept < len(state.x):
             state = state[state.loss.argsort(stable=True)[:kept]]
