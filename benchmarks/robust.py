@@ -18,8 +18,8 @@ from pathlib import Path
 # Shapes whose grasps do not all survive an error of 5 mm and 5°.
 SHAPES = ("box", "plate", "torus", "bottle", "l_block", "hammer")
 PRESET = "balanced"
-# Errors of the judge: as many for each grasp, from a seed that no plan draws from.
-JUDGED, JUDGE_SEED = 16, 977
+# Errors of the evaluating trials: as many for each grasp, from a seed that no plan draws from.
+EVALUATIONS, EVALUATION_SEED = 16, 977
 
 
 def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
@@ -50,7 +50,7 @@ def shape_row(shape: str, seed: int, count: int, friction: float) -> dict:
     ended = time.process_time()
     shares = {g.score: g.metrics["robustness"] for g in robust.grasps if g.metrics and g.verdict is Verdict.VERIFIED}
     protocol = at_friction(PROTOCOLS["standard"], friction)
-    world, errors = build_world(hand, scene.object, parts, protocol), pose_errors(JUDGE_SEED, JUDGED)
+    world, errors = build_world(hand, scene.object, parts, protocol), pose_errors(EVALUATION_SEED, EVALUATIONS)
     verified = [g for g in plain.grasps if g.verdict is Verdict.VERIFIED]
     return {
         "shape": shape,

@@ -1,4 +1,4 @@
-"""The frozen values that rooms hand to each other.
+"""The frozen values that folders pass to each other.
 
 Metres, radians, newtons, kilograms throughout. A transform `T_a_b` maps coordinates in frame b to frame a;
 quaternions are wxyz. The object frame is the frame of the mesh as loaded (after scaling).

@@ -34,9 +34,10 @@ from graspd_ros.action_server import GoalServer
 from graspd_ros.diagnostics import health_message, resident_memory
 from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.frames import TransformListener, wait_for_transform
-from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
+from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.requests import Listener, Request
 from graspd_ros.inputs.sensor_frames import SensorFrame, cloud_frame, depth_sensor_frame, nanoseconds
+from graspd_ros.inputs.source_registry import SOURCES
 from graspd_ros.outputs.error_codes import RequestError, sentence_of
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings, declare_settings, read_settings
@@ -196,7 +197,7 @@ class GraspNode(Node):
     def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None) -> str:
         request_id = message.id or self._request_builder.new_id(kind)
         self._take(
-            SOURCES.get(message.source, "request"),
+            SOURCES[message.source].name if message.source in SOURCES else "request",
             request_id,
             lambda name, settings: self._request_builder.from_message(name, settings, message, listener),
             listener,

@@ -32,6 +32,7 @@ from graspd_ros import player
 from graspd_ros.diagnostics import Health, health_message
 from graspd_ros.grasp_node import GraspNode
 from graspd_ros.inputs.requests import check_request
+from graspd_ros.inputs.source_registry import source_of
 from graspd_ros.outputs.error_codes import ErrorCode
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings, check_parameters
@@ -184,6 +185,7 @@ def test_documented_messages_fit_their_types_and_topics(node: GraspNode):
         fill(message, yaml.safe_load(text))
         if isinstance(message, GraspRequest):
             check_request(message, "allegro_right")
+            source_of(message)
 
 
 def test_documented_goals_fit_the_action():
@@ -195,6 +197,7 @@ def test_documented_goals_fit_the_action():
         goal = type_of(kind).Goal()
         fill(goal, yaml.safe_load(text))
         check_request(goal.request, "allegro_right")
+        source_of(goal.request)
 
 
 def test_documented_echoes_name_topics_and_fields(node: GraspNode):

@@ -31,18 +31,18 @@ HAND_COUNT = 8
 PLANNED = ("fast", "balanced", "accurate")
 # What `balanced` is compared with: the same effort in every round.
 STEADY = "balanced_steady"
-# The ladder's trials: its second figure shows these only.
-_LADDER_TRIALS = ("standard",)
-_LADDER_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
-_LADDER_PRESET = "balanced"
+# Trials of the settings sweep (suite `ladder`).
+_SWEEP_TRIALS = ("standard",)
+_SWEEP_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
+_SWEEP_PRESET = "balanced"
 _QUICK_OBJECTS = ("shape:sphere", "shape:box", "shape:mug")
 _QUICK_COUNT = 4
 # The others take minutes a cell.
 _QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
 
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
-# Rungs of the ladder: what is changed, and to what; all else stays at `balanced`.
-LADDER: Mapping[str, Sequence[Mapping[str, int]]] = {
+# Sweep values: what is changed, and to what; all else stays at `balanced`.
+SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
     "candidates": [{"problem.candidates": n} for n in (32, 64, 128, 256, 512)],
     "directions": [{"problem.directions": n} for n in (6, 12, 24, 48, 96)],
     "resolution": [{"resolution": n} for n in (16, 24, 32, 48, 64)],
@@ -130,43 +130,43 @@ def main_suite(request: SuiteRequest) -> tuple[Cell, ...]:
     return tuple(cells)
 
 
-def ladder_suite(request: SuiteRequest) -> tuple[Cell, ...]:
+def sweep_suite(request: SuiteRequest) -> tuple[Cell, ...]:
     """Each of four settings from poor to rich, one at a time."""
     make = _Maker(request)
-    base = load_preset(_LADDER_PRESET)
-    objects = find_objects(request.objects or (_LADDER_OBJECTS[:2] if request.quick else _LADDER_OBJECTS))
+    base = load_preset(_SWEEP_PRESET)
+    objects = find_objects(request.objects or (_SWEEP_OBJECTS[:2] if request.quick else _SWEEP_OBJECTS))
     count = request.count or (_QUICK_COUNT if request.quick else METHODS[base.method].benchmark_count)
     cells: list[Cell] = []
     for thing in objects:
-        for ladder, sweep_values in LADDER.items():
+        for sweep, sweep_values in SWEEPS.items():
             for changes in sweep_values:
-                name = sweep_name(ladder, changes)
-                cells += make("raw", name, override(base, changes), thing, count, request.trials or _LADDER_TRIALS)
+                name = sweep_name(sweep, changes)
+                cells += make("raw", name, override(base, changes), thing, count, request.trials or _SWEEP_TRIALS)
     return tuple(cells)
 
 
 def hands_suite(request: SuiteRequest) -> tuple[Cell, ...]:
-    """Every hand in the box with one preset."""
+    """Every built-in hand with one preset."""
     objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
-    base, count = load_preset(_LADDER_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
+    base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
     makers = {name: _Maker(dataclasses.replace(request, hand=name)) for name in hand_names()}
     cells: list[Cell] = []
     for thing in objects:
         for name, make in makers.items():
-            cells += make("raw", hand_row(name), base, thing, count, request.trials or _LADDER_TRIALS)
+            cells += make("raw", hand_row(name), base, thing, count, request.trials or _SWEEP_TRIALS)
     return tuple(cells)
 
 
 SUITES: dict[str, Callable[[SuiteRequest], tuple[Cell, ...]]] = {
     "main": main_suite,
-    "ladder": ladder_suite,
+    "ladder": sweep_suite,
     "hands": hands_suite,
 }
 
 
-def sweep_name(ladder: str, changes: Mapping[str, int]) -> str:
+def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
     """Name of a sweep value's cells: the sweep and its value (steps: all of them together)."""
-    return f"{ladder}={sum(changes.values()):g}"
+    return f"{sweep}={sum(changes.values()):g}"
 
 
 def all_shapes() -> tuple[str, ...]:

@@ -180,7 +180,7 @@ def fill(document: Path, texts: Mapping[str, str]) -> list[str]:
     return filled
 
 
-_TITLES = {"speed": "Speed against accuracy", "planned": "Planned grasps", "ladder": "The ladder"}
+_TITLES = {"speed": "Speed against accuracy", "planned": "Planned grasps", "ladder": "Settings sweeps"}
 
 
 def _picture(charts: Mapping[str, Path], name: str, document: Path) -> str:

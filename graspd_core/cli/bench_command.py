@@ -21,7 +21,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument(
         "--suite", action="append", default=None, metavar="NAME", help="main (default), ladder, hands; or stress"
     )
-    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all in the box")
+    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in ones")
     parser.add_argument(
         "--objects", nargs="+", default=(), metavar="OBJECT", help="shape:NAME, meshes or folders; default: all shapes"
     )

@@ -1,4 +1,4 @@
-"""`graspd hands`: the hands in the box; `graspd hands inspect`: what is in a hand, and a picture of it."""
+"""`graspd hands`: the built-in hands; `graspd hands inspect`: what is in a hand, and a picture of it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from graspd_core.errors import ConfigError
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    hands = commands.add_parser("hands", help="list the hands in the box, or inspect one")
+    hands = commands.add_parser("hands", help="list the built-in hands, or inspect one")
     hands.set_defaults(run=run)
     actions = hands.add_subparsers(metavar="inspect", dest="action")
     inspect = actions.add_parser("inspect", help="the tree, joints, palm and postures of a hand")
     inspect.set_defaults(run=run_inspect)
-    inspect.add_argument("hand", metavar="FILE|NAME", help="URDF, MJCF, hand description, or a name in the box")
+    inspect.add_argument(
+        "hand", metavar="FILE|NAME", help="URDF, MJCF, hand description, or the name of a built-in hand"
+    )
     inspect.add_argument(
         "--picture", type=Path, metavar="out.png", help="draw it: open and closed, palm and candidates"
     )
@@ -27,7 +29,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """List the hands in the box."""
+    """List the built-in hands."""
     import torch
 
     from graspd_core.hands.library import hand_names, load_hand

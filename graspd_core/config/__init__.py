@@ -1,4 +1,4 @@
-"""Settings that several rooms share: frozen dataclasses, a file each. Those of a method lie in the method's folder."""
+"""Settings that several folders share: frozen dataclasses, a file each. A method's own lie in its folder."""
 
 from __future__ import annotations
 

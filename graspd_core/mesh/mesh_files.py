@@ -107,7 +107,7 @@ def check_mesh(
         warnings.append(f"{source}: simplified from {len(mesh.faces)} to {most_faces} faces")
         mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
     if dusty:
-        # Before all else that is said of the mesh: its size and its holes could be the dust's.
+        # First, because the size and the holes reported below could be those of the small pieces.
         mesh, small = drop_small_components(mesh)
         if small:
             warnings.append(f"{source}: dropped {small} tiny pieces that float clear of the rest")

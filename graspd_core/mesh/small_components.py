@@ -1,4 +1,4 @@
-"""Dust about a mesh: tiny pieces that float clear of it, as scanners and careless exports leave them."""
+"""Drop small components: tiny pieces that float clear of a mesh, as scanners and careless exports leave them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.types import TriangleMesh
 
 # A piece is tiny below this share of the extent of the piece with the most area, and what stays must hold this share of
-# all area: a surface that is in pieces everywhere, as loose triangles are, has no dust.
+# all area: a surface that is in pieces everywhere, as loose triangles are, loses none.
 TINY, STAYS = 0.05, 0.98
 
 
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """The mesh without its dust, and how many pieces of it there were.
+    """The mesh without its small components, and how many they were.
 
-    Dust is what shares no vertex with the rest, is tiny, and lies farther from all that is not tiny than it is large:
-    a bump, a screw's head or a loose triangle that touches the body stays.
+    A small component shares no vertex with the rest, is tiny, and lies farther from all that is not tiny than it is
+    large: a bump, a screw's head or a loose triangle that touches the body stays.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1

@@ -1,4 +1,4 @@
-"""The front door: a scene and a hand in, ranked and verified grasps out."""
+"""Plan grasps: a scene and a hand in, ranked and verified grasps out."""
 
 from __future__ import annotations
 

@@ -9,21 +9,11 @@ from collections.abc import Callable
 import numpy as np
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
-from jaxtyping import Float
 
-from graspd_core import PointCloud, Scene, load_scene, run_isolated
-from graspd_ros.inputs.mesh_path import resolve_mesh
-from graspd_ros.inputs.requests import Listener, Request, check_request, point_of, pose_matrix, settings_of
-from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, nanoseconds, scene_of_views, trimmed
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_ros.inputs.requests import Listener, Request, check_request, settings_of
+from graspd_ros.inputs.sensor_frames import SensorFrame, Views, nanoseconds
+from graspd_ros.inputs.source_registry import SourceInput, frame_loader, latest_frame, mesh_loader, source_of
 from graspd_ros.parameters import Settings
-
-SOURCES = {
-    GraspRequest.CLOUD: "cloud",
-    GraspRequest.MESH: "mesh",
-    GraspRequest.LATEST_CLOUD: "latest_cloud",
-    GraspRequest.VIEWS: "views",
-}
 
 
 class RequestBuilder:
@@ -61,17 +51,19 @@ class RequestBuilder:
 
     def add_view(self, settings: Settings) -> None:
         """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
-        self.views = self.views.add(self._newest(settings), settings, self._lookup)
+        self.views = self.views.add(
+            latest_frame(self.newest, nanoseconds(self._now()), settings), settings, self._lookup
+        )
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
         """A mesh named by its path alone. Raises MeshError."""
-        load = self._mesh_loader(uri, settings)
+        load = mesh_loader(uri, settings)
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
         """What a camera showed unasked. Raises RequestError: it is too old."""
         sensor_frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        load = _loader(lambda: (trimmed(sensor_frame.read(), settings),), settings, None)
+        load = frame_loader(sensor_frame, settings, None)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
 
@@ -85,66 +77,17 @@ class RequestBuilder:
         """
         check_request(message, self._hand)
         settings = settings_of(message, settings)
-        pose = None
-        match message.source:
-            case GraspRequest.MESH:
-                frame, stamp = message.header.frame_id or settings.mesh_frame, message.header.stamp
-                load, pose = self._mesh_loader(message.mesh_uri, settings), pose_matrix(message.object_pose)
-            case GraspRequest.VIEWS:
-                views = self.views
-                if not views.clouds:
-                    raise RequestError(ErrorCode.NO_CLOUD, "no view is kept: call ~/add_view while clouds come")
-                frame, stamp = views.frame, views.stamp
-                load = _loader(lambda: views.clouds, settings, self._target(message, frame))
-            case _:
-                sensor_frame = self._sensor_frame(message, settings)
-                frame, stamp = sensor_frame.frame, sensor_frame.stamp
-                load = _loader(
-                    lambda: (trimmed(sensor_frame.read(), settings),), settings, self._target(message, frame)
-                )
-        timeless = nanoseconds(stamp) == 0
+        source, now = source_of(message), self._now()
+        found = source.find(SourceInput(message, settings, self.newest, self.views, nanoseconds(now), self._lookup))
+        timeless = nanoseconds(found.stamp) == 0
         return Request(
             request_id,
-            SOURCES[message.source],
-            frame,
-            self._now() if timeless else stamp,
+            source.name,
+            found.frame,
+            now if timeless else found.stamp,
             settings,
-            load,
-            T_frame_object=pose,
+            found.load,
+            T_frame_object=found.T_frame_object,
             listener=listener,
             timeless=timeless,
         )
-
-    def _sensor_frame(self, message: GraspRequest, settings: Settings) -> SensorFrame:
-        if message.source == GraspRequest.LATEST_CLOUD:
-            return self._newest(settings)
-        sensor_frame = cloud_frame(message.cloud, nanoseconds(self._now()))
-        sensor_frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        return sensor_frame
-
-    def _newest(self, settings: Settings) -> SensorFrame:
-        if self.newest is None:
-            raise RequestError(ErrorCode.NO_CLOUD, "no cloud or depth image has come yet")
-        self.newest.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        return self.newest
-
-    def _target(self, message: GraspRequest, frame: str) -> Float[np.ndarray, "3"] | None:
-        """The point that says which object is meant, in the frame of the cloud [m]."""
-        if not message.use_target_point:
-            return None
-        point, given = point_of(message), message.header.frame_id
-        if given in ("", frame):
-            return point
-        pose = self._lookup(frame, given, message.header.stamp)
-        return pose[:3, :3] @ point + pose[:3, 3]
-
-    def _mesh_loader(self, uri: str, settings: Settings) -> Callable[[], Scene]:
-        path = resolve_mesh(uri, settings.mesh_roots)
-        mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
-        return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
-
-
-def _loader(
-    read: Callable[[], tuple[PointCloud, ...]], settings: Settings, target: Float[np.ndarray, "3"] | None
-) -> Callable[[], Scene]:
-    return lambda: scene_of_views(read(), settings, target)

@@ -38,7 +38,7 @@ class Request:
 
     Attributes:
         id: names the request in every answer.
-        source: mesh, cloud, latest_cloud or views.
+        source: name of its source (`source_registry`): mesh, cloud, latest_cloud or views.
         frame: the frame that the results are told in, unless the settings name an output_frame.
         stamp: when the object was as it was given.
         settings: the parameters at the time of the request, with what the request itself asks for.
@@ -77,7 +77,7 @@ class Request:
 
 
 def check_request(message: GraspRequest, hand: str) -> None:
-    """Refuse what no settings can make good.
+    """Refuse what no settings can make good. The source is checked where its row is looked up (`source_of`).
 
     Raises:
         RequestError: the field, what it holds and what is valid.
@@ -85,8 +85,6 @@ def check_request(message: GraspRequest, hand: str) -> None:
     if message.id and not _ID.fullmatch(message.id):
         shown = message.id[:MOST_ID]
         raise _bad(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
-    if message.source > GraspRequest.VIEWS:
-        raise _bad(f"source: {message.source}; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3")
     if message.hand not in ("", hand):
         raise RequestError(
             ErrorCode.WRONG_HAND, f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"

@@ -43,7 +43,7 @@ _ENDINGS = {
 
 
 class Responses:
-    """Tells of requests through `outlets`, and counts them in `tally`."""
+    """Publish what becomes of requests through `publishers`, and count it in `counters`."""
 
     def __init__(self, node: Node, hand: HandModel) -> None:
         self.publishers = Publishers(node)

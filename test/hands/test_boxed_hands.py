@@ -1,4 +1,4 @@
-"""What every hand in the box must show, whoever added it: a new `config/hands/*.yaml` is picked up by itself."""
+"""What every built-in hand must show, whoever added it: a new `config/hands/*.yaml` is picked up by itself."""
 
 from __future__ import annotations
 

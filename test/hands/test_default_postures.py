@@ -1,4 +1,4 @@
-"""What a bare URDF does not say, found: against the descriptions of the hands in the box, and in a trial."""
+"""What a bare URDF does not say, found: against the descriptions of the built-in hands, and in a trial."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dust goes, and nothing else does: loose triangles, overlapping bodies and bumps are no dust."""
+"""Small components go, and nothing else does: loose triangles, overlapping bodies and bumps stay."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def soup(mesh: TriangleMesh, jitter: float) -> TriangleMesh:
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 1000), count=st.integers(1, 40))
-def test_dust_goes_and_the_body_stays_as_it_was(seed, count):
+def test_small_components_go_and_the_body_stays_as_it_was(seed, count):
     rng = np.random.default_rng(seed)
-    dust = [cube(0.0007, rng.choice([-1, 1], 3) * rng.uniform(0.05, 0.09, 3)) for _ in range(count)]
-    clean, dropped = drop_small_components(joined(BOX, *dust))
+    small = [cube(0.0007, rng.choice([-1, 1], 3) * rng.uniform(0.05, 0.09, 3)) for _ in range(count)]
+    clean, dropped = drop_small_components(joined(BOX, *small))
     assert dropped == count
     assert np.array_equal(clean.vertices[clean.faces], BOX.vertices[BOX.faces])
 
@@ -56,19 +56,19 @@ def test_dust_goes_and_the_body_stays_as_it_was(seed, count):
     ],
     ids=["box", "soup", "fine-soup", "mug", "hammer", "pair", "bump", "near", "gravel"],
 )
-def test_what_is_no_dust_stays(mesh):
+def test_what_is_no_small_component_stays(mesh):
     clean, dropped = drop_small_components(mesh)
     assert dropped == 0
     assert np.array_equal(clean.vertices[clean.faces], mesh.vertices[mesh.faces])
 
 
-def test_a_scene_tells_of_its_dust_and_is_as_large_as_the_body():
+def test_a_scene_names_its_small_components_and_is_as_large_as_the_body():
     scene = build_scene(joined(BOX, cube(0.0007, (0.2, 0.0, 0.0)), cube(0.0007, (0.0, 0.1, 0.0))), resolution=16)
     assert any("dropped 2 tiny pieces" in warning for warning in scene.object.warnings)
     assert np.ptp(scene.object.mesh.vertices, axis=0) == pytest.approx(np.ptp(BOX.vertices, axis=0))
 
 
-def test_what_dust_looks_like_is_not_said_of_the_body():
+def test_what_small_components_look_like_is_not_said_of_the_body():
     speck = TriangleMesh(np.array([[1.0, 0, 0], [1.0, 0.001, 0], [1.0, 0, 0.001]]), np.array([[0, 1, 2]]))
     scene = build_scene(joined(BOX, speck), resolution=16)
     assert scene.object.warnings == ("mesh: dropped 1 tiny pieces that float clear of the rest",)

@@ -55,7 +55,7 @@ def test_points_all_over_a_thin_wall_feel_what_the_grid_misses(wall):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["thin-wall-cup", "long-rod", "debris"])
-def test_what_a_coarse_grid_or_dust_once_hid_is_grasped(name):
+def test_what_a_coarse_grid_or_small_components_once_hid_is_grasped(name):
     ending = replace(run_case(CASES[name], "fast"), loading=0.0, planning=0.0, memory=0.0)
     assert ending.ending == GRASP
     assert faults(CASES[name], ending) == ()

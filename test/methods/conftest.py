@@ -1,4 +1,4 @@
-"""One small hand and small problems for the whole room, and the one finite-difference checker."""
+"""One small hand and small problems for the whole folder, and the one finite-difference checker."""
 
 from __future__ import annotations
 

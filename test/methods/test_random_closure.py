@@ -1,4 +1,4 @@
-"""The floor: from random sides, touching and never sunk in, reproducible, any hand; and it can be told to stop."""
+"""The random baseline: from random sides, touching and never sunk in, reproducible, any hand, and it can be stopped."""
 
 from __future__ import annotations
 

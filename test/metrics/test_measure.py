@@ -43,8 +43,8 @@ def test_nothing_touched_is_all_zero(gripper, box, as_object, at):
 
 def test_the_same_posture_measures_the_same_by_any_judge(gripper, box, as_object, at):
     posture = at((0.003, 0.001, -0.05), (0.016, 0.015))
-    judges = [make_metrics_context(as_object(box), gripper) for _ in range(2)]
-    assert measure(judges[0], posture) == measure(judges[0], posture) == measure(judges[1], posture)
+    contexts = [make_metrics_context(as_object(box), gripper) for _ in range(2)]
+    assert measure(contexts[0], posture) == measure(contexts[0], posture) == measure(contexts[1], posture)
 
 
 @settings(max_examples=8)

@@ -1,4 +1,4 @@
-"""The front door, end to end on a cylinder: verdicts, limits, reproducibility, and every way for a run to end early."""
+"""`plan_grasps`, end to end on a cylinder: verdicts, limits, reproducibility, and every way for a run to end early."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every setting of a preset reaches what the front door does: changed alone, it changes a very short run."""
+"""Every setting of a preset reaches `plan_grasps`: changed alone, it changes a very short run."""
 
 from __future__ import annotations
 

@@ -66,6 +66,6 @@ def test_thinning_is_even_and_keeps_both_sides():
 
 
 def test_points_that_are_no_surface_are_named():
-    dust = np.random.default_rng(0).normal(0, 0.05, (60, 3))
+    noise = np.random.default_rng(0).normal(0, 0.05, (60, 3))
     with pytest.raises(CloudError, match=r"of its 60 points lie on a surface; at least 50 .* too sparse"):
-        merge_views([PointCloud(dust, np.array([0.0, 0.0, 1.0]))])
+        merge_views([PointCloud(noise, np.array([0.0, 0.0, 1.0]))])

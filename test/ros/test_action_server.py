@@ -16,7 +16,7 @@ from graspd_ros.action_server import Goal as OurGoal
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
-LONG = {"num_grasps": 1024, "preset": "accurate", "time_budget": 600.0}
+LONG = {"num_grasps": 256, "preset": "accurate", "time_budget": 600.0}
 
 pytestmark = pytest.mark.timeout(300)
 

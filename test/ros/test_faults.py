@@ -11,7 +11,7 @@ import pytest
 from graspd_msgs.msg import GraspArray, GraspRequest
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
-LONG = {"num_grasps": 1024, "preset": "accurate", "time_budget": 600.0}
+LONG = {"num_grasps": 256, "preset": "accurate", "time_budget": 600.0}
 
 pytestmark = pytest.mark.timeout(300)
 

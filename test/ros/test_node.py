@@ -10,7 +10,7 @@ from rcl_interfaces.srv import GetParameters
 
 FEW = {"num_grasps": 2, "preset": "fast", "deadline": 100.0, "busy_policy": "queue"}
 # Work that is still going on when the next request arrives.
-LONG = {"num_grasps": 1024, "preset": "accurate", "deadline": 600.0, "busy_policy": "queue"}
+LONG = {"num_grasps": 256, "preset": "accurate", "deadline": 600.0, "busy_policy": "queue"}
 HAND_LENGTH = 0.25  # metres; the base of a hand that holds something is within this of it
 
 pytestmark = pytest.mark.timeout(300)

@@ -17,7 +17,7 @@ from rclpy.action.client import ActionClient
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
-LONG = {"num_grasps": 1024, "preset": "accurate", "time_budget": 600.0}
+LONG = {"num_grasps": 256, "preset": "accurate", "time_budget": 600.0}
 SABOTEUR = Path(__file__).with_name("saboteur.py")
 # Starts the node again and again in one process, each time with other arguments, until one does not end at once.
 STARTS = """

@@ -1,4 +1,4 @@
-"""Coupled joints in the judge's world: they move with their leader, free or loaded, and load its motor."""
+"""Coupled joints in the trial's world: they move with their leader, free or loaded, and load its motor."""
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false

@@ -1,4 +1,4 @@
-"""The judge's world against closed forms: free flight, joint limits, hollows."""
+"""The trial's world against closed forms: free flight, joint limits, hollows."""
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false

@@ -33,7 +33,7 @@ _DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
 
 @contextmanager
 def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
-    """A figure and its axes in the house's style [inches]; closed at the end."""
+    """A figure and its axes in the common style [inches]; closed at the end."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""The charts: what each second buys (speed against accuracy), and what each setting buys (the ladder)."""
+"""The charts: speed against accuracy, planned grasps, and the settings sweeps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from graspd_core.bench.charts.chart_style import FRONT, figure, place_labels, save
-from graspd_core.bench.charts.sweep_chart import draw_ladder
+from graspd_core.bench.charts.sweep_chart import draw_sweeps
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
 from graspd_core.bench.names import is_preset, is_sweep_value, parent_of, short_name
 from graspd_core.bench.pareto import pareto_front
@@ -65,7 +65,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     Returns the PNGs drawn, by "speed", "verified", "planned" and "ladder".
     """
     found = rows(records)
-    ladder = [row for row in found if is_sweep_value(row.name)]
+    swept = [row for row in found if is_sweep_value(row.name)]
     presets = by_name(row for row in found if is_preset(row.name))
     drawn = {
         "speed": draw_speed(presets, path, "cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),
@@ -76,7 +76,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
             "CPU seconds per verified grasp, trials included (one thread, log scale)",
         ),
         "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned")),
-        "ladder": draw_ladder(ladder, path.with_name(f"{path.name}_ladder")) if ladder else None,
+        "ladder": draw_sweeps(swept, path.with_name(f"{path.name}_ladder")) if swept else None,
     }
     return {name: png for name, png in drawn.items() if png}
 

@@ -1,4 +1,4 @@
-"""The ladder: one setting at a time from poor to rich, hold success and CPU seconds against it."""
+"""Chart of the settings sweeps: one setting at a time, hold success and CPU seconds against its value."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from graspd_core.bench.charts.chart_style import figure, save
 from graspd_core.bench.figures import Row, by_name, spread
-from graspd_core.bench.suites import LADDER
+from graspd_core.bench.suites import SWEEPS
 from graspd_core.methods.method_registry import METHODS
 
 _LABELS = {
@@ -19,13 +19,13 @@ _LABELS = {
 _SUCCESS, _TIME = METHODS["closed_form"].colour, METHODS["graspd2022"].colour
 
 
-def draw_ladder(found: Sequence[Row], path: Path) -> Path:
-    """A panel for every ladder. Returns the PNG's path."""
-    ladders = {name: {} for name in LADDER}
+def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
+    """Draw a panel for every sweep. Returns the PNG's path."""
+    sweeps = {name: {} for name in SWEEPS}
     for name, group in by_name(found).items():
-        ladder, sweep_value = name.split("=")
-        ladders[ladder][float(sweep_value)] = group
-    present = {name: dict(sorted(sweep_values.items())) for name, sweep_values in ladders.items() if sweep_values}
+        sweep, sweep_value = name.split("=")
+        sweeps[sweep][float(sweep_value)] = group
+    present = {name: dict(sorted(sweep_values.items())) for name, sweep_values in sweeps.items() if sweep_values}
     with figure(3.2 * len(present), 3.0, ncols=len(present), squeeze=False, sharey=True) as (made, axes):
         seconds = [axis.twinx() for axis in axes[0]]
         for axis, second, (name, sweep_values) in zip(axes[0], seconds, present.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Verified grasps, planned by the front door as a user's are: rounds, trials and all."""
+"""Verified grasps, planned by `plan_grasps` as a user's are: rounds, trials and all."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def mesh_cases() -> tuple[Case, ...]:
         ("inner-void", "a ball with a smaller ball inside, wound alike", _nested),
         ("slivers", "a box cut into triangles a thousand times longer than wide", _slivers),
         ("stray-vertices", "vertices far away that no face uses", _stray),
-        ("debris", "a box with specks of dust floating about it", _debris),
+        ("debris", "a box with tiny pieces floating about it", _debris),
         ("millions-of-faces", "a ball of 1.3 million faces", lambda: _fine("sphere", 4)),
         ("far-from-origin", "a mug 40 m from its origin", lambda: _shifted(make_shape("mug"), 40.0)),
         ("thin-wall-cup", "a cup with walls of 0.9 mm", lambda: thin_cup(9e-4)),

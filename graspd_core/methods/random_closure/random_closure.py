@@ -1,4 +1,4 @@
-"""The floor that every method should beat: come from a random side, close until contact, optimise nothing.
+"""The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
 
 The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open, and moves along
 its normal until the hand first touches; then the fingers close (`closing`). Nothing is chosen by quality: of the hands

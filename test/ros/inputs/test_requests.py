@@ -62,7 +62,6 @@ def refusal(**fields) -> RequestError:
         ({"id": "../../etc/passwd"}, "id: '../../etc/passwd'"),
         ({"id": "a\nb"}, "id: "),
         ({"id": "x" * 10**6}, "at most 128"),
-        ({"source": 4}, "source: 4; valid: CLOUD=0"),
         ({"num_grasps": MOST_GRASPS + 1}, "num_grasps: 257; valid: 1 to 256"),
         ({"preset": "/etc/passwd.yaml"}, f"preset: '/etc/passwd.yaml'; valid: {', '.join(preset_names())}"),
         ({"seed": -2}, "seed: -2"),

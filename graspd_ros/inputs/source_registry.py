@@ -1,0 +1,147 @@
+"""The sources of a GraspRequest's object: a row each. To add one, write its function and its row here, and its constant
+in `GraspRequest.msg`; nothing else is edited."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from graspd_msgs.msg import GraspRequest
+from jaxtyping import Float
+
+from graspd_core import Scene, load_scene, run_isolated
+from graspd_ros.inputs.mesh_path import resolve_mesh
+from graspd_ros.inputs.requests import point_of, pose_matrix
+from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, scene_of_views, trimmed
+from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_ros.parameters import Settings
+
+
+@dataclass(frozen=True, eq=False)
+class SourceInput:
+    """What a source may look at.
+
+    Attributes:
+        message: the request; its fields are checked.
+        settings: the parameters, with what the request asks for itself.
+        newest: the newest frame that a camera sent; None before the first.
+        views: the frames that were kept.
+        now: the node's clock [ns].
+        lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
+    """
+
+    message: GraspRequest
+    settings: Settings
+    newest: SensorFrame | None
+    views: Views
+    now: int
+    lookup: Callable[[str, str, Time], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class SourceObject:
+    """The object that a source gives.
+
+    Attributes:
+        frame: the frame that the object is in.
+        stamp: when it was as it was given; zero where the source does not say.
+        load: reads the object; slow, may raise a GraspdError.
+        T_frame_object: pose of the object's own frame in `frame`; None where they are one.
+    """
+
+    frame: str
+    stamp: Time
+    load: Callable[[], Scene]
+    T_frame_object: Float[np.ndarray, "4 4"] | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """One place that objects come from.
+
+    Attributes:
+        name: its name in answers; in capitals that of its constant in the message.
+        find: gives the object without reading it. Raises GraspdError: it is missing, old or out of reach.
+    """
+
+    name: str
+    find: Callable[[SourceInput], SourceObject]
+
+
+def latest_frame(newest: SensorFrame | None, now: int, settings: Settings) -> SensorFrame:
+    """The newest frame at `now` [ns]. Raises RequestError: there is none, or it is too old."""
+    if newest is None:
+        raise RequestError(ErrorCode.NO_CLOUD, "no cloud or depth image has come yet")
+    newest.check_age(now, settings.cloud_max_age)
+    return newest
+
+
+def mesh_loader(uri: str, settings: Settings) -> Callable[[], Scene]:
+    """A function that reads the mesh at a path or URI. Raises MeshError: it is out of reach."""
+    path = resolve_mesh(uri, settings.mesh_roots)
+    mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
+    return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
+
+
+def frame_loader(frame: SensorFrame, settings: Settings, target: Float[np.ndarray, "3"] | None) -> Callable[[], Scene]:
+    """A function that makes a scene of one frame; `target` says which object is meant, in the cloud's frame [m]."""
+    return lambda: scene_of_views((trimmed(frame.read(), settings),), settings, target)
+
+
+def _from_cloud(given: SourceInput) -> SourceObject:
+    frame = cloud_frame(given.message.cloud, given.now)
+    frame.check_age(given.now, given.settings.cloud_max_age)
+    return _of_frame(given, frame)
+
+
+def _from_mesh(given: SourceInput) -> SourceObject:
+    header = given.message.header
+    frame, pose = header.frame_id or given.settings.mesh_frame, pose_matrix(given.message.object_pose)
+    return SourceObject(frame, header.stamp, mesh_loader(given.message.mesh_uri, given.settings), pose)
+
+
+def _from_latest_cloud(given: SourceInput) -> SourceObject:
+    return _of_frame(given, latest_frame(given.newest, given.now, given.settings))
+
+
+def _from_views(given: SourceInput) -> SourceObject:
+    views, settings = given.views, given.settings
+    if not views.clouds:
+        raise RequestError(ErrorCode.NO_CLOUD, "no view is kept: call ~/add_view while clouds come")
+    target = _target(given, views.frame)
+    return SourceObject(views.frame, views.stamp, lambda: scene_of_views(views.clouds, settings, target))
+
+
+SOURCES: dict[int, Source] = {
+    GraspRequest.CLOUD: Source("cloud", _from_cloud),
+    GraspRequest.MESH: Source("mesh", _from_mesh),
+    GraspRequest.LATEST_CLOUD: Source("latest_cloud", _from_latest_cloud),
+    GraspRequest.VIEWS: Source("views", _from_views),
+}
+
+
+def source_of(message: GraspRequest) -> Source:
+    """The row of the source that a request names. Raises RequestError: there is none."""
+    if message.source not in SOURCES:
+        valid = ", ".join(f"{source.name.upper()}={number}" for number, source in SOURCES.items())
+        raise RequestError(ErrorCode.BAD_REQUEST, f"source: {message.source}; valid: {valid}")
+    return SOURCES[message.source]
+
+
+def _of_frame(given: SourceInput, frame: SensorFrame) -> SourceObject:
+    target = _target(given, frame.frame)
+    return SourceObject(frame.frame, frame.stamp, frame_loader(frame, given.settings, target))
+
+
+def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
+    """The point that says which object is meant, in the frame of the cloud [m]."""
+    message = given.message
+    if not message.use_target_point:
+        return None
+    point, named = point_of(message), message.header.frame_id
+    if named in ("", frame):
+        return point
+    pose = given.lookup(frame, named, message.header.stamp)
+    return pose[:3, :3] @ point + pose[:3, 3]
