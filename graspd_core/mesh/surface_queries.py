@@ -54,7 +54,7 @@ def surface_distance(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Floa
 def closest_points(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The closest surface points [m], and the unit normals of the faces they lie on; NaN of points that are not finite."""
+    """The closest surface points [m] and the unit normals of their faces; NaN of points that are not finite."""
     squared, faces, closest = _nearest(surface, points)
     # libigl leaves the face and the point unset where no distance is finite.
     found = np.isfinite(squared)
