@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import chain, repeat
 
 import torch
@@ -23,7 +23,7 @@ from graspd_core.scene.scene import Scene, object_parts
 from graspd_core.trials.audit import audited_trials
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
-from graspd_core.trials.world import PROTOCOLS, at_friction
+from graspd_core.trials.world import PROTOCOLS, Protocol, at_friction
 from graspd_core.types import AuditCount, Grasp, GraspMetrics, Stage, StopHook, TriangleMesh, Verdict
 
 Parts = Future[tuple[TriangleMesh, ...]]
@@ -43,10 +43,10 @@ _NOISE = 0x6E6F697365
 
 @dataclass(frozen=True)
 class VerificationContext:
-    """What the grasps of a run are tried with, and measured with; None: they are not measured."""
+    """What the grasps of a run are tried with, and measured with, made when first asked for; None: they are not."""
 
     trials: TrialContext
-    metrics: MetricsContext | None
+    metrics: Callable[[], MetricsContext] | None
 
 
 def parts_in_background(run: Run, scene: Scene) -> Parts:
@@ -74,14 +74,25 @@ def make_trial_context(
         pass
     if run.over():
         return None
-    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-    worlds = build_worlds(scene, hand, parts.result(), protocol)
-    return VerificationContext(worlds, make_metrics_context(scene.object, hand) if measure else None)
+    parts.result()
+    worlds = _worlds(scene, hand, at_friction(PROTOCOLS[verify], scene.object.friction))
+    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None)
+
+
+# Kept for the last few scenes and hands, which are hashed by identity.
+@lru_cache(maxsize=4)
+def _worlds(scene: Scene, hand: HandModel, protocol: Protocol) -> TrialContext:
+    return build_worlds(scene, hand, object_parts(scene.object), protocol)
+
+
+@lru_cache(maxsize=4)
+def _metrics_context(scene: Scene, hand: HandModel) -> MetricsContext:
+    return make_metrics_context(scene.object, hand)
 
 
 def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
     """Candidates with their metrics, none of them tried."""
-    context = make_metrics_context(scene.object, hand)
+    context = _metrics_context(scene, hand)
     return tuple(replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in candidates)
 
 
@@ -123,7 +134,7 @@ def run_trials(
             run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed)
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
-                tried = replace(tried, metrics=measure(context.metrics, tried.grasp))
+                tried = replace(tried, metrics=measure(context.metrics(), tried.grasp))
             (verified if passed else failed).append(tried)
             if len(verified) == count:
                 break

@@ -115,7 +115,7 @@ def candidates() -> tuple[VerificationContext, tuple[Grasp, ...]]:
     errors = pose_errors(1, len(found))
     moved = [displaced(g, *e, scene.object.center_of_mass) for g, e in zip(found, errors, strict=True)]
     worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
-    context = VerificationContext(worlds, make_metrics_context(scene.object, hand))
+    context = VerificationContext(worlds, lambda: make_metrics_context(scene.object, hand))
     return context, tuple(g for pair in zip(moved, found, strict=True) for g in pair)
 
 

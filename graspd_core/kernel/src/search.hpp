@@ -38,8 +38,8 @@ static void run_steps(const Problem& p, const Schedule& schedule, const State& s
         look.soft = schedule.soft != 0;
         look.delta = look.soft ? schedule.delta_end * powf(schedule.delta_start / schedule.delta_end, remaining)
                                : schedule.delta_end;
-        look.fine = polish;
-        look.sharp = k >= schedule.explore_steps;
+        look.fine = k >= steps - std::min(schedule.fine_steps, schedule.polish_steps);
+        look.sharp = polish;
         float loss = evaluate(p, look.sharp ? schedule.polish_weights : schedule.weights, x, look, gradient, s);
         bool finite = std::isfinite(loss);
         for (int i = 0; i < variables; i++) finite = finite && std::isfinite(gradient[i]);
@@ -48,7 +48,8 @@ static void run_steps(const Problem& p, const Schedule& schedule, const State& s
             for (int i = 0; i < variables; i++) gradient[i] = 0;
         }
         // Judged at the end values only, so that early, padded iterates never win.
-        if ((polish || (schedule.polish_steps == 0 && remaining == 0)) && loss < state.best_loss[row]) {
+        bool scored = look.fine || (schedule.fine_steps == 0 && polish) || (schedule.polish_steps == 0 && remaining == 0);
+        if (scored && loss < state.best_loss[row]) {
             state.best_loss[row] = loss;
             memcpy(state.best_x + row * variables, x, sizeof(float) * variables);
         }

@@ -69,11 +69,11 @@ class ClosedForm:
         if config.activation == "hard":
             delta = config.delta_end
         polish = index >= config.explore_steps + config.refine_steps
-        sharp = index >= config.explore_steps
+        fine = index >= self.steps - min(config.fine_steps, config.polish_steps)
         loss, gradient = self.value_and_gradient(
-            problem, state.x, state.radius * remaining, delta, fine=polish, sharp=sharp
+            problem, state.x, state.radius * remaining, delta, fine=fine, sharp=polish
         )
-        if polish or (config.polish_steps == 0 and remaining == 0.0):
+        if fine or (config.fine_steps == 0 and polish) or (config.polish_steps == 0 and remaining == 0.0):
             better = loss < state.best_loss
             state = replace(
                 state,

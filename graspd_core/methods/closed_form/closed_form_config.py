@@ -35,8 +35,9 @@ class ClosedFormConfig:
     Attributes:
         starts_per_grasp: starts tried for each grasp asked for; hopeless ones are dropped on the way.
         explore_steps: steps with all starts, before the hopeless ones are dropped.
-        refine_steps: steps with those that are kept, and all of the object's sharp points.
-        polish_steps: last steps, with all candidates too.
+        refine_steps: steps with those that are kept.
+        polish_steps: last steps, with all of the object's sharp points and weights that make contact exact.
+        fine_steps: the last of them, with all candidates too.
         keep_per_grasp: starts kept after exploring, for each grasp asked for.
         drops: times that exploring drops starts, evenly spread, each time the same share of those left.
         activation: whether contact fades over its width or, for the ablation, ends at `delta_end`.
@@ -46,16 +47,17 @@ class ClosedFormConfig:
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
         joint_rate: step size of the joints [rad]; sliding ones take 0.05 m for a radian.
-        weights: of the loss terms while exploring.
-        polish_weights: of the loss terms while refining and polishing.
+        weights: of the loss terms while exploring and refining.
+        polish_weights: of the loss terms while polishing.
         obstacle_factor: times as many starts are tried and kept where there is a support or a neighbour, which rule
             out most ways to grasp a thing.
     """
 
     starts_per_grasp: float = 8.0
     explore_steps: int = 30
-    refine_steps: int = 150
-    polish_steps: int = 30
+    refine_steps: int = 60
+    polish_steps: int = 80
+    fine_steps: int = 30
     keep_per_grasp: float = 2.0
     drops: int = 2
     activation: Literal["soft", "hard"] = "soft"
@@ -95,7 +97,8 @@ def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
     """
     share, times = min(budget, 1.0), max(budget, 1.0)
     steps = {
-        name: math.ceil(getattr(settings, name) * share) for name in ("explore_steps", "refine_steps", "polish_steps")
+        name: math.ceil(getattr(settings, name) * share)
+        for name in ("explore_steps", "refine_steps", "polish_steps", "fine_steps")
     }
     starts = {name: getattr(settings, name) * times for name in ("starts_per_grasp", "keep_per_grasp")}
     return replace(settings, **steps, **starts)
