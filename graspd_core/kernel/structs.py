@@ -103,7 +103,7 @@ class Schedule(ctypes.Structure):
         ("weights", Weights),
         ("polish_weights", Weights),
         *_of(_FLOAT, "delta_start delta_end radius_start translation_rate rotation_rate joint_rate"),
-        *_of(_INT, "explore_steps refine_steps polish_steps soft sharp_refining"),
+        *_of(_INT, "explore_steps refine_steps polish_steps soft"),
     ]
 
 

@@ -1,6 +1,6 @@
 """Exact signed distance of points to a mesh: what metrics are measured with. No grid, no gradient.
 
-Negative where the winding number says inside. Distances are counted in float32 about the object's centre (1e-8 m).
+Negative where the winding number says inside.
 """
 
 from __future__ import annotations

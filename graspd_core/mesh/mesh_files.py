@@ -13,7 +13,7 @@ from torch.quasirandom import SobolEngine
 from graspd_core.errors import MeshError
 from graspd_core.mesh.broken_files import refuse_broken
 from graspd_core.mesh.collada import read_dae
-from graspd_core.mesh.small_components import drop_small_components
+from graspd_core.mesh.small_components import drop_small_components, face_components
 from graspd_core.mesh.topology import (
     drop_degenerate,
     drop_repeated,
@@ -148,18 +148,13 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
     Exact for one closed, consistently wound body; otherwise summed over points where the winding number says
     inside (about 1 % of volume). A surface that encloses nothing counts as a solid of its bounding box.
     """
-    import trimesh
-
     far = far_centre(mesh.vertices)
     if far.any():
         # Moments about the origin would lose all digits.
         volume, centre, inertia = mass_properties(moved_mesh(mesh, -far))
         return volume, centre + far, inertia
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    if is_closed(mesh) and is_oriented(mesh.faces) and body.body_count == 1:
-        if body.volume < 0:
-            body.invert()
-        return float(body.volume), np.array(body.center_mass), np.array(body.moment_inertia)
+    if is_closed(mesh) and is_oriented(mesh.faces) and not face_components(mesh).any():
+        return _solid_moments(mesh)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     # A flat sheet still needs a box of some thickness for its inertia to be positive.
     size = np.maximum(high - low, 1e-3)
@@ -260,6 +255,18 @@ def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
     if len(unique) == 0:
         raise MeshError(f"{source}: no face has an area; a triangle mesh with a surface is needed")
     return TriangleMesh(vertices, unique), len(faces) - len(distinct), len(distinct) - len(unique)
+
+
+def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Volume, centre and inertia of a closed body, wound either way: sums over tetrahedra with a corner at zero."""
+    corners = mesh.vertices[mesh.faces]
+    sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    total, middle = sixfold.sum(), corners.sum(1)
+    centre = sixfold @ middle / (4 * total)
+    # The second moment of a tetrahedron at zero: det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ), c its other corners.
+    second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, middle, middle)
+    spread = np.sign(total) * (second / 120 - total / 6 * np.outer(centre, centre))
+    return float(abs(total) / 6), centre, np.trace(spread) * np.eye(3) - spread
 
 
 def _moments(

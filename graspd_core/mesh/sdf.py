@@ -93,7 +93,7 @@ def build_sdf(
     """
     layout = grid_layout(mesh, resolution, padding)
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    # Queries are about the centre: Open3D counts in float32.
+    # About the centre: far from the origin, differences lose digits.
     centred = TriangleMesh(mesh.vertices - centre, mesh.faces)
     axes = [x + layout.spacing * np.arange(n) for x, n in zip(layout.origin - centre, layout.counts, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"))

@@ -6,9 +6,9 @@ A hand sampled every few millimetres does not notice an edge that sinks in betwe
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from graspd_core.mesh.mesh_distance import make_distance_query, signed_distance
+from graspd_core.mesh.mesh_distance import DistanceQuery, make_distance_query, signed_distance
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.types import TriangleMesh
@@ -18,34 +18,41 @@ _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
 
 
-def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> Float[np.ndarray, "points 3"]:
+def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "points 3"], float]:
     """At most `count` evenly spread surface points [m] with less than a probe's depth of material below them.
 
     A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
     nearer. Returns fewer points, possibly none, on a smooth object.
+
+    Returns:
+        The points, and the share of the surface with less than two probe depths of material below it: near one for
+        cups and sheets.
     """
+    query = make_distance_query(mesh)
     points, normals = _pool(mesh, seed)
-    depth = -signed_distance(make_distance_query(mesh), points - _PROBE * normals)
-    sharp = points[depth < (1 - _SHARP) * _PROBE]
-    return sharp[farthest_points(sharp, count)]
+    sharp = points[_is_thin(query, points, normals, _PROBE)]
+    samples, sample_normals = surface_samples(mesh, _POOL // 6, seed)
+    share = float(_is_thin(query, samples, sample_normals, 2 * _PROBE).mean())
+    return sharp[farthest_points(sharp, count)], share
 
 
-def thin_share(mesh: TriangleMesh, seed: int = 0) -> float:
-    """Share of the surface with less than two probe depths of material below it: near one for cups and sheets."""
-    points, normals = surface_samples(mesh, _POOL // 6, seed)
-    depth = -signed_distance(make_distance_query(mesh), points - 2 * _PROBE * normals)
-    return float((depth < (1 - _SHARP) * 2 * _PROBE).mean())
+def _is_thin(
+    query: DistanceQuery, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], probe: float
+) -> Bool[np.ndarray, "n"]:
+    """Whether there is less than `probe` [m] of material below each point."""
+    return -signed_distance(query, points - probe * normals) < (1 - _SHARP) * probe
 
 
 def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
     """Indices of at most `count` points by farthest-point sampling, starting from the first."""
     if len(points) == 0:
         return np.zeros(0, dtype=int)
-    chosen = [0]
-    nearest = np.linalg.norm(points - points[0], axis=-1)
+    columns = np.ascontiguousarray(points.T)
+    chosen, nearest = [0], np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
+        x, y, z = (column - column[chosen[-1]] for column in columns)
+        nearest = np.minimum(nearest, x * x + y * y + z * z)
         chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=-1))
     return np.array(chosen)
 
 

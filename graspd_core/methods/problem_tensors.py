@@ -16,8 +16,7 @@ from graspd_core.hands.collision_tensors import CollisionTensors, make_collision
 from graspd_core.hands.kinematics import Kinematics, make_kinematics, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import GridSDF
-from graspd_core.mesh.sharp_features import sharp_points, thin_share
-from graspd_core.scene.scene import Scene
+from graspd_core.scene.scene import Scene, object_sharp_points
 
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
 _REACH_OF_TIPS = 0.1
@@ -165,14 +164,15 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 @lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
     """Lay the scene's object out; kept for the last few scenes, which are hashed by identity."""
-    thin = thin_share(scene.object.mesh) > _THIN_WALLED
-    sharp = sharp_points(scene.object.mesh, settings.features * 2 if thin else settings.features)
+    sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
+    thin = thin_share > _THIN_WALLED
     floor, confidence = settings.confidence_floor, None
     if scene.confidence is not None:
         confidence = floor + (1 - floor) * scene.confidence.to(device, dtype)
     return ObjectTensors(
         sdf=scene.sdf.to(device, dtype),
-        features=torch.as_tensor(sharp, device=device, dtype=dtype),
+        # They were chosen one by one, each the farthest from all before: the first half is spread as well.
+        features=torch.as_tensor(sharp if thin else sharp[: settings.features], device=device, dtype=dtype),
         coarse_features=settings.features if thin else 0,
         center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
         length=scene.object.radius,

@@ -23,7 +23,6 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated, start_worker_process
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing
 
 
@@ -63,8 +62,7 @@ def plan_grasps(
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = Run(time.perf_counter(), deadline, progress, stop)
     support, message, far, rounds = scene.support, "", np.zeros(3), []
-    # A run that is over before it begins, cancelled while its object was loaded perhaps, begins nothing.
-    if not run.over():
+    if not run.over():  # else it begins nothing
         scene, far = planning_scene(scene, config.resolution)
         hand = with_candidates(hand, config.problem.fine_candidates)
         message = out_of_reach(scene, hand)
@@ -73,11 +71,11 @@ def plan_grasps(
     found = run_rounds(
         run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device, measure=measure
     )
-    grasps = _ranked(run, found, config, seed)
-    timing, outcome = _timing(run, scene, found), run.outcome(bool(grasps), found.good, count)
+    moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
+    timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    moved, warnings = tuple(moved_grasp(grasp, far) for grasp in grasps), scene.object.warnings
-    return GraspResult(outcome, moved, timing, seed, config.method, message, warnings, support, found.audits)
+    model = scene.object
+    return GraspResult(outcome, moved, timing, seed, config.method, message, model.warnings, support, found.audits)
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
@@ -123,6 +121,8 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
     done in a child process, since threads beside would stand still meanwhile.
     """
+    from graspd_core.scene.scene_from_views import scene_from_views
+
     start_worker_process()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
     scene = run_isolated(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)

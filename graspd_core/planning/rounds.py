@@ -39,6 +39,8 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
 
 # How far apart the seeds of two rounds are.
 _SEED_STEP = 1_000_003
+# Where so many grasps are asked for, so few are sought first: an answer need not wait until all are found.
+_MANY, _FIRST_BATCH = 8, 2
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,16 @@ def run_rounds(
 ) -> RoundsResult:
     """Find candidates and try them, round by round, until `count` of them are good.
 
-    Most objects need one round. Where too few grasps held, what is missing is sought again from other initial poses.
+    Most objects need one round, which begins with a small batch for a first answer. Where too few grasps held, what is
+    missing is sought again from other initial poses.
     Without `parts`, the object's convex parts, no trial is run.
     """
     state = RoundsResult(time.perf_counter())
-    for attempt, config in enumerate(rounds):
-        wanted, good, began = count - state.good, state.good, time.perf_counter()
+    batches = [(config, count) for config in rounds]
+    if rounds and parts is not None and count >= _MANY:
+        batches.insert(0, (rounds[0], _FIRST_BATCH))
+    for attempt, (config, most) in enumerate(batches):
+        wanted, good, began = min(most, count - state.good), state.good, time.perf_counter()
         hooks = Hooks(
             report=lambda step, of, loss, good=good: run.report(Stage.OPTIMISE, step, of, loss, good),
             # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.

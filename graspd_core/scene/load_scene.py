@@ -12,10 +12,8 @@ from graspd_core.config import SceneConfig
 from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.mesh.surface_queries import load_library
 from graspd_core.pointcloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
 from graspd_core.scene.scene import Scene, build_scene, refuse_numbers
-from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.segmentation.target_selection import Target
 from graspd_core.types import TriangleMesh
 
@@ -55,6 +53,9 @@ def load_scene(
     numbers = {"mass": mass, "friction": friction, "resolution": resolution}
     refuse_numbers(given, scale=scale, **numbers)
     if not isinstance(source, TriangleMesh) and is_cloud_file(source):
+        # A mesh needs none of what makes an object of a cloud.
+        from graspd_core.scene.scene_from_views import scene_from_views
+
         views = [
             replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
         ]
@@ -63,8 +64,6 @@ def load_scene(
         )
         return replace(scene, object=replace(scene.object, scale=scale))
     mesh, warnings = _read_mesh(source, scale)
-    # A distance grid that is remembered needs no Open3D, but the plan does.
-    load_library()
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 
 

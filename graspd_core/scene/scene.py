@@ -14,6 +14,7 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
 from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
 from graspd_core.mesh.separate_bodies import bodies_apart
+from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
@@ -160,6 +161,21 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 
     arrays = cache.remember(f"sdf-{near.sha256}-{resolution}", build, valid)
     return moved_sdf(GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()}), far)
+
+
+def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
+    """At most `count` of the object's sharp points [m] and its share of thin surface, remembered by content."""
+    near, far = near_object(model)
+
+    def build() -> cache.Arrays:
+        points, thin_share = sharp_points(near.mesh, count)
+        return {"points": points, "thin_share": np.array(thin_share)}
+
+    def valid(arrays: cache.Arrays) -> bool:
+        return set(arrays) == {"points", "thin_share"} and arrays["points"].shape[1:] == (3,)
+
+    arrays = cache.remember(f"sharp-{near.sha256}-{count}", build, valid)
+    return arrays["points"] + far, float(arrays["thin_share"])
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:

@@ -128,8 +128,8 @@ def test_what_a_hook_raises_passes_through(problem, starts):
         search(problem, starts, config=LONG, stop=stop)
 
 
-def test_dropping_by_halves_and_sharp_refining_are_torchs(problem, starts):
-    config = ClosedFormConfig(explore_steps=3, refine_steps=1, polish_steps=1, drops=3, sharp_refining=True)
+def test_dropping_by_halves_is_torchs(problem, starts):
+    config = ClosedFormConfig(explore_steps=3, refine_steps=1, polish_steps=1, drops=3)
     assert [rows_kept(config, 1, rows, index) for rows, index in ((8, 1), (4, 2), (2, 3), (1, 4))] == [4, 2, 1, 1]
     mine = search(problem, starts, keep=2, config=config)
     theirs = minimise(ClosedForm(config, 2), problem, starts, Hooks())

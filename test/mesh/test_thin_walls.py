@@ -14,7 +14,7 @@ from graspd_core.bench.stress.stress_case import GRASP
 from graspd_core.bench.stress.stress_cases import CASES
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
-from graspd_core.mesh.sharp_features import sharp_points, thin_share
+from graspd_core.mesh.sharp_features import sharp_points
 
 RADIUS, HEIGHT = 0.033, 0.08
 
@@ -45,8 +45,8 @@ def test_a_wall_thinner_than_a_cell_is_blurred_within_and_right_beside(wall):
 @pytest.mark.parametrize("wall", [5e-4, 3e-3])
 def test_points_all_over_a_thin_wall_feel_what_the_grid_misses(wall):
     cup = thin_cup(wall)
-    assert thin_share(cup) > 0.95
-    points = sharp_points(cup, 128)
+    assert sharp_points(cup, 128)[1] > 0.95
+    points, _ = sharp_points(cup, 128)
     assert len(points) == 128
     # As dense as 128 points over 0.04 m² can be, within a factor.
     gaps = np.linalg.norm(surface_samples(cup, 500, 1)[0][:, None] - points, axis=-1).min(1)

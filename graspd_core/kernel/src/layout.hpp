@@ -91,7 +91,7 @@ struct Schedule {
     Weights weights, polish_weights;
     float delta_start, delta_end, radius_start;
     float translation_rate, rotation_rate, joint_rate;
-    int32_t explore_steps, refine_steps, polish_steps, soft, sharp_refining;
+    int32_t explore_steps, refine_steps, polish_steps, soft;
 };
 
 // How a pregrasp is sought (config/grasp_stages_config.py).

@@ -39,7 +39,7 @@ static void run_steps(const Problem& p, const Schedule& schedule, const State& s
         look.delta = look.soft ? schedule.delta_end * powf(schedule.delta_start / schedule.delta_end, remaining)
                                : schedule.delta_end;
         look.fine = polish;
-        look.sharp = polish || (schedule.sharp_refining && k >= schedule.explore_steps);
+        look.sharp = k >= schedule.explore_steps;
         float loss = evaluate(p, look.sharp ? schedule.polish_weights : schedule.weights, x, look, gradient, s);
         bool finite = std::isfinite(loss);
         for (int i = 0; i < variables; i++) finite = finite && std::isfinite(gradient[i]);

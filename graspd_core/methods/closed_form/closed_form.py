@@ -69,7 +69,7 @@ class ClosedForm:
         if config.activation == "hard":
             delta = config.delta_end
         polish = index >= config.explore_steps + config.refine_steps
-        sharp = polish or (config.sharp_refining and index >= config.explore_steps)
+        sharp = index >= config.explore_steps
         loss, gradient = self.value_and_gradient(
             problem, state.x, state.radius * remaining, delta, fine=polish, sharp=sharp
         )

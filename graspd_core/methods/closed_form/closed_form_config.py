@@ -35,11 +35,10 @@ class ClosedFormConfig:
     Attributes:
         starts_per_grasp: starts tried for each grasp asked for; hopeless ones are dropped on the way.
         explore_steps: steps with all starts, before the hopeless ones are dropped.
-        refine_steps: steps with those that are kept.
-        polish_steps: last steps, with all candidates and the object's sharp points.
+        refine_steps: steps with those that are kept, and all of the object's sharp points.
+        polish_steps: last steps, with all candidates too.
         keep_per_grasp: starts kept after exploring, for each grasp asked for.
         drops: times that exploring drops starts, evenly spread, each time the same share of those left.
-        sharp_refining: whether refining already looks at all sharp points, with the weights of polishing.
         activation: whether contact fades over its width or, for the ablation, ends at `delta_end`.
         delta_start: width of the soft contact at the start [m].
         delta_end: width of the soft contact at the end [m].
@@ -47,19 +46,18 @@ class ClosedFormConfig:
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
         joint_rate: step size of the joints [rad]; sliding ones take 0.05 m for a radian.
-        weights: of the loss terms while exploring and refining.
-        polish_weights: of the loss terms while polishing.
+        weights: of the loss terms while exploring.
+        polish_weights: of the loss terms while refining and polishing.
         obstacle_factor: times as many starts are tried and kept where there is a support or a neighbour, which rule
             out most ways to grasp a thing.
     """
 
-    starts_per_grasp: float = 4.0
-    explore_steps: int = 50
-    refine_steps: int = 80
-    polish_steps: int = 50
+    starts_per_grasp: float = 8.0
+    explore_steps: int = 30
+    refine_steps: int = 150
+    polish_steps: int = 30
     keep_per_grasp: float = 2.0
-    drops: int = 1
-    sharp_refining: bool = False
+    drops: int = 2
     activation: Literal["soft", "hard"] = "soft"
     delta_start: float = 0.02
     delta_end: float = 0.004
