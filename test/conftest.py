@@ -29,14 +29,31 @@ hypothesis.settings.register_profile("ci", hypothesis.settings.get_profile("dev"
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
+# Files whose tests share a node, which takes seconds to start: they go to one worker. It waits for nodes while the
+# other computes; as one of the largest scopes it begins early.
+SHARED_NODE = {
+    f"test/ros/{name}.py"
+    for name in (
+        "outputs/test_messages",
+        "test_action_server",
+        "test_faults",
+        "test_hostile",
+        "test_node",
+        "test_node_process",
+        "test_scenarios",
+    )
+}
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """With several workers: a file's tests go to one, for what they share, and all of test/ros, for its node."""
+    """With several workers: a file's tests go to one, for what they share, and so do all of one shared node."""
     from xdist.scheduler import LoadScopeScheduling
 
     class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return "test/ros" if nodeid.startswith("test/ros/") else nodeid.partition("::")[0]
+            file = nodeid.partition("::")[0]
+            return "shared node" if file in SHARED_NODE else file
 
     return ByFile(config, log)
 

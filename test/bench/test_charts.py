@@ -11,6 +11,7 @@ import pytest
 
 from graspd_core.bench.charts import chart_style as charts_style
 from graspd_core.bench.charts import speed_chart as charts
+from graspd_core.bench.charts.robustness_chart import draw_robust
 from graspd_core.bench.figures import by_name, rows
 
 ENDS = ("_verified", "_planned", "_ladder")
@@ -58,6 +59,17 @@ def test_the_same_figures_draw_the_same_chart(tmp_path: Path, records):
 def test_nothing_to_draw_is_no_chart(tmp_path: Path, record):
     assert charts.draw_charts([record(kind="pace")], tmp_path / "chart") == {}
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shapes", [["mug"], ["mug", "box", "mug"]])
+def test_the_chart_of_the_ranking_has_a_bar_for_each_shape_and_a_curve_for_each_order(tmp_path: Path, shapes):
+    costs = {"plan_cpu_s": 2.0, "ranked_plan_cpu_s": 3.0}
+    found = [{"shape": shape, "held": [0.5, 1.0], "ranked_by": [0.25, 0.75], **costs} for shape in shapes]
+    assert draw_robust(found, tmp_path / "robust") == tmp_path / "robust.png"
+    drawing = (tmp_path / "robust.svg").read_text()
+    for text in ("ranked by score", "ranked by noisy trials", "CPU seconds for 2 verified grasps"):
+        assert f"<!-- {text} -->" in drawing
+    assert [shape for shape in ("mug", "box", "bowl") if f"<!-- {shape} -->" in drawing] == list(dict.fromkeys(shapes))
 
 
 def test_labels_keep_clear_of_each_other():

@@ -68,7 +68,7 @@ def test_a_preset_file_sets_a_new_method(dummy: str, tmp_path: Path):
     assert config.at_budget(0.5) == config
 
 
-def test_the_front_door_runs_a_new_method(dummy: str, hand):
+def test_plan_grasps_runs_a_new_method(dummy: str, hand):
     result = plan_grasps(
         load_scene("shape:sphere", resolution=16), hand, count=2, preset=PlanConfig(method=dummy), verify="none"
     )

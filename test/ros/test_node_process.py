@@ -83,22 +83,18 @@ def refusals(folder: Path, domain: int, starts: list[list[str]]) -> list[str]:
     return [line for (line,) in lines]
 
 
-def test_a_bad_parameter_ends_the_start_with_one_line(tmp_path, domain):
+def test_a_bad_parameter_or_argument_ends_the_start_with_one_line(tmp_path, domain):
     cases = {
-        "hand:=no_such_hand": "no_such_hand",
-        "busy_policy:=perhaps": "reject, queue, replace",
-        "preset:=no_such_preset": "no_such_preset",
-        "device:=abacus": "abacus",
-        "num_grasps:=0": "num_grasps",
-        "deadline:=soon": "deadline",
+        "no_such_hand": ["-p", "hand:=no_such_hand"],
+        "reject, queue, replace": ["-p", "busy_policy:=perhaps"],
+        "no_such_preset": ["-p", "preset:=no_such_preset"],
+        "abacus": ["-p", "device:=abacus"],
+        "num_grasps": ["-p", "num_grasps:=0"],
+        "deadline": ["-p", "deadline:=soon"],
+        # What ROS itself cannot read.
+        "foo": ["-p", "foo"],
+        "none": ["--params-file", "none.yaml"],
     }
-    lines = refusals(tmp_path, domain, [["-p", parameter] for parameter in cases])
-    for line, culprit in zip(lines, cases.values(), strict=True):
-        assert culprit in line
-
-
-def test_arguments_that_ros_cannot_read_end_the_start_with_one_line(tmp_path, domain):
-    cases = {"foo": ["-p", "foo"], "none": ["--params-file", "none.yaml"]}
     for line, culprit in zip(refusals(tmp_path, domain, list(cases.values())), cases, strict=True):
         assert culprit in line
 
