@@ -1,8 +1,8 @@
 """Screened Poisson (Kazhdan and Hoppe 2013) on a uniform grid: a field that is negative within oriented points.
 
 The field's differences along the grid's edges are fitted to the normals, and its values near a point to those of a step
-that is two cells wide. Coarse grids are solved first and start the finer ones, which then need few iterations. Where points
-are missing the field goes on smoothly.
+that is two cells wide. Coarse grids are solved first and start the finer ones, which then need few iterations. Where
+points are missing the field goes on smoothly.
 """
 
 from __future__ import annotations
