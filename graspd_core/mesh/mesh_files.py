@@ -266,6 +266,8 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
     # The second moment of a tetrahedron at zero: det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ), c its other corners.
     second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, middle, middle)
     spread = np.sign(total) * (second / 120 - total / 6 * np.outer(centre, centre))
+    # Off the diagonal a symmetric body has rounding noise, which alone would choose its principal axes.
+    spread[np.abs(spread) < 1e-9 * np.trace(spread)] = 0.0
     return float(abs(total) / 6), centre, np.trace(spread) * np.eye(3) - spread
 
 
