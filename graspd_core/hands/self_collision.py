@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.link_distance import depth_inside
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.surface_points import dense_samples, parent_groups
+from graspd_core.hands.surface_points import dense_samples, kept, parent_groups
 
 # Overlap that counts as touching rather than colliding [m].
 _TOUCH = 1e-4
@@ -49,12 +49,17 @@ def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) ->
 
 
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    """Pairs of links that are never checked against each other.
+    """Pairs of links that are never checked against each other, remembered on disk by the hand's content.
 
     Welded links; links with one joint between them; links with two joints between them that never do more than graze
     (boxes stand for rounded knuckles, whose corners would otherwise block the joint); and pairs that overlap in the
     open posture or in every sampled posture.
     """
+    build = lambda: {"adjacent": _adjacent_links(hand)}  # noqa: E731
+    return kept(hand, "adjacent", hand.num_links, {"adjacent": (hand.num_links,)}, build)["adjacent"]
+
+
+def _adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     groups = hand.link_group
     same = groups[:, None] == groups[None, :]
     above = parent_groups(hand)[groups]

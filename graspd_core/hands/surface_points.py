@@ -6,7 +6,8 @@ are those that stay inside the next link of the chain at every value of the join
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +19,11 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.link_distance import primitive_sdf, within_bounds
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
+from graspd_core.runtime import disk_cache as cache
 
+# What no sample depends on.
+_BESIDES = {"name", "urdf", "warnings", "mount", "adjacent", "candidate_points", "candidate_normals", "candidate_link"}
+_CONTENT = {item.name for item in fields(HandModel)} - _BESIDES
 # Steps along the normal that tell a face that lies on another solid from one that is flush with it [m].
 _STEP = 1e-6
 # How far out of a face a point must come free of the other solids of its group: in a crease nothing can be touched [m].
@@ -60,8 +65,13 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
         raise HandError(f"candidates={count}: at least 1 is needed")
     if count == len(hand.candidate_link):
         return hand
-    points, normals, links = candidates(hand, count, seed=0)
-    return replace(hand, candidate_points=points, candidate_normals=normals, candidate_link=links)
+
+    def build() -> dict[str, np.ndarray]:
+        points, normals, links = candidates(hand, count, seed=0)
+        return {"candidate_points": points, "candidate_normals": normals, "candidate_link": links}
+
+    shapes = {"candidate_points": (3,), "candidate_normals": (3,), "candidate_link": ()}
+    return replace(hand, **kept(hand, f"candidates-{count}", 1, shapes, build))
 
 
 def candidates(
@@ -109,6 +119,40 @@ def dense_samples(
             raise HandError(f"{hand.urdf}: almost all of the hand's solids lie inside others")
         pool = _exposed(hand, _random_pool(hand, drawn, rng))
     return pool.points, pool.links, pool.areas
+
+
+def kept_dense_samples(
+    hand: HandModel, *, count: int, seed: int
+) -> tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"], Float[np.ndarray, "samples"]]:
+    """`dense_samples`, remembered on disk by the hand's content."""
+
+    def build() -> dict[str, np.ndarray]:
+        points, links, areas = dense_samples(hand, count=count, seed=seed)
+        return {"points": points, "links": links, "areas": areas}
+
+    found = kept(hand, f"samples-{count}-{seed}", count, {"points": (3,), "links": (), "areas": ()}, build)
+    return found["points"], found["links"], found["areas"]
+
+
+def kept(
+    hand: HandModel, what: str, rows: int, shapes: Mapping[str, tuple[int, ...]], build: Callable[[], cache.Arrays]
+) -> cache.Arrays:
+    """What `build` samples of this hand, or sampled of one of the same content, remembered on disk.
+
+    Args:
+        what: name of the samples and all settings that they depend on.
+        rows: the least number of rows.
+        shapes: the arrays' names, and the shape of a row of each.
+    """
+
+    def valid(arrays: cache.Arrays) -> bool:
+        if {name: array.shape[1:] for name, array in arrays.items()} != shapes:
+            return False
+        counts = {len(array) if array.ndim else 0 for array in arrays.values()}
+        return len(counts) == 1 and min(counts) >= rows
+
+    content = cache.digest(value for name, value in sorted(vars(hand).items()) if name in _CONTENT)
+    return cache.remember(f"hand-{content}-{what}", build, valid)
 
 
 def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from graspd_core.hands.kinematics import Kinematics, make_kinematics
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.surface_points import dense_samples
+from graspd_core.hands.surface_points import kept_dense_samples
 from graspd_core.mesh.mesh_distance import DistanceQuery, make_distance_query
 from graspd_core.scene.scene import ObjectModel
 
@@ -58,7 +58,7 @@ def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext
 @lru_cache(maxsize=8)
 def hand_surface(hand: HandModel) -> HandSurface:
     """Dense samples and bounding balls of a hand."""
-    points, links, areas = dense_samples(hand, count=_SAMPLES, seed=_SEED)
+    points, links, areas = kept_dense_samples(hand, count=_SAMPLES, seed=_SEED)
     centers, radii = _balls(hand)
     return HandSurface(points, links, areas, centers, radii, make_kinematics(hand, "cpu", torch.float64))
 

@@ -7,22 +7,25 @@ same twice, so that a node that sees them would fill the disk: the files not use
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import itertools
 import os
 import tempfile
 import threading
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 Arrays = dict[str, np.ndarray]
 
-# Part of every file's name: raise it when what is computed from the same mesh changes.
+# Part of every file's name: raise it when what is computed from the same mesh or hand changes.
 VERSION = 6
-CAPACITY = 16
+CAPACITY = 24
 # Size of all files together [bytes], and how many are written between two looks at it.
 MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16
 
@@ -54,6 +57,26 @@ def forget() -> None:
     """Empty the memory of this process; files stay."""
     with _lock:
         _memory.clear()
+
+
+def digest(values: Iterable[Any]) -> str:
+    """SHA-256 of arrays, tuples, dataclasses and what is told by its `repr`, hexadecimal: the part of a key."""
+    found = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            found.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, tuple):
+            found.update(f"({len(value)}".encode())
+            for part in value:
+                add(part)
+        elif dataclasses.is_dataclass(value):
+            add(tuple(getattr(value, item.name) for item in dataclasses.fields(value)))
+        else:
+            found.update(f"{value!r};".encode())
+
+    add(tuple(values))
+    return found.hexdigest()
 
 
 def cache_path(key: str) -> Path | None:
