@@ -266,8 +266,9 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
     # The second moment of a tetrahedron at zero: det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ), c its other corners.
     second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, middle, middle)
     spread = np.sign(total) * (second / 120 - total / 6 * np.outer(centre, centre))
-    # Off the diagonal a symmetric body has rounding noise, which alone would choose its principal axes.
+    # What is rounding noise is zero: else it alone would choose a symmetric body's principal axes.
     spread[np.abs(spread) < 1e-9 * np.trace(spread)] = 0.0
+    centre[np.abs(centre) < 1e-12 * np.abs(corners).max()] = 0.0
     return float(abs(total) / 6), centre, np.trace(spread) * np.eye(3) - spread
 
 

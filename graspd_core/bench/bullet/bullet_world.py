@@ -73,7 +73,11 @@ def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
             "pybullet is not installed: the displacement trial and the second simulator need it; "
             "valid: Python 3.11 with pip install -e '.[bench]' (there is no wheel for 3.12)"
         )
-    moments, axes = np.linalg.eigh(0.5 * (target.inertia + target.inertia.T) / target.mass)
+    inertia = 0.5 * (target.inertia + target.inertia.T) / target.mass
+    moments, axes = np.diag(inertia), np.eye(3)
+    # A body whose axes are the frame's keeps them: among equal moments rounding would choose.
+    if np.any(inertia != np.diag(moments)):
+        moments, axes = np.linalg.eigh(inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     return BulletWorld(
         hand=hand,
