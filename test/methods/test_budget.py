@@ -22,7 +22,7 @@ def test_an_budget_of_one_is_the_settings():
 
 
 def test_half_the_budget_is_half_the_steps_and_twice_is_twice_the_starts():
-    assert figures(CONFIG.at_budget(0.5), STEPS) == [15, 75, 15]
+    assert figures(CONFIG.at_budget(0.5), STEPS) == [25, 40, 40]
     assert figures(CONFIG.at_budget(2.0), STARTS) == [16.0, 4.0]
 
 

@@ -23,17 +23,17 @@ def scene():
 
 
 def rounds(scene: Scene, verify: str = "standard") -> list[tuple[int, float]]:
-    """Exploring steps and starts a grasp of each round, where the settings are 30 and 8."""
+    """Exploring steps and starts a grasp of each round, where the settings are 50 and 8."""
     found = [config.settings for config in rounds_of(scene, PlanConfig(), verify)]
     return [(config.explore_steps, config.starts_per_grasp) for config in found]
 
 
 def test_a_known_object_alone_begins_cheaply(scene):
-    assert rounds(scene) == [(15, 8.0), (30, 8.0), (30, 16.0)]
+    assert rounds(scene) == [(25, 8.0), (50, 8.0), (50, 16.0)]
 
 
 def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_steps(scene):
-    all_steps = [(30, 8.0), (30, 16.0), (30, 16.0)]
+    all_steps = [(50, 8.0), (50, 16.0), (50, 16.0)]
     neighbour = Obstacle(make_shape("box"), scene.sdf)
     assert rounds(scene, "none") == all_steps
     assert rounds(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), -0.045))) == all_steps

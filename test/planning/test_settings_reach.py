@@ -28,7 +28,7 @@ from graspd_core.types import Plane, Progress, Stage
 # As short as a run can be that still does everything once.
 SETTINGS: dict[str, Any] = {
     "closed_form": ClosedFormConfig(
-        starts_per_grasp=9.0, explore_steps=2, refine_steps=2, polish_steps=2, keep_per_grasp=5.0
+        starts_per_grasp=9.0, explore_steps=2, refine_steps=2, polish_steps=2, fine_steps=1, keep_per_grasp=5.0
     ),
     "graspd2022": Graspd2022Config(
         initial=InitialPosesConfig(starts_per_grasp=3.0), level_set=LevelSetConfig(coarse_steps=2), steps=4
@@ -96,7 +96,7 @@ held = partial(Case, base=HOLDING, hand="parallel_gripper", count=1, verify="sta
 table = Case(scene="table")
 CASES = {
     "closed_form.keep_per_grasp": Case(1.0, (("closed_form.keep_per_grasp", 0.1),), count=10),
-    "closed_form.drops": Case(3, (("closed_form.keep_per_grasp", 0.1), ("closed_form.explore_steps", 6)), count=10),
+    "closed_form.drops": Case(6, (("closed_form.keep_per_grasp", 0.1), ("closed_form.explore_steps", 6)), count=10),
     "closed_form.obstacle_factor": table,
     "problem.confidence_floor": table,
     "closed_form.weights.obstacle": table,

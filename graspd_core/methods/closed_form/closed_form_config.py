@@ -54,8 +54,8 @@ class ClosedFormConfig:
     """
 
     starts_per_grasp: float = 8.0
-    explore_steps: int = 30
-    refine_steps: int = 60
+    explore_steps: int = 50
+    refine_steps: int = 80
     polish_steps: int = 80
     fine_steps: int = 30
     keep_per_grasp: float = 2.0
