@@ -1,7 +1,7 @@
-"""Oriented points to a closed surface: the zero of a Poisson field, cut back to what the cameras allow.
+"""Oriented points to a closed surface: screened Poisson (Kazhdan and Hoppe 2013), cut back to what the cameras allow.
 
-Where points are missing Poisson's surface balloons or runs off. The field is cut by the space that was seen to be empty
-and by the support, which closes the surface whatever it was.
+Where points are missing Poisson's surface balloons or runs off. It is sampled on a grid, cut by the space that was seen
+to be empty and by the support, and surfaced again, which closes it whatever it was.
 """
 
 from __future__ import annotations
@@ -10,20 +10,47 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.surface_queries import closest_points, make_surface
 from graspd_core.pointcloud.free_space import FreeSpace, empty_depth
 from graspd_core.reconstruction.merge_views import Surfels
-from graspd_core.reconstruction.poisson_field import BAND_CELLS, poisson_field
 from graspd_core.types import TriangleMesh
 
 # Cells of the grid along the object's longest side.
 GRID_CELLS = 60
 # Cells that a wall is made thick, if it is thinner.
 MIN_WALL_CELLS = 2.2
+# Beyond so many cells from the Poisson surface a node's side is its region's.
+BAND_CELLS = 2
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
+
+
+def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
+    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size.
+
+    Its finest cells are wider than `finest` [m].
+    """
+    size = float(np.ptp(surfels.points, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(1.2 * size / finest)), 5, 7))
+    vertices, faces = _fit(surfels.points, surfels.normals, depth)
+    if len(faces) == 0:
+        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
+    return TriangleMesh(vertices, faces)
+
+
+def _fit(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: int
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth, scale=1.2, n_threads=1)
+    return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
 
 
 def grid_cell(surfels: Surfels, least: float) -> float:
@@ -48,18 +75,14 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 
 
-def close_surface(surfels: Surfels, free_space: FreeSpace, cell: float, finest: float) -> TriangleMesh:
-    """The closed Poisson surface of the surfels on a grid of such cells, less what is known to be empty.
-
-    Args:
-        finest: features smaller than this are smoothed away [m].
-    """
+def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace, cell: float) -> TriangleMesh:
+    """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
     from scipy.ndimage import gaussian_filter
 
     low, high = surfels.points.min(0), surfels.points.max(0)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    value = poisson_field(surfels, axes, finest)
+    value = _signed(surface, nodes, cell)
     inner = value < BAND_CELLS * cell
     beyond = (
         np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell))
@@ -90,6 +113,40 @@ def march(value: Float[np.ndarray, "x y z"], axes: Sequence[Float[np.ndarray, "_
     return TriangleMesh(np.asarray(vertices), np.asarray(faces, dtype=np.int64))
 
 
+def _signed(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Float[np.ndarray, "x y z"]:
+    """Signed distance at the nodes near the surface, and a signed `BAND_CELLS` of cells elsewhere.
+
+    The surface has no border within the grid, so it parts it into regions; those away from it take the side that most
+    of their nodes next to the surface are on, by the nearest face's normal.
+    """
+    from scipy.ndimage import label
+
+    near = _touched(surface, nodes, cell)
+    closest, normals = closest_points(make_surface(surface), nodes[near])
+    offset = nodes[near] - closest
+    side = np.where((offset * normals).sum(1) < 0, -1.0, 1.0)
+    value = np.full(near.shape, BAND_CELLS * cell)
+    value[near] = np.linalg.norm(offset, axis=1)
+    signs = np.zeros(near.shape)
+    signs[near] = side
+    labelled: Any = label(value > 0.9 * cell)
+    region, count = labelled
+    votes = np.bincount(region.ravel(), signs.ravel(), count + 1)
+    return value * np.where(region > 0, np.where(votes[region] < 0, -1.0, 1.0), signs)
+
+
+def _touched(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Bool[np.ndarray, "x y z"]:
+    """Nodes within some two cells of the surface, whose faces are smaller than a cell or two."""
+    from scipy.ndimage import binary_dilation
+
+    points = np.concatenate([surface.vertices, surface.vertices[surface.faces].mean(1)])
+    index = np.round((points - nodes[0, 0, 0]) / cell).astype(int)
+    index = index[((index >= 0) & (index < nodes.shape[:3])).all(1)]
+    touched = np.zeros(nodes.shape[:3], dtype=bool)
+    touched[tuple(index.T)] = True
+    return np.asarray(binary_dilation(touched, np.ones((3, 3, 3)), iterations=BAND_CELLS), dtype=bool)
+
+
 def _outside_hull(
     points: Float[np.ndarray, "n 3"], nodes: Float[np.ndarray, "m 3"], cell: float
 ) -> Float[np.ndarray, "m"]:
@@ -113,8 +170,7 @@ def _one_solid(value: Float[np.ndarray, "x y z"], cell: float) -> Float[np.ndarr
     border = np.ones(value.shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False
     value = np.where(border, np.maximum(value, 0.5 * cell), value)
-    # Thin parts may hang together by corners of cells alone.
-    labelled: Any = label(value < 0, np.ones((3, 3, 3)))
+    labelled: Any = label(value < 0)
     part, count = labelled
     if count == 0:
         raise CloudError("cloud: its points enclose nothing; more views are needed")

@@ -21,7 +21,7 @@ from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
 from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, point_step
-from graspd_core.reconstruction.poisson import close_surface, grid_cell, part_walls
+from graspd_core.reconstruction.poisson import close_surface, fit_poisson, grid_cell, part_walls
 from graspd_core.reconstruction.shape_completion import complete_shape
 from graspd_core.reconstruction.unposed_cloud import is_unposed, orient_unposed
 from graspd_core.se3 import perpendicular
@@ -92,7 +92,7 @@ def reconstruct(
 def _surface(known: Surfels, free_space: FreeSpace, settings: ReconstructionConfig) -> TriangleMesh:
     known = part_walls(known, grid_cell(known, settings.min_cell))
     cell = grid_cell(known, settings.min_cell)
-    return close_surface(known, free_space, cell, settings.poisson_cell)
+    return close_surface(fit_poisson(known, settings.poisson_cell), known, free_space, cell)
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
