@@ -103,7 +103,9 @@ CASES = {
     "closed_form.polish_weights.obstacle": table,
     "closed_form.weights.penetration": Case(base=FAR_JUMPS),
     "closed_form.weights.self_collision": Case(base=FAR_JUMPS),
-    "closed_form.polish_weights.self_collision": Case(base=(*FAR_JUMPS, *FEW_STARTS), hand="allegro_right", count=6),
+    "closed_form.polish_weights.self_collision": Case(
+        base=(*FAR_JUMPS, *FEW_STARTS, ("closed_form.polish_steps", 12)), hand="allegro_right", count=12
+    ),
     "graspd2022.simulation.stopping_force": Case(base=(("graspd2022.simulation.scaling", "object"),)),
     "graspd2022.contact.friction_stiffness": Case(1e-3),
     "graspd2022.constraints.limit_bound": Case(base=(("graspd2022.pose_rate", 1.0),)),
