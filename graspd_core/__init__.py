@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from graspd_core.mesh.shapes import make_shape
     from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
     from graspd_core.planning.plan_grasps import check_request, plan_grasps, warm_up
+    from graspd_core.planning.planning_worker import start_planning_worker
     from graspd_core.pointcloud.camera import PinholeCamera
     from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_in_metres
     from graspd_core.pointcloud.point_cloud import PointCloud, transform_cloud
@@ -47,6 +48,7 @@ _MODULES = {
     "mesh.mesh_files": ("load_mesh", "save_mesh"),
     "mesh.shapes": ("make_shape",),
     "planning.plan_grasps": ("check_request", "plan_grasps", "warm_up"),
+    "planning.planning_worker": ("start_planning_worker",),
     "pointcloud.camera": ("PinholeCamera",),
     "pointcloud.depth_image": ("cloud_from_depth", "depth_in_metres"),
     "pointcloud.point_cloud": ("PointCloud", "transform_cloud"),

@@ -33,10 +33,12 @@ def main(args: list[str] | None = None) -> int:
     _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
+    from graspd_core import limit_malloc_arenas, start_planning_worker
+
+    # First, so that the child's imports, two seconds of them, go on beside this process's own.
+    start_planning_worker()
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.utilities import try_shutdown
-
-    from graspd_core import limit_malloc_arenas
 
     limit_malloc_arenas()
     sys.setswitchinterval(SWITCH_INTERVAL)

@@ -16,11 +16,12 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.planning.feasibility import out_of_reach
 from graspd_core.planning.planning_scene import planning_scene
+from graspd_core.planning.planning_worker import start_planning_worker
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import parts_in_background, rank_by_robustness
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.runtime.worker_process import run_isolated, start_worker_process
+from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing
@@ -123,7 +124,7 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     """
     from graspd_core.scene.scene_from_views import scene_from_views
 
-    start_worker_process()
+    start_planning_worker()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
     scene = run_isolated(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
     plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)

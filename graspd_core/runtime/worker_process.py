@@ -8,6 +8,8 @@ multiprocessing's, which would import the user's main module again: a script wit
 from __future__ import annotations
 
 import atexit
+import contextlib
+import importlib
 import os
 import pickle
 import signal
@@ -15,7 +17,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, TypeVar
 
@@ -24,17 +26,18 @@ from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
 T = TypeVar("T")
 
 # The child finds modules where this process does.
-_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe})"
+_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r})"
 
 
 class WorkerProcess:
     """Calls functions in a child process, which starts at once and ends with this one, however that ends.
 
-    Calls come one at a time. A child that has died is replaced. Functions must be importable by their names;
-    arguments, results and errors are pickled.
+    Calls come one at a time; before the first the child imports `modules`. A child that has died is replaced. Functions
+    must be importable by their names; arguments, results and errors are pickled.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *modules: str) -> None:
+        self._modules = modules
         self._lock = threading.Lock()
         self._start()
 
@@ -75,7 +78,7 @@ class WorkerProcess:
         # Only the child's end of the pipe goes to the child, so that it reads an end of file when this process dies.
         self._pipe, theirs = Pipe()
         path = [entry for entry in sys.path if isinstance(entry, str)]
-        program = _CHILD.format(path=path, module=__name__, pipe=theirs.fileno())
+        program = _CHILD.format(path=path, module=__name__, pipe=theirs.fileno(), modules=self._modules)
         # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
         # blocked, since it needs a second for its imports before it could ignore it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -91,11 +94,14 @@ class WorkerProcess:
 _child: WorkerProcess | None = None
 
 
-def start_worker_process() -> None:
-    """From now on do what goes through `run_isolated` in a child process, so that threads beside do not stand still."""
+def start_worker_process(*modules: str) -> None:
+    """From now on do what goes through `run_isolated` in a child process, so that threads beside do not stand still.
+
+    The child begins by importing `modules`; where there is a child, nothing is done.
+    """
     global _child
     if _child is None:
-        _child = WorkerProcess()
+        _child = WorkerProcess(*modules)
         atexit.register(_child.close)
 
 
@@ -104,12 +110,16 @@ def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
-def serve(number: int) -> None:
-    """Do what comes through the pipe of this file descriptor, until its other end is closed."""
+def serve(number: int, modules: Iterable[str] = ()) -> None:
+    """Import modules, then do what comes through the pipe of this file descriptor, until its other end is closed."""
     pipe = Connection(number)
     # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_malloc_arenas()
+    for name in modules:
+        # One that cannot be imported fails the work that needs it.
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
     while True:
         try:
             call = pipe.recv_bytes()

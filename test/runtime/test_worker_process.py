@@ -30,6 +30,15 @@ def test_the_work_is_done_elsewhere(child: WorkerProcess):
     assert child(os.getpid) == child(os.getpid) != os.getpid()
 
 
+def test_modules_are_imported_before_the_first_call_and_those_that_cannot_be_do_no_harm():
+    process = WorkerProcess("no_such_module", "colorsys")
+    try:
+        # Asked for nothing that would import it.
+        assert process(eval, "'colorsys' in __import__('sys').modules")
+    finally:
+        process.close()
+
+
 def test_values_and_errors_come_back_and_the_child_lives_on(child: WorkerProcess):
     assert child(math.sqrt, 2.25) == 1.5
     with pytest.raises(ValueError, match="math domain"):
