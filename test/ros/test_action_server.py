@@ -78,7 +78,10 @@ def test_a_goal_gets_feedback_and_the_same_answer_as_the_topic(client, node, act
     status, result = goal.end()
     assert status == GoalStatus.STATUS_SUCCEEDED
     assert (result.status, result.request_id, len(result.grasps) > 0) == (GraspArray.SUCCEEDED, "goal-a", True)
-    assert {f.progress.stage for f in goal.feedback} >= {"load", "optimise"}
+    # Feedback comes ten times a second at most, and a stage may take less than that.
+    stages = {f.progress.stage for f in goal.feedback}
+    assert "load" in stages
+    assert stages & {"optimise", "verify"}
     assert client.answer("goal-a") == result
 
 
