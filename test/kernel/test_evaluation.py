@@ -7,14 +7,17 @@ from dataclasses import replace
 import pytest
 import torch
 
+from graspd_core.config import ProblemConfig
+from graspd_core.hands.library import load_hand
 from graspd_core.kernel import builds
 from graspd_core.methods.closed_form.closed_form import ClosedForm, weighted
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.methods.closed_form.compiled_search import evaluate_compiled, least_distance_compiled
+from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.kernel_problem import KernelProblem, kernel_problem
 from graspd_core.methods.losses import hard_contact
-from graspd_core.methods.poses import moved_along, unpack
-from graspd_core.methods.problem import Problem, Terms, evaluate, least_distance
+from graspd_core.methods.poses import moved_along, pack, unpack
+from graspd_core.methods.problem import Problem, Terms, build_problem, evaluate, least_distance
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 DELTA = 0.006
@@ -156,3 +159,28 @@ def test_torch_evaluates_what_the_kernel_does_not(problem_of, monkeypatch):
     assert kernel_problem(replace(problem, object=double)) is None
     monkeypatch.setenv("GRASPD_KERNEL", "off")
     assert kernel_problem(problem) is None
+
+
+@pytest.mark.parametrize("links", [1, 99])
+def test_hands_of_one_moving_link_and_of_a_hundred_links(tmp_path, scenes, links):
+    """A chain of boxes, as long as one may be; every seventh joint slides."""
+    box = '<collision><origin xyz="0 0 0.004"/><geometry><box size="0.006 0.006 0.008"/></geometry></collision>'
+    parts = [f'<link name="l{i}">{box}</link>' for i in range(links + 1)]
+    joint = (
+        '<joint name="j{0}" type="{1}"><parent link="l{2}"/><child link="l{0}"/><origin xyz="0 0 0.008"/>'
+        '<axis xyz="0 1 0"/><limit lower="-0.3" upper="0.4" effort="1" velocity="1"/></joint>'
+    )
+    parts += [joint.format(i, "prismatic" if i % 7 == 3 else "revolute", i - 1) for i in range(1, links + 1)]
+    path = tmp_path / "chain.urdf"
+    path.write_text(f'<robot name="chain">{"".join(parts)}</robot>')
+    hand = load_hand(str(path), candidates=300)
+    assert len(hand.joint_names) == links
+    problem = build_problem(scenes["box"], hand, ProblemConfig(candidates=150, features=16, directions=12), seed=0)
+    starts = draw_starts(scenes["box"], hand, 6, 0, "cpu", torch.float32)
+    x, radius = pack(moved_along(starts, problem.hand.pivot)), torch.linspace(0.001, 0.006, 6)
+    for look in LOOKS:
+        _, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, **look)
+        expected = by_torch(problem, x, radius, **look)
+        assert terms.penetration.tolist() == pytest.approx(expected.penetration.tolist(), rel=1e-3, abs=1e-4)
+        slope = gradient_of(problem, x, radius, WEIGHTS, **look)
+        assert ((gradient - slope).norm(dim=-1) / slope.norm(dim=-1)).median() < 1e-3
