@@ -3,7 +3,7 @@
 #include <atomic>
 #include <chrono>
 #include <exception>
-#include <memory>
+#include <mutex>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -37,35 +37,31 @@ class Stop {
     std::atomic<bool> stopped_{false};
 };
 
-// work(row, scratch, whether this is the caller's thread) for every row; the caller's thread takes part.
+// work(row, scratch, whether this is the caller's thread) for every row; the caller's thread takes part. What a thread
+// throws, for want of memory, ends the others and is thrown to the caller.
 template <class Work>
 static void for_rows(const Problem& p, int rows, int threads, Work work) {
     std::atomic<int> next{0};
+    std::exception_ptr failure;
+    std::mutex failing;
     auto run = [&](bool caller) {
-        Scratch scratch(p);
-        for (int row; (row = next++) < rows;) work(row, scratch, caller);
+        try {
+            Scratch scratch(p);
+            for (int row; (row = next++) < rows;) work(row, scratch, caller);
+        } catch (...) {
+            std::lock_guard<std::mutex> lock(failing);
+            failure = std::current_exception();
+            next = rows;
+        }
     };
     std::vector<std::thread> others;
-    for (int k = 1; k < std::min(threads, rows); k++) {
-        try {
-            others.emplace_back([&] {
-                try {
-                    run(false);
-                } catch (const std::bad_alloc&) {  // the others do its rows
-                }
-            });
-        } catch (const std::system_error&) {  // no thread to be had
-            break;
-        }
-    }
-    std::exception_ptr failed;
     try {
-        run(true);
-    } catch (...) {
-        failed = std::current_exception();
+        for (int k = 1; k < std::min(threads, rows); k++) others.emplace_back(run, false);
+    } catch (const std::system_error&) {  // no thread to be had: fewer do the same
     }
+    run(true);
     for (auto& other : others) other.join();
-    if (failed && next < rows) std::rethrow_exception(failed);
+    if (failure) std::rethrow_exception(failure);
 }
 
 }  // namespace graspd
