@@ -56,7 +56,8 @@ class Robot:
         self.joints: JointState | None = None
         self.pose: PoseStamped | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(String, "/graspd/status", self._on_status, 50)
+        told = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(String, "/graspd/status", self._on_status, told)
         self.node.create_subscription(JointState, "/graspd/joint_states", self._on_joints, latched)
         self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self._on_pose, latched)
         self.mesh = self.node.create_publisher(String, "/graspd/mesh", 10)
