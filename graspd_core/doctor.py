@@ -96,8 +96,8 @@ def run_checks() -> list[Check]:
         ("compiled kernel", _KERNEL, f"torch does its work, 30 times slower: {_SETUP}", False),
         *((name, _import_probe(name, module), _SETUP, True) for name, module in _LIBRARIES.items()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
-        ("pybullet", _BULLET, "only benchmarks need it, on Python 3.11: make setup, or pip install 'graspd[bench]'", False),
-        ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup, or pip install -c constraints.txt 'graspd[ros]'", False),
+        ("pybullet", _BULLET, "only benchmarks need it: make setup, on Python 3.11", False),
+        ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup (docs/ros.md)", False),
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:
         probed = list(pool.map(lambda probe: try_code(*probe), probes))
