@@ -35,7 +35,7 @@ format: setup  ## format and sort imports in place
 	$(RUN)/ruff format .
 
 docs: setup  ## the pages of docs/ and the reference of the library, to build/site; warnings are errors
-	$(RUN)/mkdocs build -q
+	$(RUN)/mkdocs build
 	@echo build/site/index.html
 
 pictures: setup  ## the picture of README.md anew
