@@ -56,91 +56,47 @@ if TYPE_CHECKING:
     from graspd_core.types import TriangleMesh as TriangleMesh
     from graspd_core.types import Verdict as Verdict
 
-# Where each name is.
+# The names of each module.
 _MODULES = {
-    # scenes
-    "scene.load_scene": ("load_scene",),
-    "scene.scene_from_views": ("scene_from_views",),
-    "scene.scene": ("Scene",),
-    "config": ("SceneConfig",),
-    "segmentation.target_selection": ("Target",),
-    "pointcloud.point_cloud": ("PointCloud",),
-    "pointcloud.camera": ("PinholeCamera",),
-    "pointcloud.depth_image": ("cloud_from_depth", "depth_in_metres"),
-    "mesh.mesh_files": (
-        "load_mesh",
-        "save_mesh",
-    ),
-    "mesh.shapes": ("make_shape",),
-    # hands
-    "hands.library": (
-        "hand_names",
-        "load_hand",
-    ),
-    "hands.model": ("HandModel",),
-    "hands.hand_mesh": ("hand_mesh",),
-    # planning
-    "planning.plan_grasps": (
-        "plan_grasps",
-        "warm_up",
-    ),
-    "methods.plan_config": (
-        "PlanConfig",
-        "load_preset",
-        "override",
-        "preset_names",
-    ),
-    "methods.problem": ("build_problem",),
-    # trials and metrics
-    "planning.verify_grasps": ("verify_grasps",),
-    "trials.trial_registry": (
-        "TRIALS",
-        "Trial",
-    ),
-    "metrics.metric_registry": (
-        "METRICS",
-        "Metric",
-    ),
-    # results
-    "types": (
-        "Grasp",
-        "GraspResult",
-        "Outcome",
-        "Posture",
-        "Progress",
-        "TrialResult",
-        "TriangleMesh",
-        "Verdict",
-    ),
-    "formats.grasps_json": ("save_result",),
-    "formats.read_grasps": ("load_grasps",),
-    "errors": ("GraspdError",),
+    "scene.load_scene": "load_scene",
+    "scene.scene_from_views": "scene_from_views",
+    "scene.scene": "Scene",
+    "config": "SceneConfig",
+    "segmentation.target_selection": "Target",
+    "pointcloud.point_cloud": "PointCloud",
+    "pointcloud.camera": "PinholeCamera",
+    "pointcloud.depth_image": "cloud_from_depth depth_in_metres",
+    "mesh.mesh_files": "load_mesh save_mesh",
+    "mesh.shapes": "make_shape",
+    "hands.library": "hand_names load_hand",
+    "hands.model": "HandModel",
+    "hands.hand_mesh": "hand_mesh",
+    "planning.plan_grasps": "plan_grasps warm_up",
+    "methods.plan_config": "PlanConfig load_preset override preset_names",
+    "methods.problem": "build_problem",
+    "planning.verify_grasps": "verify_grasps",
+    "trials.trial_registry": "TRIALS Trial",
+    "metrics.metric_registry": "METRICS Metric",
+    "types": "Grasp GraspResult Outcome Posture Progress TrialResult TriangleMesh Verdict",
+    "formats.grasps_json": "save_result",
+    "formats.read_grasps": "load_grasps",
+    "errors": "GraspdError",
 }
 # Names that version 0.1 had here: they are found with a warning until 0.3.
 _MOVED = {
-    "formats.grasps_json": ("grasp_figures",),
-    "formats.read_grasps": (
-        "grasps_of",
-        "load_document",
-    ),
-    "hands.kinematics": ("link_poses",),
-    "hands.model": (
-        "Mount",
-        "all_joint_names",
-        "all_joint_positions",
-    ),
-    "planning.plan_grasps": ("check_request",),
-    "planning.planning_worker": ("start_planning_worker",),
-    "pointcloud.point_cloud": ("transform_cloud",),
-    "runtime.heap": (
-        "limit_malloc_arenas",
-        "trim_heap",
-    ),
-    "runtime.worker_process": ("run_isolated",),
-    "trials.lift_trial": ("retreat_posture",),
+    "formats.grasps_json": "grasp_figures",
+    "formats.read_grasps": "grasps_of load_document",
+    "hands.kinematics": "link_poses",
+    "hands.model": "Mount all_joint_names all_joint_positions",
+    "planning.plan_grasps": "check_request",
+    "planning.planning_worker": "start_planning_worker",
+    "pointcloud.point_cloud": "transform_cloud",
+    "runtime.heap": "limit_malloc_arenas trim_heap",
+    "runtime.worker_process": "run_isolated",
+    "trials.lift_trial": "retreat_posture",
 }
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-_MOVED_TO = {name: module for module, names in _MOVED.items() for name in names}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
+_MOVED_TO = {name: module for module, names in _MOVED.items() for name in names.split()}
 
 __all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
