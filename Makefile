@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
+.PHONY: help setup test check format docs pictures wheel demo bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -33,6 +33,16 @@ check: setup  ## lint, formatting and types
 format: setup  ## format and sort imports in place
 	$(RUN)/ruff check --fix .
 	$(RUN)/ruff format .
+
+docs: setup  ## the pages of docs/ and the reference of the library, to build/site; warnings are errors
+	$(RUN)/mkdocs build
+	@echo build/site/index.html
+
+pictures: setup  ## the picture of README.md anew
+	$(RUN)/python scripts/pictures.py
+
+wheel: setup  ## a source distribution and a wheel, to dist/
+	$(RUN)/python -m build
 
 demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and figures out, in demo/
 	$(RUN)/python examples/demo.py

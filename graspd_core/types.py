@@ -153,8 +153,8 @@ class Grasp:
     pregrasp: Posture
     grasp: Posture
     squeeze: Posture
-    contacts: tuple[Contact, ...]
-    score: float
+    contacts: tuple[Contact, ...] = ()
+    score: float = 0.0
     metrics: GraspMetrics | None = None
     trials: tuple[TrialResult, ...] = ()
 

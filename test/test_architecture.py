@@ -79,8 +79,9 @@ MAY_IMPORT = {
     "doctor": BELOW_PLANNING | {"planning", "__init__"},
     "cli": BELOW_PLANNING | {"planning", "bench", "doctor", "__init__"},
 }
-# What the node sees: the public names, and values.
+# What the node sees: the public names, values, and what only a process that serves needs.
 NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags"}
+NODE_SEES |= {"runtime", "hands", "pointcloud", "formats", "planning"}
 
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {
@@ -308,7 +309,7 @@ def test_no_file_outside_the_packages_is_too_long():
         ("graspd_core/bench/suites.py", "def f():\n    from matplotlib import pyplot", "matplotlib"),
         ("graspd_core/attic/old.py", "x = 1", "not in the table"),
         ("graspd_core/types.py", "\n" * (MAX_LINES + 1), "split it"),
-        ("graspd_ros/node.py", "from graspd_core.pointcloud.point_cloud import crop", "pointcloud.point_cloud"),
+        ("graspd_ros/node.py", "from graspd_core.methods.losses import touch", "methods.losses"),
     ],
 )
 def test_the_checker_sees_a_planted_breach(path: str, source: str, culprit: str):

@@ -16,6 +16,15 @@ from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
 
 
+def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
+    """Read the grasps of a file that `save_result` wrote, in rank order.
+
+    Raises:
+        FormatError: missing, not of this format or version, or a grasp in it is malformed.
+    """
+    return grasps_of(load_document(path))
+
+
 def load_document(path: str | Path) -> dict[str, Any]:
     """Read a grasps file.
 

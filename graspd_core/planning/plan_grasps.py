@@ -46,7 +46,8 @@ def plan_grasps(
     Args:
         scene: from `load_scene` or `scene_from_views`; where the preset asks for another grid, that is built.
         hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
-        count, seed: verified grasps wanted; same seed, same machine, same grasps.
+        count: verified grasps wanted.
+        seed: same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
         verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         deadline: seconds from now after which the run ends with what it has.
@@ -69,9 +70,8 @@ def plan_grasps(
         message = out_of_reach(scene, hand)
         rounds = [] if message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    found = run_rounds(
-        run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device, measure=measure
-    )
+    request = {"count": count, "seed": seed, "verify": verify, "device": device, "measure": measure}
+    found = run_rounds(run, scene, hand, rounds, parts, **request)
     moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
     timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
