@@ -87,6 +87,8 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         score=float(_numbers_of(values, "score")),
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
+        # Files written before clouds were doubted have no such key.
+        probability=_scaled({"probability": None, **values}, "probability", 1.0),
     )
     if values["verdict"] != grasp.verdict:
         raise ValueError(f"verdict: {shown(values['verdict'])}; by its trials the grasp is {grasp.verdict}")

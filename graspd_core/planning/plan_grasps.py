@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
@@ -21,10 +22,11 @@ from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import parts_in_background, rank_by_robustness
 from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.reconstruction.next_view import next_view
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing
+from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
 
 
 def plan_grasps(
@@ -74,9 +76,12 @@ def plan_grasps(
     found = run_rounds(run, scene, hand, rounds, parts, **request)
     moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
     timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
+    message, view = (message, None) if found.good else _less_sure(scene, moved, far, message)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     model = scene.object
-    return GraspResult(outcome, moved, timing, seed, config.method, message, model.warnings, support, found.audits)
+    return GraspResult(
+        outcome, moved, timing, seed, config.method, message, model.warnings, support, found.audits, view
+    )
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
@@ -84,6 +89,20 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     if found.context is None or not config.robust.rank:
         return found.grasps
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
+
+
+def _less_sure(
+    scene: Scene, grasps: tuple[Grasp, ...], far: Float[np.ndarray, "3"], message: str
+) -> tuple[str, Float[np.ndarray, "4 4"] | None]:
+    """What a run says that found no grasp which is sure enough, and the view that would show most of what is hidden."""
+    held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in grasps)
+    if scene.evidence is None or not held:
+        return message, None
+    view = next_view(scene.evidence, scene.object.mesh, far)
+    told = f"{held} grasps hold on the likeliest shape, none is sure enough, since a part of the object was guessed"
+    if view is not None:
+        told += "; a view from ({:.2f}, {:.2f}, {:.2f}) m would show most of it".format(*view[:3, 3])
+    return told, view
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
