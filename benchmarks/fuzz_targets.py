@@ -254,7 +254,7 @@ TARGETS: dict[str, Target] = {
         ),
         Target(
             "mjcf", _hand, "xml", lambda: MJCFS, _errors("HandError"),
-            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_values", "_geoms"))),
+            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_geoms"))),
             (*_NUMBERS, "polycoef=", "eulerseq=", "childclass=", "<freejoint/>", "quat=", "xyaxes=", "fromto="),
         ),
         Target(
