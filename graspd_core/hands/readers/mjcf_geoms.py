@@ -122,6 +122,7 @@ def asset_hull(path: Path, mesh: MeshAsset, corners: int) -> TriangleMesh:
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
     points = mesh.vertices * mesh.scale
-    if len(points) == 0 or np.abs(points).max() > LARGEST_SIZE:
-        raise wrong(path, mesh.place, f"<mesh vertex=...>: {len(points)} points, not all within {LARGEST_SIZE:g} m")
+    if len(points) < 4 or np.abs(points).max() > LARGEST_SIZE:
+        text = f"{len(points)} points; expected four or more, within {LARGEST_SIZE:g} m"
+        raise wrong(path, mesh.place, f"<mesh vertex=...>: {text}")
     return limited_hull(points, corners)

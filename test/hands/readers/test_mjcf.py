@@ -84,6 +84,11 @@ def test_ranges_that_do_not_hold_limit_nothing(folder: Path, mjcf: str) -> None:
         ('size=".01 .02 .01"', 'size=".01 -.02 .01"', "changed.xml:13: .*size 1 must be positive in geom"),
         ('type="ellipsoid"', 'type="hfield"', "body 'tip': <geom type='hfield'> is not read; known: sphere"),
         ('mesh="w"', 'mesh="q"', "names the mesh 'q'; known: t, w"),
+        (
+            'vertex="0 0 0 .02 0 0 0 .02 0 0 0 .03"',
+            'vertex="0 0 0"',
+            "mesh 't': <mesh vertex=...>: 1 points; expected four",
+        ),
         ('file="wedge.obj"', 'file="lost.obj"', "mesh 'w': mesh 'lost.obj' was not found"),
         ('polycoef="0.1 .5 0 0 0"', 'polycoef="0.1 .5 2 0 0"', "only a straight line is read"),
         ('joint2="j3"', 'joint2="j9"', "changed.xml:19: .*unknown element 'j9' in equality constraint"),
