@@ -18,9 +18,10 @@ from jaxtyping import Float
 
 from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import HandModel, JointKind, Primitive
-from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.joint_limits import Coupling, JointSpec
 from graspd_core.hands.readers.link_meshes import corners_each
-from graspd_core.hands.readers.mimic import Coupling, resolved_couplings
+from graspd_core.hands.readers.mimic import resolved_couplings
 from graspd_core.hands.readers.mjcf_geoms import (
     MeshAsset,
     asset_hull,
