@@ -259,7 +259,7 @@ TARGETS: dict[str, Target] = {
         ),
         Target(
             "description", _description, "yaml", lambda: DESCRIPTIONS, _errors("HandError"),
-            ("graspd_core.hands.readers.description", "graspd_core.hands.readers.mount"),
+            ("graspd_core.hands.readers.description",),
             (*_NUMBERS, *_YAML, "palm:", "!!timestamp", ".nan"),
         ),
         Target(

@@ -44,8 +44,9 @@ def test_a_hand_without_the_entry_has_no_mount(tmp_path: Path) -> None:
     ("entry", "message"),
     [
         ("mount: tool0\n", r"mount: expected a mapping of keys to values, got 'tool0'"),
-        ("mount: {position: [0, 0, 0]}\n", r"mount.parent: expected the name of the arm's link, got None"),
-        ("mount: {parent: t, pose: 1}\n", r"mount.pose: unknown key; known: parent, position, quaternion_wxyz"),
+        ("mount: {position: [0, 0, 0]}\n", r"mount.parent is missing"),
+        ("mount: {parent: 3}\n", r"mount.parent: expected text, got 3"),
+        ("mount: {parent: t, pose: 1}\n", r"unknown key 'pose'; known: parent, position, quaternion_wxyz"),
         ("mount: {parent: t, position: [0, 0]}\n", r"mount.position: expected 3 numbers, got \[0, 0\]"),
         ("mount: {parent: t, position: [0, 0, .nan]}\n", r"mount.position: expected 3 numbers"),
         ("mount: {parent: t, quaternion_wxyz: [1, 1, 0, 0]}\n", r"mount.quaternion_wxyz: .*length 1, not 1.41"),
