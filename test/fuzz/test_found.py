@@ -157,8 +157,8 @@ def test_presets(fuzz: ModuleType, folder: Path, text: str, message: str) -> Non
     ("text", "message"),
     [
         ("effort: 1" + 400 * "0", "effort: expected positive numbers"),
-        ("palm: {center: [1.0e+308, 0, 0], normal: [0, 0, 1]}", "palm.center: expected three numbers"),
-        ("palm: {center: [0, 0, 0], normal: [1.0e+300, 1.0e+300, 0]}", "palm.normal: expected three numbers"),
+        ("palm: {center: [1.0e+308, 0, 0], normal: [0, 0, 1]}", "palm.center: expected 3 numbers"),
+        ("palm: {center: [0, 0, 0], normal: [1.0e+300, 1.0e+300, 0]}", "palm.normal: expected 3 numbers"),
         ("mount: {parent: a, position: [1" + 400 * "0" + ", 0, 0]}", "mount.position: expected 3 numbers"),
         ("mount: {parent: a, quaternion_wxyz: [1.0e+300, 0, 0, 0]}", "mount.quaternion_wxyz: expected 4 numbers"),
         ("effort: {? 0x" + 5000 * "f" + " : 1}", "no such joint"),

@@ -67,22 +67,14 @@ def assemble(
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
     specs = [by_name[link] for link in order]
     chain, couplings, mended = settled(path, [into[link] for link in order[1:]], couplings)
-    actuated = [joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
-    if not actuated:
+    joint_fields = _actuated([joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings])
+    if not joint_fields["joint_names"]:
         raise HandError(f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp")
-    limits = {
-        key: np.array([getattr(joint, key) for joint in actuated], dtype=float)
-        for key in ("lower", "upper", "effort", "velocity")
-    }
-    middle = 0.5 * (limits["lower"] + limits["upper"])
     return HandModel(
         name=name,
         urdf=str(path),
         link_names=tuple(order),
-        joint_names=tuple(joint.name for joint in actuated),
-        **limits,
-        open_posture=middle,
-        closed_posture=middle,
+        **joint_fields,
         palm_center=np.zeros(3),
         palm_normal=np.array([1.0, 0.0, 0.0]),
         approach=np.array([1.0, 0.0, 0.0]),
@@ -97,6 +89,15 @@ def assemble(
         candidate_link=np.zeros(0, dtype=np.int64),
         warnings=(*warnings, *mended),
     )
+
+
+def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
+    """The fields of a hand that have an entry for each actuated joint."""
+    keys = ("lower", "upper", "effort", "velocity")
+    limits = {key: np.array([getattr(joint, key) for joint in joints], dtype=float) for key in keys}
+    middle = 0.5 * (limits["lower"] + limits["upper"])
+    names = tuple(joint.name for joint in joints)
+    return {"joint_names": names, **limits, "open_posture": middle, "closed_posture": middle}
 
 
 def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
