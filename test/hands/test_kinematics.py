@@ -27,6 +27,7 @@ from graspd_core.hands.readers.urdf import read_urdf
 
 SLIDER = """<robot name="slider">
   <link name="rail"/><link name="cart"/><link name="plate"/><link name="arm"/><link name="second"/>
+  <link name="third"/>
   <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/>
     <origin xyz="0.1 0 0" rpy="0.3 -0.2 0.5"/><axis xyz="0 1 1"/>
     <limit lower="-0.1" upper="0.2" effort="5" velocity="1"/></joint>
@@ -34,6 +35,8 @@ SLIDER = """<robot name="slider">
   <joint name="turn" type="continuous"><parent link="plate"/><child link="arm"/><axis xyz="1 2 2"/></joint>
   <joint name="other" type="revolute"><parent link="rail"/><child link="second"/><origin xyz="0 0.2 0"/>
     <axis xyz="0 0 -1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="follows" type="revolute"><parent link="arm"/><child link="third"/><origin xyz="0.03 0 0" rpy="1 0 0"/>
+    <axis xyz="0 1 0"/><limit lower="-9" upper="9"/><mimic joint="other" multiplier="-0.7" offset="0.2"/></joint>
 </robot>"""
 
 

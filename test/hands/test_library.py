@@ -10,6 +10,7 @@ import pytest
 
 from graspd_core.errors import HandError
 from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import Mount
 from graspd_core.hands.readers.description import read_description
 from graspd_core.paths import config_dir
 
@@ -103,12 +104,44 @@ def test_unknown_hand_lists_the_known_ones() -> None:
         ("urdf: allegro_right.urdf", "urdf: !file allegro_right.urdf", r"yaml:\d+: not well-formed YAML: could not"),
         ("urdf: allegro_right.urdf", "urdf: 2026-99-99", r"yaml:1: not well-formed YAML: ValueError"),
         ("effort: 0.7", "effort: " + "[" * 3000, r"yaml:\d+: not well-formed YAML"),
+        *(
+            ("effort: 0.7", f"mount: {mount}", rf"yaml:\d+: {message}")
+            for mount, message in (
+                ("tool0", "mount: expected a mapping of keys to values, got 'tool0'"),
+                ("{position: [0, 0, 0]}", "mount.parent is missing"),
+                ("{parent: 3}", "mount.parent: expected text, got 3"),
+                ("{parent: t, pose: 1}", "unknown key 'pose'; known: parent, position, quaternion_wxyz"),
+                ("{parent: t, position: [0, 0]}", r"mount.position: expected 3 numbers, got \[0, 0\]"),
+                ("{parent: t, position: [0, 0, .nan]}", "mount.position: expected 3 numbers"),
+                ("{parent: t, quaternion_wxyz: [1, 1, 0, 0]}", "mount.quaternion_wxyz: .*length 1, not 1.41"),
+            )
+        ),
     ],
 )
 def test_a_bad_description_is_refused_by_line_and_key(allegro_copy: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(HandError, match=message) as caught:
         load_hand(_edit(allegro_copy, old, new))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        (
+            "mount: {parent: tool0, position: [0, 0, 0.02], quaternion_wxyz: [0.7071, 0, 0, 0.7071]}\n",
+            Mount("tool0", (0.0, 0.0, 0.02), (0.5**0.5, 0.0, 0.0, 0.5**0.5)),
+        ),
+        ("mount: {parent: flange}\n", Mount("flange", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))),
+        ("", None),
+    ],
+)
+def test_a_mount_is_read_and_its_quaternion_made_exact(allegro_copy: Path, entry: str, expected: Mount | None) -> None:
+    allegro_copy.write_text(allegro_copy.read_text() + entry)
+    mount = load_hand(allegro_copy, candidates=8).mount
+    assert (mount is None) == (expected is None)
+    if mount is not None and expected is not None:
+        assert (mount.parent, mount.position) == (expected.parent, expected.position)
+        assert mount.quaternion_wxyz == pytest.approx(expected.quaternion_wxyz, abs=1e-15)
 
 
 def test_a_description_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
