@@ -96,6 +96,10 @@ def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
         return _numbers_of_text(data[at:], 0, points, sum(counts))[:, columns]
     if header["DATA"][0] != "binary":
         return None
+    # Whatever else numpy would take for a type, or for a page of Python.
+    odd = [kind for kind in header["TYPE"] if kind.upper() not in ("F", "I", "U")]
+    if odd:
+        raise ValueError(f"its TYPE {odd[0][:40]!r} is none of F, I and U")
     sizes = [int(word) * count for word, count in zip(header["SIZE"], counts, strict=True)]
     codes = ["<" + header["TYPE"][place].lower() + header["SIZE"][place] for place in places]
     return _rows(data, _packed(codes, places, sizes), points, at)

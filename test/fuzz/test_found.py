@@ -79,6 +79,10 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
         (PCD.format(n=10**9, data="binary_compressed").encode() + bytes(24), "promises 1000000000 points or bytes"),
         (PCD.replace("1 1 1", "1 1 100000000").format(n=1, data="binary_compressed").encode(), "promises 100000000"),
         (PCD.replace("4 4 4", "4 4 5").format(n=1, data="binary").encode() + bytes(24), "not a readable pcd cloud"),
+        (
+            PCD.replace("F F F", "F F " + 5000 * "1").format(n=1, data="binary").encode() + bytes(12),
+            "is none of F, I and U",
+        ),
         (b"# 7\nFIELDS x y z\n", "its header has no SIZE"),
     ],
     ids=str,
