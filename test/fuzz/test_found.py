@@ -76,13 +76,24 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
         (PCD.format(n=2, data="ascii").encode() + b"0 0 1\n", "cut short: 1 of 2 points"),
         (PCD.format(n=10**9, data="ascii").encode() + b"0 0 1\n", "cut short: 1 of 1000000000 points"),
         (PCD.format(n=10**9, data="binary").encode() + bytes(24), "cut short: 2 of 1000000000 points"),
-        (PCD.format(n=10**9, data="binary_compressed").encode() + bytes(24), "promises 1000000000 points or bytes"),
-        (PCD.replace("1 1 1", "1 1 100000000").format(n=1, data="binary_compressed").encode(), "promises 100000000"),
+        (
+            PCD.format(n=10**9, data="binary_compressed").encode() + bytes(24),
+            "promises points of 12000000000 bytes, its data 0",
+        ),
+        (
+            PCD.replace("1 1 1", "1 1 100000000").format(n=1, data="binary_compressed").encode(),
+            "promises points of 400000008 bytes, its data 0",
+        ),
         (PCD.replace("4 4 4", "4 4 5").format(n=1, data="binary").encode() + bytes(24), "not a readable pcd cloud"),
         (
             PCD.replace("F F F", "F F " + 5000 * "1").format(n=1, data="binary").encode() + bytes(12),
             "is none of F, I and U",
         ),
+        (
+            PCD.format(n=1, data="binary_compressed").encode() + struct.pack("<II", 8, 24) + bytes(8),
+            "12 bytes, its data 8",
+        ),
+        (PCD.format(n=1, data="packed").encode() + bytes(12), "its DATA 'packed' is none of ascii, binary and"),
         (b"# 7\nFIELDS x y z\n", "its header has no SIZE"),
     ],
     ids=str,
