@@ -255,12 +255,12 @@ TARGETS: dict[str, Target] = {
         ),
         Target(
             "mjcf", _hand, "xml", lambda: MJCFS, _errors("HandError"),
-            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_values", "_geoms"))),
+            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_geoms"))),
             (*_NUMBERS, "polycoef=", "eulerseq=", "childclass=", "<freejoint/>", "quat=", "xyaxes=", "fromto="),
         ),
         Target(
             "description", _description, "yaml", lambda: DESCRIPTIONS, _errors("HandError"),
-            ("graspd_core.hands.readers.description", "graspd_core.hands.readers.mount"),
+            ("graspd_core.hands.readers.description",),
             (*_NUMBERS, *_YAML, "palm:", "!!timestamp", ".nan"),
         ),
         Target(

@@ -85,7 +85,7 @@ NODE_SEES |= {"runtime", "hands", "pointcloud", "formats", "planning"}
 
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {
-    "mujoco": ("graspd_core/trials/",),
+    "mujoco": ("graspd_core/trials/", "graspd_core/hands/readers/"),
     "pybullet": ("graspd_core/bench/bullet/",),
     "open3d": (
         "graspd_core/mesh/",

@@ -1,4 +1,4 @@
-"""The Allegro hand that graspd ships with: golden values, geometry, postures."""
+"""The Allegro and the LEAP hand that graspd ships with: their makers' figures, geometry, postures."""
 
 from __future__ import annotations
 
@@ -15,23 +15,33 @@ from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples
 
 TIPS = ("link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip")
-# Extents of the maker's meshes in their link frames [m]: lower corner, upper corner.
-PROXIMAL = ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0628])
-MEDIAL = ([-0.0098, -0.0135, -0.0063], [0.0098, 0.0135, 0.0472])
-DISTAL = ([-0.0098, -0.0135, -0.0063], [0.0098, 0.0135, 0.0157])
-BASE = ([-0.0098, -0.0135, 0.0], [0.0098, 0.0135, 0.0220])
-TIP = ([-0.0120, -0.0120, -0.0110], [0.0120, 0.0120, 0.0120])
-EXTENTS = {
+# Extents of the makers' meshes in their link frames [m]: lower corner, upper corner.
+ALLEGRO = {
     "base_link": ([-0.0295, -0.0567, -0.0950], [0.0113, 0.0567, 0.0017]),
-    **{f"link_{4 * finger}.0": BASE for finger in range(3)},
-    **{f"link_{4 * finger + 1}.0": PROXIMAL for finger in range(3)},
-    **{f"link_{4 * finger + 2}.0": MEDIAL for finger in range(3)},
-    **{f"link_{4 * finger + 3}.0": DISTAL for finger in range(3)},
-    **dict.fromkeys(TIPS, TIP),
+    **{f"link_{4 * finger}.0": ([-0.0098, -0.0135, 0.0], [0.0098, 0.0135, 0.0220]) for finger in range(3)},
+    **{f"link_{4 * finger + 1}.0": ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0628]) for finger in range(3)},
+    **{f"link_{4 * finger + 2}.0": ([-0.0098, -0.0135, -0.0063], [0.0098, 0.0135, 0.0472]) for finger in range(3)},
+    **{f"link_{4 * finger + 3}.0": ([-0.0098, -0.0135, -0.0063], [0.0098, 0.0135, 0.0157]) for finger in range(3)},
+    **dict.fromkeys(TIPS, ([-0.0120, -0.0120, -0.0110], [0.0120, 0.0120, 0.0120])),
     "link_12.0": ([-0.0392, -0.0080, -0.0080], [0.0055, 0.0260, 0.0415]),
     "link_13.0": ([-0.0098, -0.0135, -0.0002], [0.0098, 0.0135, 0.0218]),
     "link_14.0": ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0577]),
     "link_15.0": ([-0.0098, -0.0135, -0.0088], [0.0098, 0.0135, 0.0313]),
+}
+FINGER = {
+    "mcp_joint": ([-0.0430, -0.0080, -0.0028], [0.0100, 0.0625, 0.0330]),
+    "pip": ([-0.0095, -0.0146, -0.0231], [0.0245, 0.0150, -0.0001]),
+    # The lobes of its fork reach 4 mm farther than the box that stands for the fork.
+    "dip": ([-0.0100, -0.0461, -0.0029], [0.0245, 0.0080 - 0.0040, 0.0317]),
+    "fingertip": ([-0.0112, -0.0495, -0.0029], [0.0099, 0.0080, 0.0317]),
+}
+LEAP = {
+    "palm_lower": ([-0.1000, -0.0987, -0.0347], [0.0030, 0.0257, 0.0113]),
+    **{f"{name}{finger}": extent for name, extent in FINGER.items() for finger in ("", "_2", "_3")},
+    "pip_4": ([-0.0244, -0.0145, -0.0230], [0.0096, 0.0151, 0.0]),
+    "thumb_pip": ([-0.0100, -0.0173, -0.0249], [0.0100, 0.0173, 0.0001]),
+    "thumb_dip": ([-0.0186, -0.0096, -0.0316], [0.0099, 0.0545, 0.0030]),
+    "thumb_fingertip": ([-0.0112, -0.0622, -0.0309], [0.0184, 0.0094, 0.0021]),
 }
 
 
@@ -46,19 +56,30 @@ def test_joint_order_limits_and_effort(hand: HandModel) -> None:
     np.testing.assert_allclose(hand.upper, [0.47, 1.61, 1.709, 1.618] * 3 + [1.396, 1.163, 1.644, 1.719])
     np.testing.assert_allclose(hand.effort, 0.7)
     assert hand.link_mass.sum() == pytest.approx(0.9861)
+    leap = load_hand("leap_right")
+    # Names are bare numbers that do not rise along a finger; sorting them would permute the joints.
+    assert leap.joint_names == tuple(map(str, [1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11, 12, 13, 14, 15]))
+    np.testing.assert_allclose(leap.lower, [-0.314, -1.047, -0.506, -0.366] * 3 + [-0.349, -0.47, -1.2, -1.34])
+    np.testing.assert_allclose(leap.upper, [2.23, 1.047, 1.885, 2.042] * 3 + [2.094, 2.443, 1.9, 1.88])
+    np.testing.assert_allclose(leap.effort, 0.95)
+    assert leap.link_mass.sum() == pytest.approx(0.746)
+    assert (leap.open_posture[leap.joint_names.index("12")], leap.open_posture[0]) == (1.5, 0.2)
 
 
-@pytest.mark.parametrize("name", EXTENTS)
-def test_primitives_cover_the_true_extents(hand: HandModel, name: str) -> None:
-    meshes = [primitive_mesh(p).vertices for p in hand.primitives_of[hand.link_index[name]]]
-    vertices = np.concatenate(meshes)
-    lower, upper = EXTENTS[name]
-    # 0.06 mm: the extents are rounded to 0.1 mm, and the tip's ball is drawn with inscribed facets.
-    assert (vertices.min(0) <= np.array(lower) + 6e-5).all()
-    assert (vertices.max(0) >= np.array(upper) - 6e-5).all()
-    # 1 mm: the tip's ball reaches that far into the box behind it; everything else is as snug as the rounding.
-    assert (vertices.min(0) >= np.array(lower) - 1.0001e-3).all()
-    assert (vertices.max(0) <= np.array(upper) + 6e-5).all()
+@pytest.mark.parametrize(
+    ("name", "extents", "tolerance"),
+    # The extents are rounded to 0.1 mm, and balls are drawn with inscribed facets; LEAP's fingers differ by 0.1 mm.
+    [("allegro_right", ALLEGRO, 6e-5), ("leap_right", LEAP, 1.2e-4)],
+)
+def test_primitives_cover_the_true_extents(name: str, extents: dict[str, tuple], tolerance: float) -> None:
+    hand = load_hand(name)
+    for link, (lower, upper) in extents.items():
+        vertices = np.concatenate([primitive_mesh(p).vertices for p in hand.primitives_of[hand.link_index[link]]])
+        np.testing.assert_allclose(vertices.max(0), upper, atol=tolerance, err_msg=link)
+        # The ball of Allegro's tips reaches a millimetre into the box behind it.
+        inside = 1e-3 if link in TIPS else 0.0
+        assert (vertices.min(0) <= np.array(lower) + tolerance).all(), link
+        assert (vertices.min(0) >= np.array(lower) - tolerance - inside).all(), link
 
 
 def test_a_fist_is_seen_to_collide(hand: HandModel) -> None:
@@ -68,8 +89,24 @@ def test_a_fist_is_seen_to_collide(hand: HandModel) -> None:
     assert overlap.max() > 3e-3
 
 
-def test_thumb_opposes_the_fingers_when_open(hand: HandModel) -> None:
-    tips = link_poses(hand, hand.open_posture)[1][[hand.link_index[name] for name in TIPS]]
+@pytest.mark.parametrize(
+    ("name", "links", "fingers", "thumb"),
+    [
+        ("allegro_right", TIPS, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        # Points amid the soft tips, where others put their tip frames.
+        (
+            "leap_right",
+            ("fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip"),
+            (0.0, -0.04, 0.015),
+            (0.0, -0.045, -0.015),
+        ),
+    ],
+)
+def test_thumb_opposes_the_fingers_when_open(name: str, links: tuple, fingers: tuple, thumb: tuple) -> None:
+    hand = load_hand(name)
+    ends = [hand.link_index[link] for link in links]
+    rotations, translations = link_poses(hand, hand.open_posture)
+    tips = np.einsum("nij,nj->ni", rotations[ends], np.array([fingers] * 3 + [thumb])) + translations[ends]
     assert ((tips - hand.palm_center) @ hand.palm_normal > 0.03).all()
     assert np.linalg.norm(tips[3] - tips[1]) > 0.08  # room for an object of 8 cm
 
