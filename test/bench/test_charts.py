@@ -64,7 +64,7 @@ def test_nothing_to_draw_is_no_chart(tmp_path: Path, record):
 @pytest.mark.parametrize("shapes", [["mug"], ["mug", "box", "mug"]])
 def test_the_chart_of_the_ranking_has_a_bar_for_each_shape_and_a_curve_for_each_order(tmp_path: Path, shapes):
     costs = {"plan_cpu_s": 2.0, "ranked_plan_cpu_s": 3.0}
-    found = [{"shape": shape, "held": [0.5, 1.0], "ranked_by": [0.25, 0.75], **costs} for shape in shapes]
+    found = [{"shape": shape, "shares": [0.5, 1.0], "ranked_by": [0.25, 0.75], **costs} for shape in shapes]
     assert draw_robust(found, tmp_path / "robust") == tmp_path / "robust.png"
     drawing = (tmp_path / "robust.svg").read_text()
     for text in ("ranked by score", "ranked by noisy trials", "CPU seconds for 2 verified grasps"):

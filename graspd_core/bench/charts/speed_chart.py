@@ -11,10 +11,9 @@ import numpy as np
 
 from graspd_core.bench.charts.chart_style import FRONT, figure, place_labels, save
 from graspd_core.bench.charts.sweep_chart import draw_sweeps
-from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
+from graspd_core.bench.figures import Row, by_name, pareto_front, per_verified, rows, spread
 from graspd_core.bench.names import is_preset, is_sweep_value, parent_of, short_name
-from graspd_core.bench.pareto import pareto_front
-from graspd_core.bench.result_store import Record
+from graspd_core.bench.study import Record
 from graspd_core.methods.method_registry import METHODS
 
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from graspd_core.bench.failure_maps.map_job import Done, Job, plan, settings, try_grasps
+from graspd_core.bench.failure_maps.map_case import Done, MapCase, plan, settings, try_grasps
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.rendering.depth_noise import DEFAULT, NONE, DepthNoise
@@ -26,12 +26,12 @@ _SAMPLES = 4000
 _FOUND = 0.005
 
 
-def run(job: Job) -> Done:
+def run(case: MapCase) -> Done:
     """Plan on the reconstruction of one view at that elevation [deg]; try on the true object in its place."""
-    (noise,) = job.up
-    truth, scene = _seen(job.thing, float(job.across), float(noise), job.seed, settings(job.preset).resolution)
-    hand, grasps = plan(job, scene)
-    cell = try_grasps(job, noise, hand, truth, grasps, PROTOCOLS["standard"])
+    (noise,) = case.up
+    truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
+    hand, grasps = plan(case, scene)
+    cell = try_grasps(case, noise, hand, truth, grasps, PROTOCOLS["standard"])
     return Done((cell,), _errors(truth.mesh, scene.object.mesh))
 
 

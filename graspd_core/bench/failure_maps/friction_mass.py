@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graspd_core.bench.failure_maps.map_job import Done, Job, plan, settings, try_grasps
+from graspd_core.bench.failure_maps.map_case import Done, MapCase, plan, settings, try_grasps
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import ObjectModel
@@ -18,13 +18,13 @@ MASSES = (0.005, 0.03, 0.1, 0.3, 1.0, 2.0)
 THINGS = ("cylinder", "mug")
 
 
-def run(job: Job) -> Done:
-    """Plan at the friction of the job, for the 0.1 kg that planning supposes; try at every mass."""
-    config = settings(job.preset)
-    scene = load_scene(f"shape:{job.thing}", friction=float(job.across), resolution=config.resolution)
-    hand, grasps = plan(job, scene)
-    protocol = at_friction(PROTOCOLS["standard"], float(job.across))
-    cells = tuple(try_grasps(job, mass, hand, at_mass(scene.object, mass), grasps, protocol) for mass in job.up)
+def run(case: MapCase) -> Done:
+    """Plan at the friction of the case, for the 0.1 kg that planning supposes; try at every mass."""
+    config = settings(case.preset)
+    scene = load_scene(f"shape:{case.thing}", friction=float(case.across), resolution=config.resolution)
+    hand, grasps = plan(case, scene)
+    protocol = at_friction(PROTOCOLS["standard"], float(case.across))
+    cells = tuple(try_grasps(case, mass, hand, at_mass(scene.object, mass), grasps, protocol) for mass in case.up)
     stiffness = np.where(hand.slides, protocol.slide_stiffness, protocol.stiffness)
     shares = [effort_used(hand, grasp, stiffness) for grasp in grasps]
     return Done(cells, {"effort_used": float(np.median(shares)) if shares else None})

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import torch
 
-from graspd_core.bench.failure_maps.map_job import Done, Job, plan, try_grasps
+from graspd_core.bench.failure_maps.map_case import Done, MapCase, plan, try_grasps
 from graspd_core.bench.stress.broken_meshes import thin_cup
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
@@ -20,12 +20,12 @@ THINGS = ("cup",)
 _SAMPLES = 4000
 
 
-def run(job: Job) -> Done:
+def run(case: MapCase) -> Done:
     """Plan on a grid of that resolution, and no finer, of a cup with walls of so many millimetres."""
-    (wall,) = job.up
-    scene = on_grid(cup(float(wall)), int(job.across))
-    hand, grasps = plan(job, scene)
-    cell = try_grasps(job, wall, hand, scene.object, grasps, PROTOCOLS["standard"])
+    (wall,) = case.up
+    scene = on_grid(cup(float(wall)), int(case.across))
+    hand, grasps = plan(case, scene)
+    cell = try_grasps(case, wall, hand, scene.object, grasps, PROTOCOLS["standard"])
     return Done((cell,), grid_errors(scene))
 
 

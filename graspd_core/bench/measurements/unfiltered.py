@@ -6,7 +6,7 @@ from typing import Any
 
 from graspd_core.bench.measurements.benchmark_trials import TRIALS, Tried
 from graspd_core.bench.measurements.measurement import Cell
-from graspd_core.bench.measurements.stopwatch import Stopwatch
+from graspd_core.bench.stopwatch import Stopwatch
 from graspd_core.hands.library import load_hand
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
@@ -21,7 +21,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
-        scene = load_scene(cell.source, resolution=cell.settings.resolution)
+        scene = load_scene(cell.object, resolution=cell.settings.resolution)
     with stopwatch("optimise"):
         found = find_candidates(scene, hand, count=cell.count, seed=cell.seed, config=cell.settings, hooks=Hooks())
     grasps = found.grasps[: cell.count]
