@@ -17,7 +17,7 @@ from graspd_core.bench.studies import (
 )
 from graspd_core.bench.study import Study
 
-_CELLS = ("measurements/*.py",)
+_CELLS = ("measurements/*.py", "bullet/*.py", "object_case.py")
 _RAW = ("objects", "seeds", "count", "hand", "trials", "quick")
 _PLANS = ("presets", "objects", "seeds", "count", "hand", "quick")
 
@@ -63,7 +63,7 @@ STUDIES: dict[str, Study] = {
         seen_objects.seen_cases,
         seen_objects.run_seen,
         rgbd_table.rgbd_sections,
-        ("studies/seen_objects.py",),
+        ("studies/seen_objects.py", "object_case.py"),
         _PLANS,
         seen_objects.seen_seconds,
         came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
@@ -73,7 +73,7 @@ STUDIES: dict[str, Study] = {
         robust_ranking.robust_cases,
         robust_ranking.run_robust,
         robust_ranking.robust_sections,
-        ("studies/robust_ranking.py",),
+        ("studies/robust_ranking.py", "object_case.py"),
         _PLANS,
         lambda case: 2.0 + 2.5 * case.count,
     ),
@@ -82,7 +82,7 @@ STUDIES: dict[str, Study] = {
         map_registry.map_cases,
         map_registry.run_map,
         map_report.map_sections,
-        ("failure_maps/[!m]*.py", "failure_maps/map_case.py", "failure_maps/map_registry.py"),
+        ("failure_maps/[!m]*.py", "failure_maps/map_case.py", "failure_maps/map_registry.py", "object_case.py"),
         ("cases", "quick"),
         map_registry.map_seconds,
     ),
@@ -104,7 +104,7 @@ STUDIES: dict[str, Study] = {
         early_ends.early_cases,
         early_ends.run_early,
         early_ends.early_sections,
-        ("studies/early_ends.py",),
+        ("studies/early_ends.py", "object_case.py"),
         _PLANS,
         lambda case: 2.0 + 1.2 * case.count,
     ),
@@ -113,7 +113,7 @@ STUDIES: dict[str, Study] = {
         simulators.simulator_cases,
         simulators.run_simulators,
         simulators.simulator_sections,
-        ("studies/simulators.py", "bullet/*.py"),
+        ("studies/simulators.py", "object_case.py", "bullet/*.py"),
         _PLANS,
         lambda case: 2.0 + 2.5 * case.count,
     ),
@@ -122,7 +122,7 @@ STUDIES: dict[str, Study] = {
         human_hand.mano_cases,
         human_hand.run_mano,
         human_hand.mano_sections,
-        ("studies/human_hand.py", "bullet/*.py"),
+        ("studies/human_hand.py", "object_case.py", "bullet/*.py"),
         _PLANS,
         usual=False,
     ),

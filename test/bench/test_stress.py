@@ -43,7 +43,7 @@ def test_cases_are_named_once_and_expect_endings_that_there_are():
 
 @pytest.mark.parametrize(
     "name", ["nan-vertices", "zero-faces", "all-degenerate", "micrometre", "no-mesh-at-all", "bad-indices", "cut-off",
-             "empty", "no-view", "all-nan", "ten-points", "zero-width", "lying-sizes"]
+             "empty", "no-view", "all-nan", "ten-points", "zero-width", "lying-sizes", "integer-fields", "no-object"]
 )  # fmt: skip
 def test_what_shows_nothing_is_refused_in_one_line(name: str):
     # What it took is the study's to say: this process holds what other tests left, and is not alone on the machine.

@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+from graspd_core.bench.object_case import raw_grasps
 from graspd_core.bench.study import Case
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.trials.hold_trial import hold_trial
@@ -108,8 +107,7 @@ def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
     """The hand, and the first of the method's own ranking, none filtered by a trial."""
     config = settings(case.preset)
     hand = hand_for(case.hand, config.problem.fine_candidates)
-    found = find_candidates(scene, hand, count=case.count, seed=case.seed, config=config, hooks=Hooks())
-    return hand, found.grasps[: case.count]
+    return hand, raw_grasps(scene, hand, config, case.count, case.seed)
 
 
 def try_grasps(

@@ -15,15 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from graspd_core.bench.object_case import ObjectCase, raw_grasps
 from graspd_core.bench.report import markdown_table
-from graspd_core.bench.study import Case, Record, Request, Sections, find_objects, object_hash
+from graspd_core.bench.study import Record, Request, Sections, find_objects
 from graspd_core.config import RobustConfig
-from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.library import hand_names
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import load_preset
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene, object_parts
 from graspd_core.trials.gravity_trial import gravity_trial
@@ -34,11 +31,7 @@ from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
 from graspd_core.types import Grasp, Plane, TriangleMesh
 
 # Thin things: an authored shape, and factors on its three extents.
-THIN: Mapping[str, tuple[str, tuple[float, ...]]] = {
-    "sheet": ("plate", (1.0, 1.0, 0.3)),
-    "rod": ("box", (0.2, 0.2, 2.0)),
-    "strip": ("box", (0.1, 0.5, 2.0)),
-}
+THIN = (("shape:plate", (1.0, 1.0, 0.3)), ("shape:box", (0.2, 0.2, 2.0)), ("shape:box", (0.1, 0.5, 2.0)))
 SHAPES = ("shape:mug", "shape:hammer", "shape:torus")
 ERROR_SEED = 4711
 # A grasp, whether the trial lasts its full length, and the hand's error, to what the trial says.
@@ -46,37 +39,36 @@ Trial = Callable[[Grasp, bool, Any], Any]
 
 
 @dataclass(frozen=True)
-class EarlyEnds(Case):
-    """The first `count` grasps of a hand on a thing, which is a thin one by its name or an object."""
+class EarlyEnds(ObjectCase):
+    """Grasps of an object, or of a thin thing made of it by factors on its extents."""
 
-    thing: str
-    hand: str
-    preset: str
-    seed: int
-    count: int
+    factors: tuple[float, ...] = ()
 
-    def asked(self) -> Record:
-        return {**super().asked(), "content": "" if self.thing in THIN else object_hash(self.thing)}
+    def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
+        hand, scene = super().load(friction)
+        if not self.factors:
+            return hand, scene
+        mesh = scene.object.mesh
+        return hand, load_scene(TriangleMesh(mesh.vertices * self.factors, mesh.faces))
 
 
 def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
     """Every hand on a few shapes and thin things."""
-    things = (*find_objects(request.objects or SHAPES), *(() if request.objects else THIN))
+    things = [(thing, ()) for thing in find_objects(request.objects or SHAPES)]
     hands = (request.hand,) if request.hand else hand_names()
-    seeds, count = request.seeds or (0,), request.count or 4
     cases = tuple(
-        EarlyEnds(thing, hand, request.preset(), seed, count) for seed in seeds for thing in things for hand in hands
+        EarlyEnds(thing, request.preset(), hand, seed, request.count or 4, factors)
+        for seed in request.seeds or (0,)
+        for thing, factors in (*things, *(() if request.objects else THIN))
+        for hand in hands
     )
     return cases[:1] if request.quick else cases
 
 
 def run_early(case: EarlyEnds) -> Record:
     """Both lengths of every trial of every grasp."""
-    config = load_preset(case.preset)
-    hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
-    scene = _scene(case.thing, config.resolution)
-    found = find_candidates(scene, hand, count=case.count, seed=case.seed, config=config, hooks=Hooks())
-    grasps = found.grasps[: case.count]
+    hand, scene = case.load()
+    grasps = raw_grasps(scene, hand, case.config, case.count, case.seed)
     errors = pose_errors((ERROR_SEED, case.seed), max(len(grasps), 1))
     trials = trials_of(hand, scene) if grasps else {}
     return {
@@ -126,10 +118,9 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     told = []
     for record in (record for record in records if not record["error"]):
         for row in record["rows"]:
-            names = [
-                row["group"],
-                *(["of standard, thin"] if record["thing"] in THIN and row["group"] == "standard" else []),
-            ]
+            names = [row["group"]]
+            if record["factors"] and row["group"] == "standard":
+                names.append("of standard, thin")
             for name in names:
                 groups.setdefault(name, []).append(row)
             if row["early"].get("passed") != row["late"].get("passed"):
@@ -138,14 +129,6 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     headings += ["CPU ms, all: full, early", "passing: full, early"]
     body = [[name, str(len(rows)), *_figures(rows)] for name, rows in groups.items()]
     return {"early-ends": [markdown_table(headings, body), "\n".join(told)] if body else []}
-
-
-def _scene(thing: str, resolution: int) -> Scene:
-    if thing not in THIN:
-        return load_scene(thing, resolution=resolution)
-    shape, factors = THIN[thing]
-    mesh = make_shape(shape)
-    return load_scene(TriangleMesh(mesh.vertices * factors, mesh.faces), resolution=resolution)
 
 
 def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:

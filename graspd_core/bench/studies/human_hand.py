@@ -12,21 +12,20 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
 from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
+from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
 from graspd_core.bench.report import markdown_table
-from graspd_core.bench.study import Case, Record, Request, Sections, find_objects, object_hash, thing_name
+from graspd_core.bench.study import Record, Request, Sections, object_hash, thing_name
 from graspd_core.errors import ConfigError
 from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_distance import make_distance_query
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import load_preset
+from graspd_core.methods.plan_config import to_mapping
 from graspd_core.metrics.skin_metrics import measure_skin
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import object_parts
@@ -34,7 +33,7 @@ from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import PROTOCOLS, build_world
 
 SHAPES = ("shape:sphere", "shape:cylinder", "shape:box")
-COUNT, BEST = 8, 2
+BEST = 2
 # Turpin et al. 2022, table 1, MANO: mean over 57 ShapeNet objects of the two best grasps each.
 PAPER = {"Grasp'D": (43.0, 5.70, 7.55, 0.59), "ObMan / GraspIt!": (9.4, 1.28, 7.37, 1.95)}
 _HEADINGS = ["object", "held, raw", "contact area cm² within 2 mm (5, 10)", "intersection cm³", "CA/IV 1/cm"]
@@ -42,22 +41,13 @@ _HEADINGS += ["displacement cm", "penetration mm"]
 
 
 @dataclass(frozen=True)
-class HumanGrasps(Case):
-    """The grasps of one object by a model file."""
+class HumanGrasps(ObjectCase):
+    """Grasps of an object with the model in a file."""
 
-    model: str
-    content: str
-    thing: str
-    preset: str
-    seed: int
-    count: int
-
-    @property
-    def label(self) -> str:
-        return f"{Path(self.model).stem} {thing_name(self.thing)} {self.preset} {self.seed}"
+    content: str = ""
 
     def asked(self) -> Record:
-        return {**super().asked(), "model": "", "thing": object_hash(self.thing)}
+        return {**asdict(self), "hand": "", "object": object_hash(self.object), "settings": to_mapping(self.config)}
 
 
 def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
@@ -65,26 +55,21 @@ def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
     model = Path(request.hand)
     if not model.is_file():
         raise ConfigError(f"hand: {request.hand or 'none given'}; valid: MANO_RIGHT.pkl or MANO_LEFT.pkl, as a path")
-    content, count = hashlib.sha256(model.read_bytes()).hexdigest(), request.count or COUNT
-    return tuple(
-        HumanGrasps(str(model), content, thing, request.preset(), seed, count)
-        for thing in find_objects(request.objects or SHAPES)
-        for seed in request.seeds or (0,)
-    )
+    content = hashlib.sha256(model.read_bytes()).hexdigest()
+    return tuple(HumanGrasps(**vars(case), content=content) for case in object_cases(request, SHAPES, 8))
 
 
 def run_mano(case: HumanGrasps) -> Record:
     """Plan on one object, try every grasp, measure the best."""
-    config = load_preset(case.preset)
-    mano = load_mano(Path(case.model), [], candidates=config.problem.fine_candidates)
-    scene = load_scene(case.thing, resolution=config.resolution)
+    config = case.config
+    mano = load_mano(Path(case.hand), [], candidates=config.problem.fine_candidates)
+    scene = load_scene(case.object, resolution=config.resolution)
     began = time.process_time()
-    hooks = Hooks()
-    grasps = find_candidates(scene, mano.model, count=case.count, seed=case.seed, config=config, hooks=hooks).grasps
+    grasps = raw_grasps(scene, mano.model, config, case.count, case.seed)
     seconds = (time.process_time() - began) / case.count
     parts = object_parts(scene.object)
     world = build_world(mano.model, scene.object, parts, PROTOCOLS["standard"])
-    holds = [hold_trial(world, grasp, PROTOCOLS["standard"]) for grasp in grasps[: case.count]]
+    holds = [hold_trial(world, grasp, PROTOCOLS["standard"]) for grasp in grasps]
     query = make_distance_query(scene.object.mesh)
     skins = [measure_skin(query, mano.skinned_mesh(grasp.grasp)) for grasp in grasps[:BEST]]
     bullet = build_bullet_world(mano.model, scene.object, parts) if bullet_available() else None
@@ -103,8 +88,8 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """The objects, their mean, and the paper's rows, as Markdown."""
     good = [record for record in records if not record["error"]]
     measured = [record for record in good if record["contact_area_cm2"]]
-    body = [_row(thing_name(r["thing"]), f"{r['held']}/{r['count']}", [r]) for r in measured]
-    body += [[thing_name(r["thing"]), "no grasp found", *[""] * 5] for r in good if r not in measured]
+    body = [_row(thing_name(r["object"]), f"{r['held']}/{r['count']}", [r]) for r in measured]
+    body += [[thing_name(r["object"]), "no grasp found", *[""] * 5] for r in good if r not in measured]
     if measured:
         share = sum(r["held"] for r in good) / sum(r["count"] for r in good)
         body.append(_row("**mean**", f"{share:.0%}", measured))

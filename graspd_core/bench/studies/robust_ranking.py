@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.bench.object_case import ObjectCase, object_cases
 from graspd_core.bench.report import markdown_table
-from graspd_core.bench.study import Case, Picture, Record, Request, Sections, find_objects, thing_name
-from graspd_core.hands.library import load_hand
-from graspd_core.methods.plan_config import load_preset
+from graspd_core.bench.study import Picture, Record, Request, Sections, thing_name
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import object_parts
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
@@ -28,34 +26,19 @@ from graspd_core.types import Verdict
 SHAPES = ("shape:box", "shape:plate", "shape:torus", "shape:bottle", "shape:l_block", "shape:hammer")
 # Errors of the evaluating trials: as many for each grasp, from a seed that no plan draws from.
 EVALUATIONS, EVALUATION_SEED = 16, 977
+FRICTION = 0.6
 
 
-@dataclass(frozen=True)
-class Ranking(Case):
-    """A plan with and one without ranking, of `count` verified grasps at a friction."""
-
-    object: str
-    seed: int
-    count: int
-    preset: str
-    hand: str
-    friction: float = 0.6
-
-
-def robust_cases(request: Request) -> tuple[Ranking, ...]:
+def robust_cases(request: Request) -> tuple[ObjectCase, ...]:
     """One a shape and seed."""
-    things = find_objects(request.objects or SHAPES[: 1 if request.quick else None])
-    count, hand = request.count or (2 if request.quick else 8), request.hand or "allegro_right"
-    seeds = request.seeds or (0,)
-    return tuple(Ranking(thing, seed, count, request.preset(), hand) for seed in seeds for thing in things)
+    return object_cases(request, SHAPES, 8)
 
 
-def run_robust(case: Ranking) -> Record:
+def run_robust(case: ObjectCase) -> Record:
     """Costs of both plans; what each grasp was ranked by, and what it really holds."""
-    config = load_preset(case.preset)
+    config = case.config
     ranked = replace(config, robust=replace(config.robust, rank=True))
-    hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
-    scene = load_scene(case.object, resolution=config.resolution, friction=case.friction)
+    hand, scene = case.load(friction=FRICTION)
     # The parts are built once and belong to neither run.
     parts = object_parts(scene.object)
     began = time.process_time()
@@ -64,7 +47,7 @@ def run_robust(case: Ranking) -> Record:
     robust = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=ranked)
     ended = time.process_time()
     shares = {g.score: g.metrics["robustness"] for g in robust.grasps if g.metrics and g.verdict is Verdict.VERIFIED}
-    protocol = at_friction(PROTOCOLS["standard"], case.friction)
+    protocol = at_friction(PROTOCOLS["standard"], FRICTION)
     world, errors = build_world(hand, scene.object, parts, protocol), pose_errors(EVALUATION_SEED, EVALUATIONS)
     verified = [g for g in plain.grasps if g.verdict is Verdict.VERIFIED]
     return {

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.bench.study import Case, Record, Request, find_objects
+from graspd_core.bench.object_case import ObjectCase, object_cases
+from graspd_core.bench.study import Record, Request
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
@@ -22,7 +23,6 @@ from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.mesh.winding_number import winding_inside
-from graspd_core.methods.plan_config import load_preset
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.rendering.depth_noise import DEFAULT
 from graspd_core.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
@@ -45,37 +45,18 @@ FOUND, SAMPLES = 0.005, 20_000
 
 
 @dataclass(frozen=True)
-class Seen(Case):
-    """What is seen, and what is planned on it.
+class Seen(ObjectCase):
+    """Grasps of what `views` cameras see; 0 plans on the true mesh. The seed is of noise and grasps, and of the place
+    of the first camera."""
 
-    Attributes:
-        object: shape:NAME, or a mesh in metres.
-        views: cameras: 1, 3, 15; 0 plans on the true mesh.
-        start: 0 to 2: azimuth of the first camera, elevation, and the seed of noise and grasps.
-        count: verified grasps asked for.
-        preset: of the optimiser.
-        hand: by name.
-    """
-
-    object: str
-    views: int
-    start: int
-    count: int
-    preset: str
-    hand: str
+    views: int = 1
 
 
 def seen_cases(request: Request) -> tuple[Seen, ...]:
-    """Every object from every number of views; `seeds` are starts, by default the first two."""
-    things = find_objects(request.objects or [f"shape:{name}" for name in SHAPES[: 1 if request.quick else None]])
-    starts = request.seeds or (0, 1)[: 1 if request.quick else None]
-    count, hand = request.count or (2 if request.quick else 4), request.hand or "allegro_right"
-    return tuple(
-        Seen(thing, views, start, count, request.preset(), hand)
-        for thing in things
-        for views in (VIEWS[:2] if request.quick else VIEWS)
-        for start in starts
-    )
+    """Every object from every number of views, by default from two places."""
+    request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
+    cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
+    return tuple(Seen(**vars(case), views=views) for case in cases for views in VIEWS[: 2 if request.quick else None])
 
 
 def seen_seconds(case: Seen) -> float:
@@ -85,10 +66,10 @@ def seen_seconds(case: Seen) -> float:
 
 def run_seen(case: Seen) -> Record:
     """Everything that is reported of one case; a refusal is a result with its message."""
-    hand = load_hand(case.hand, candidates=load_preset(case.preset).problem.fine_candidates)
+    hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     thing = case.object.removeprefix("shape:")
     stage = tabletop(thing if case.object.startswith("shape:") else load_mesh(case.object), yaw=YAW)
-    clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.start) if case.views else []
+    clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
     _load_libraries()
     # Or the full mesh would be met again at its next start.
     disk_cache.forget()
@@ -103,8 +84,8 @@ def run_seen(case: Seen) -> Record:
 
 def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
     """One camera, three around, or two rings of eight and seven."""
-    azimuth = np.deg2rad(20.0 + 120.0 * case.start)
-    elevation = np.deg2rad(ELEVATIONS[case.start % len(ELEVATIONS)])
+    azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
+    elevation = np.deg2rad(ELEVATIONS[case.seed % len(ELEVATIONS)])
     if case.views <= 3:
         return ring_poses(case.views, elevation=elevation, azimuth=azimuth)
     upper = ring_poses(case.views // 2, elevation=np.deg2rad(60.0), azimuth=azimuth + 0.2)
@@ -124,8 +105,8 @@ def _true_scene(stage: TabletopScene, source: str) -> Scene:
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
     """Plan one grasp against the clock, then `count`; try all that were verified on the truth."""
-    first = plan_grasps(scene, hand, count=1, seed=case.start, preset=case.preset)
-    many = plan_grasps(scene, hand, count=case.count, seed=case.start, preset=case.preset)
+    first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
+    many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
     protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
     parts = object_parts(truth.object)
     world = build_world(hand, truth.object, parts, protocol)

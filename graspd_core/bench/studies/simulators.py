@@ -7,7 +7,7 @@ of place by up to 5 mm and 5°, as in the noisy trial, so that failures are amon
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,52 +15,33 @@ import numpy as np
 from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
 from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
 from graspd_core.bench.bullet.bullet_world import build_bullet_world
+from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
 from graspd_core.bench.report import markdown_table
-from graspd_core.bench.study import Case, Record, Request, Sections, all_shapes, find_objects, thing_name
-from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.bench.study import Record, Request, Sections, all_shapes, thing_name
 from graspd_core.scene.scene import object_parts
 from graspd_core.trials.displacement_trial import build_frozen_world, displacement_trial
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.noisy_trial import displaced, pose_error
 from graspd_core.trials.world import PROTOCOLS, build_world
 
-
-@dataclass(frozen=True)
-class Comparison(Case):
-    """`count` grasps of an object, and as many out of place, with pulls of `pull` [s] in both simulators."""
-
-    object: str
-    preset: str
-    seed: int
-    count: int
-    hand: str
-    pull: float = 0.5
+# Seconds of each pull, in both simulators; MuJoCo tries the full length as well.
+PULL = 0.5
 
 
-def simulator_cases(request: Request) -> tuple[Comparison, ...]:
+def simulator_cases(request: Request) -> tuple[ObjectCase, ...]:
     """One a shape and seed."""
-    things = find_objects(request.objects or all_shapes()[: 1 if request.quick else None])
-    count, hand = request.count or (1 if request.quick else 4), request.hand or "allegro_right"
-    seeds = request.seeds or (0,)
-    return tuple(Comparison(thing, request.preset(), seed, count, hand) for seed in seeds for thing in things)
+    return object_cases(request, all_shapes(), 4, 1)
 
 
-def run_simulators(case: Comparison) -> Record:
+def run_simulators(case: ObjectCase) -> Record:
     """Both simulators on the grasps of one object: a trial each."""
-    config = load_preset(case.preset)
-    hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
-    scene = load_scene(case.object, resolution=config.resolution)
-    hooks = Hooks()
-    found = find_candidates(scene, hand, count=case.count, seed=case.seed, config=config, hooks=hooks).grasps
+    hand, scene = case.load()
+    first = raw_grasps(scene, hand, case.config, case.count, case.seed)
     parts, standard = object_parts(scene.object), PROTOCOLS["standard"]
-    short = replace(standard, hold_time=case.pull)
+    short = replace(standard, hold_time=PULL)
     world = build_world(hand, scene.object, parts, standard)
     bullet, frozen = build_bullet_world(hand, scene.object, parts), build_frozen_world(hand, scene.object, parts)
-    rng, first = np.random.default_rng(case.seed), found[: case.count]
+    rng = np.random.default_rng(case.seed)
     moved = [(True, displaced(grasp, *pose_error(rng), world.center_of_mass)) for grasp in first]
     trials = [
         {
