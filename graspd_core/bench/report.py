@@ -18,7 +18,7 @@ def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> st
     return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")
 
 
-def provenance(study: str, records: Sequence[Record]) -> str:
+def provenance(command: str, records: Sequence[Record]) -> str:
     """One line on where figures come from: the command, the days, the commits, the code, the machine, what it took."""
 
     def of(name: str) -> str:
@@ -26,15 +26,15 @@ def provenance(study: str, records: Sequence[Record]) -> str:
 
     failed = sum(bool(record["error"]) for record in records)
     minutes = sum(record.get("case_cpu", 0.0) for record in records) / 60
-    told = f"Made {of('made')} by `graspd bench {study}` at commit {of('commit')} (code {of('code')}): "
+    told = f"Made {of('made')} by `{command}` at commit {of('commit')} (code {of('code')}): "
     told += f"{len(records)} cases, {minutes:.0f} CPU minutes on {of('machine')}."
     return told + (f" {failed} cases failed and are in no figure." if failed else "")
 
 
-def sourced(study: str, records: Sequence[Record], sections: Sections) -> dict[str, Sequence[str | Picture]]:
+def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict[str, Sequence[str | Picture]]:
     """Sections that have anything in them, each with the line that says where its figures come from."""
     filled = {name: [part for part in parts if part] for name, parts in sections.items()}
-    return {name: [*parts, provenance(study, records)] for name, parts in filled.items() if parts}
+    return {name: [*parts, provenance(command, records)] for name, parts in filled.items() if parts}
 
 
 def written(parts: Sequence[str | Picture], document: Path | None = None) -> str:

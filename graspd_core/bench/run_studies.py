@@ -94,7 +94,7 @@ def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Pictur
     sections: dict[str, Sequence[str | Picture]] = {}
     for name, records in records_of(plan).items():
         if records:
-            sections |= sourced(name, records, STUDIES[name].sections(records, chart))
+            sections |= sourced(f"graspd bench {name}", records, STUDIES[name].sections(records, chart))
     return sections
 
 

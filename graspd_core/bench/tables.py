@@ -6,18 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import is_hand, is_preset
+from graspd_core.bench.names import FEW, is_hand, is_preset
 from graspd_core.bench.report import markdown_table
 from graspd_core.bench.study import Picture, Record, Sections
 from graspd_core.bench.suites import DECADES
 from graspd_core.metrics.metric_registry import METRICS
 
 _PLANNED = ("first_wall", "cpu_per_verified", "rounds")
-# Presets of the first page: those that people plan with, the published method, its repaired form and a baseline.
-FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_repaired", "random_closure")
 _TITLES = {
     "speed": "Speed against accuracy",
-    "verified": "Seconds per verified grasp",
+    "short": "Speed against accuracy",
     "planned": "Planned grasps",
     "ladder": "Settings sweeps",
 }
@@ -115,12 +113,12 @@ def pace_table(records: Sequence[Record]) -> str:
 
 
 def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """The whole table, the few rows of a first page, planned runs, and every object."""
+    """The few rows of a first page, the whole table, planned runs, and every object."""
     drawn = drawn_charts(records, chart)
     few = [record for record in records if record["name"] in FEW]
     return {
-        "bench": [drawn.get("speed"), summary_table(records), missing(records)],
-        "bench-short": [drawn.get("speed"), summary_table(few)],
+        "bench": [drawn.get("short"), summary_table(few)],
+        "bench-all": [drawn.get("speed"), summary_table(records), missing(records)],
         "bench-planned": [drawn.get("planned"), planned_table(records), pace_table(records)],
         "bench-objects": [object_tables(records)],
     }

@@ -99,7 +99,7 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
     for document in options.readme:
         fill(document, sections)
     # Every object's table is long, and what a first page shows is part of the whole.
-    shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench-short")]
+    shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
     print("\n\n".join(filter(None, shown)))
 
 

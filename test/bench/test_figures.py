@@ -70,7 +70,7 @@ def test_what_the_means_leave_out_is_said(record):
     full = [record(), record(thing="mug"), record("fast"), record("fast", thing="mug")]
     assert tables.missing(full) == ""
     assert tables.missing(full[:3]) == "Means are over 2 objects, but `fast` of 1 only."
-    raised = report.provenance("main", [*full[:3], record("fast", thing="mug", error="died")])
+    raised = report.provenance("graspd bench main", [*full[:3], record("fast", thing="mug", error="died")])
     assert raised.endswith("1 cases failed and are in no figure.")
 
 
@@ -148,11 +148,13 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     document.write_text(
         f"{spoken_of}\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
     )
-    sections = report.sourced("main", [record()], tables.main_sections([record()], tmp_path / "figures" / "bench"))
-    assert list(sections) == ["bench", "bench-short", "bench-objects"], "what has no figures has no section"
+    sections = report.sourced(
+        "graspd bench main", [record()], tables.main_sections([record()], tmp_path / "figures" / "bench")
+    )
+    assert list(sections) == ["bench", "bench-all", "bench-objects"], "what has no figures has no section"
     assert report.fill(document, sections) == ["bench"]
     text = document.read_text()
-    picture = "![Speed against accuracy](figures/bench.png)"
+    picture = "![Speed against accuracy](figures/bench_short.png)"
     assert text.startswith(f"{spoken_of}\n<!-- bench:begin -->\n{picture}\n\n| preset |")
     source = (
         "Made 2026-11-22 by `graspd bench main` at commit 1234567 (code 0.1.0+abc): 1 cases, 0 CPU minutes on 2 cores."
@@ -161,7 +163,7 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     assert text.endswith("\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n")
     assert "old" not in text
     document.write_text("no sections")
-    with pytest.raises(ConfigError, match="none of the sections bench, bench-short"):
+    with pytest.raises(ConfigError, match="none of the sections bench, bench-all"):
         report.fill(document, sections)
     with pytest.raises(ConfigError, match="No such file"):
         report.fill(tmp_path / "nowhere.md", {})
@@ -169,7 +171,7 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
 
 def test_the_first_page_has_a_few_rows(record):
     names = ("fast", "balanced", "accurate", "annealing", "graspd2022", "graspd2022_short", "random_closure")
-    (_, table) = tables.main_sections([record(name) for name in names], None)["bench-short"]
+    (_, table) = tables.main_sections([record(name) for name in names], None)["bench"]
     assert isinstance(table, str)
     assert table.count("\n") - 1 == 5
     assert "annealing" not in table

@@ -60,7 +60,7 @@ def test_the_smallest_run_ends_in_a_record_and_fills_its_section(name: str, tmp_
     record = run_job(Job(name, study.cases(Request(quick=True))[0], study.run, "1+a"))
     assert record["error"] == ""
     assert study.faults(record) == ()
-    sections = sourced(name, [record], study.sections([record], tmp_path / "bench"))
+    sections = sourced(f"graspd bench {name}", [record], study.sections([record], tmp_path / "bench"))
     marker, page = PAGES[name]
     assert f"by `graspd bench {name}` at commit" in written(sections[marker])
     assert f"<!-- {marker}:begin -->" in (ROOT / page).read_text()

@@ -70,25 +70,17 @@ class MapCell:
     reasons: Mapping[str, int]
 
 
-@dataclass(frozen=True)
-class Done:
-    """What came of a case: its cells, and figures by name that help to explain them."""
-
-    cells: tuple[MapCell, ...]
-    evidence: Mapping[str, float | None]
-
-
 # What a map does for each of its cases. A scene that is refused raises a GraspdError.
-Run = Callable[[MapCase], Done]
+Run = Callable[[MapCase], tuple[MapCell, ...]]
 
 
-def run_on(run: Run, case: MapCase) -> Done:
+def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
     """The cells of a case; where its scene is refused, all of its grasps are lost for that reason."""
     try:
         return run(case)
     except GraspdError as error:
         reason = f"{NO_SCENE}: {kind_of(str(error))}"
-        return Done(tuple(MapCell(up, 0, {reason: case.count}) for up in case.up), {})
+        return tuple(MapCell(up, 0, {reason: case.count}) for up in case.up)
 
 
 @lru_cache(maxsize=4)
