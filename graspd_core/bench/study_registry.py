@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from graspd_core.bench import suites, tables
+from graspd_core.bench.bullet.bullet_world import bullet_available
 from graspd_core.bench.failure_maps import map_registry, map_report
 from graspd_core.bench.measurements.measurement import run_cell
 from graspd_core.bench.stress import stress_cases, stress_table
@@ -116,6 +117,7 @@ STUDIES: dict[str, Study] = {
         ("studies/simulators.py", "object_case.py", "bullet/*.py"),
         _PLANS,
         lambda case: 2.0 + 2.5 * case.count,
+        usual=bullet_available(),
     ),
     "mano": Study(
         "a human hand of the user's, in the units of the Grasp'D paper",

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     for path in (options.out / "results.json", options.chart):
         if path:
             check_writable(path)
-    with Interrupt() as interrupt, Lines(plan, options.processes) as lines:
+    with Interrupt() as interrupt, Lines(plan, 0 if options.no_run else options.processes) as lines:
         for job, record in run_plan(plan, options.processes, interrupt.came) if not options.no_run else ():
             lines(job.study, record)
     if interrupt.came():
@@ -96,11 +96,18 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
     from graspd_core.bench.run_studies import report_of
 
     sections = report_of(plan, options.chart)
-    for document in options.readme:
-        fill(document, sections)
     # Every object's table is long, and what a first page shows is part of the whole.
     shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
     print("\n\n".join(filter(None, shown)))
+    wrong = []
+    for document in options.readme:
+        try:
+            fill(document, sections)
+        except ConfigError as error:
+            wrong.append(error)
+    # One page that cannot be filled leaves the others filled.
+    if wrong:
+        raise wrong[0]
 
 
 class Lines:
@@ -114,7 +121,7 @@ class Lines:
         total, done = len(self.plan.jobs), len(self.plan.done)
         if done:
             print(f"graspd: {done} of {total} cases had finished before", file=sys.stderr)
-        if self.plan.missing:
+        if self.plan.missing and self.processes:
             minutes = self.plan.seconds(self.processes) / 60
             told = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} quiet cores"
             print(f"graspd: {told}", file=sys.stderr)

@@ -113,7 +113,12 @@ def test_the_command_reports_kept_endings_and_fills_a_document(tmp_path: Path, c
     page = tmp_path / "page.md"
     sections = ("stress-summary", "stress")
     page.write_text("".join(f"<!-- {name}:begin -->\nbygone\n<!-- {name}:end -->\n" for name in sections))
-    assert main(["bench", "stress", "--no-run", "--out", str(tmp_path), "--readme", str(page)]) == EXIT_OK
+    command = ["bench", "stress", "--no-run", "--out", str(tmp_path)]
+    (tmp_path / "none.md").write_text("no section")
+    assert main([*command, "--readme", str(tmp_path / "none.md"), "--readme", str(page)]) == EXIT_BAD_INPUT
+    assert "none.md: has none of the sections stress-summary, stress" in capsys.readouterr().err
+    assert "bygone" not in page.read_text(), "the other page is filled all the same"
+    assert main([*command, "--readme", str(page)]) == EXIT_OK
     assert "1 cases, 0 faults." in capsys.readouterr().out
     assert "1 cases, 0 faults." in page.read_text()
     assert "by `graspd bench stress` at commit" in page.read_text()

@@ -14,10 +14,11 @@ import numpy as np
 
 from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
 from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
-from graspd_core.bench.bullet.bullet_world import build_bullet_world
+from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
 from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
 from graspd_core.bench.report import markdown_table
 from graspd_core.bench.study import Record, Request, Sections, all_shapes, thing_name
+from graspd_core.errors import ConfigError
 from graspd_core.scene.scene import object_parts
 from graspd_core.trials.displacement_trial import build_frozen_world, displacement_trial
 from graspd_core.trials.hold_trial import hold_trial
@@ -29,7 +30,9 @@ PULL = 0.5
 
 
 def simulator_cases(request: Request) -> tuple[ObjectCase, ...]:
-    """One a shape and seed."""
+    """One a shape and seed. Raises ConfigError: there is no PyBullet."""
+    if not bullet_available():
+        raise ConfigError("simulators: PyBullet is not installed; pip install -e '.[bench]', on Python 3.11")
     return object_cases(request, all_shapes(), 4, 1)
 
 
