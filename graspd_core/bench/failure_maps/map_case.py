@@ -1,22 +1,19 @@
-"""One piece of a map's work: a planning, the cells that its grasps are tried in, and what came of it in each."""
+"""One case of a map: a planning, the cells that its grasps are tried in, and what came of it in each."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
+from graspd_core.bench.object_case import raw_grasps
+from graspd_core.bench.study import Case
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import PlanConfig, load_preset, to_mapping
+from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import Protocol, build_world
@@ -25,13 +22,12 @@ from graspd_core.types import Grasp
 # Where a cell lies on an axis of its map: a number, or the name of an object.
 Place = float | str
 
-HAND = "allegro_right"
 # What an empty place among the grasps asked for is called.
 NOT_FOUND, NO_SCENE = "no grasp found", "no scene"
 
 
 @dataclass(frozen=True)
-class Job:
+class MapCase(Case):
     """A planning, and the cells that its grasps are tried in.
 
     Attributes:
@@ -42,6 +38,7 @@ class Job:
         up: places of its cells on the vertical axis.
         count: raw grasps asked for, each of which is tried in every cell.
         seed: of everything that is drawn.
+        hand: by name.
     """
 
     map: str
@@ -51,11 +48,16 @@ class Job:
     up: tuple[Place, ...]
     count: int
     seed: int
+    hand: str = "allegro_right"
+
+    @property
+    def label(self) -> str:
+        return " ".join(str(word) for word in (self.map, self.preset, self.thing, self.across, *self.up[:1]))
 
 
 @dataclass(frozen=True)
 class MapCell:
-    """What came of one job's grasps in one cell.
+    """What came of one case's grasps in one cell.
 
     Attributes:
         up: its place on the vertical axis.
@@ -68,36 +70,17 @@ class MapCell:
     reasons: Mapping[str, int]
 
 
-@dataclass(frozen=True)
-class Done:
-    """Cells of a job, and figures of what was planned on that help to explain them."""
-
-    cells: tuple[MapCell, ...]
-    evidence: Mapping[str, float | None]
+# What a map does for each of its cases. A scene that is refused raises a GraspdError.
+Run = Callable[[MapCase], tuple[MapCell, ...]]
 
 
-# What a map does for each of its jobs. A scene that is refused raises a GraspdError.
-Run = Callable[[Job], Done]
-
-
-def job_key(job: Job) -> str:
-    """Hash of everything that a job is asked, hexadecimal. The code that answers is recorded beside it.
-
-    Of the settings those count that raw grasps depend on: there are no rounds, and clouds are segmented as usual.
-    """
-    config = to_mapping(settings(job.preset))
-    looked_at = {name: config[name] for name in ("resolution", "problem", config["method"], "grasp_stages")}
-    asked = {**asdict(job), "hand": HAND, "settings": looked_at}
-    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
-
-
-def run_job(run: Run, job: Job) -> Done:
-    """The cells of a job; where its scene is refused, all of its grasps are lost for that reason."""
+def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
+    """The cells of a case; where its scene is refused, all of its grasps are lost for that reason."""
     try:
-        return run(job)
+        return run(case)
     except GraspdError as error:
         reason = f"{NO_SCENE}: {kind_of(str(error))}"
-        return Done(tuple(MapCell(up, 0, {reason: job.count}) for up in job.up), {})
+        return tuple(MapCell(up, 0, {reason: case.count}) for up in case.up)
 
 
 @lru_cache(maxsize=4)
@@ -107,30 +90,29 @@ def settings(preset: str) -> PlanConfig:
 
 
 @lru_cache(maxsize=4)
-def hand_for(candidates: int) -> HandModel:
-    """The hand of all maps."""
-    return load_hand(HAND, candidates=candidates)
+def hand_for(name: str, candidates: int) -> HandModel:
+    """A hand with so many contact candidates."""
+    return load_hand(name, candidates=candidates)
 
 
-def plan(job: Job, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
+def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
     """The hand, and the first of the method's own ranking, none filtered by a trial."""
-    config = settings(job.preset)
-    hand = hand_for(config.problem.fine_candidates)
-    found = find_candidates(scene, hand, count=job.count, seed=job.seed, config=config, hooks=Hooks())
-    return hand, found.grasps[: job.count]
+    config = settings(case.preset)
+    hand = hand_for(case.hand, config.problem.fine_candidates)
+    return hand, raw_grasps(scene, hand, config, case.count, case.seed)
 
 
 def try_grasps(
-    job: Job, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
+    case: MapCase, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
 ) -> MapCell:
     """Every grasp in the hold trial on `target`."""
     if not grasps:
-        return MapCell(up, 0, {NOT_FOUND: job.count})
+        return MapCell(up, 0, {NOT_FOUND: case.count})
     world = build_world(hand, target, object_parts(target), protocol)
     holds = [hold_trial(world, grasp, protocol) for grasp in grasps]
     reasons = Counter(kind_of(hold.reason) for hold in holds if not hold.passed)
-    if len(grasps) < job.count:
-        reasons[NOT_FOUND] = job.count - len(grasps)
+    if len(grasps) < case.count:
+        reasons[NOT_FOUND] = case.count - len(grasps)
     return MapCell(up, sum(hold.passed for hold in holds), dict(reasons))
 
 
@@ -139,8 +121,3 @@ def kind_of(reason: str) -> str:
     for figures in (r"\([^()]*\d[^()]*\)", r"(by )?[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?", r"along [-+][xyz]"):
         reason = re.sub(figures, " ", reason)
     return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
-
-
-def record_of(job: Job, done: Done, code: str, cpu: float) -> dict[str, Any]:
-    """What is kept of a job."""
-    return {"key": job_key(job), "code": code, **asdict(job), **asdict(done), "cpu": cpu, "error": ""}
