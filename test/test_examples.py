@@ -33,7 +33,7 @@ def test_a_mesh(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
 
 def test_a_cloud(run: Run, capsys: pytest.CaptureFixture[str]):
     assert run("grasp_a_cloud") == 0
-    assert "held ['hold', 'lift']" in capsys.readouterr().out
+    assert "held ['hold', 'lift', 'hypotheses']" in capsys.readouterr().out
 
 
 def test_your_own_hand(run: Run, capsys: pytest.CaptureFixture[str]):

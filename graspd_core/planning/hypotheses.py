@@ -11,10 +11,10 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
+from graspd_core.config.certainty_config import HELD_AFTER
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.planning.run_clock import Run
-from graspd_core.reconstruction.other_shapes import other_rules, other_shape
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.scene import Scene, build_scene, object_parts
 from graspd_core.trials.hold_trial import STOPPED, hold_trial
@@ -23,9 +23,6 @@ from graspd_core.trials.trial_registry import TrialContext
 from graspd_core.trials.world import Protocol, World, at_friction, build_world
 from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
 
-# Share of grasps that hold on the true object, of those that failed under none, one and two of the hypotheses, by
-# `graspd bench truth` (docs/clouds.md).
-HELD_AFTER = (0.97, 0.93, 0.75)
 # Of the friction that the scene says.
 _LESS_FRICTION = 2 / 3
 # Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
@@ -65,6 +62,8 @@ def hypotheses_of(
     allowed = sum(held >= probability for held in HELD_AFTER) - 1
     if scene.evidence is None or allowed + 1 == len(HELD_AFTER):
         return None
+    from graspd_core.reconstruction.other_shapes import other_rules
+
     protocol = trials.protocol
     slippery = at_friction(protocol, _LESS_FRICTION * Protocol.friction[0])
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
@@ -80,7 +79,7 @@ def hypotheses_of(
         name = f"hidden side by {rule}" if rule else "hidden side closed smoothly"
         found.append(later(name, protocol, partial(_other_world, scene, hand, protocol, rule)))
     pool.shutdown(wait=False)
-    return Hypotheses(tuple(found), max(allowed, 0))
+    return Hypotheses(tuple(found), allowed)
 
 
 def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tuple[TrialResult, float]:
@@ -92,8 +91,7 @@ def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tupl
     for item in hypotheses.items:
         result = item.hold(grasp, stop)
         if stop():
-            failed.append(STOPPED)
-            break
+            return TrialResult(HYPOTHESES, False, worst[0], worst[1], STOPPED), HELD_AFTER[-1]
         if result is None:
             continue
         tried += 1
@@ -132,6 +130,8 @@ def _own_world(scene: Scene, hand: HandModel, protocol: Protocol) -> World:
 @lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
     """The world of another shape of the object's own mass and friction; None where there is no such shape."""
+    from graspd_core.reconstruction.other_shapes import other_shape
+
     mesh = run_isolated(other_shape, scene.evidence, rule, scene.object.mesh)
     if mesh is None:
         return None

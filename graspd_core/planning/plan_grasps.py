@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,7 +23,6 @@ from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import parts_in_background, rank_by_robustness
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.next_view import next_view
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
@@ -75,13 +75,11 @@ def plan_grasps(
     request = {"count": count, "seed": seed, "verify": verify, "device": device, "measure": measure}
     found = run_rounds(run, scene, hand, rounds, parts, **request)
     moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
-    timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
-    message, view = (message, None) if found.good else _less_sure(scene, moved, far, message)
+    outcome, timing = run.outcome(bool(moved), found.good, count), _timing(run, scene, found)
+    result = GraspResult(outcome, moved, timing, seed, config.method, message)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    model = scene.object
-    return GraspResult(
-        outcome, moved, timing, seed, config.method, message, model.warnings, support, found.audits, view
-    )
+    result = replace(result, warnings=scene.object.warnings, support=support, audits=found.audits)
+    return result if found.good else _less_sure(scene, far, result)
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
@@ -91,18 +89,18 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
 
 
-def _less_sure(
-    scene: Scene, grasps: tuple[Grasp, ...], far: Float[np.ndarray, "3"], message: str
-) -> tuple[str, Float[np.ndarray, "4 4"] | None]:
-    """What a run says that found no grasp which is sure enough, and the view that would show most of what is hidden."""
-    held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in grasps)
+def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
+    """A result without a grasp that is sure enough: with the view that would show most of what is hidden."""
+    held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.grasps)
     if scene.evidence is None or not held:
-        return message, None
+        return result
+    from graspd_core.reconstruction.next_view import next_view
+
     view = next_view(scene.evidence, scene.object.mesh, far)
     told = f"{held} grasps hold on the likeliest shape, none is sure enough, since a part of the object was guessed"
     if view is not None:
         told += "; a view from ({:.2f}, {:.2f}, {:.2f}) m would show most of it".format(*view[:3, 3])
-    return told, view
+    return replace(result, message=told, next_view=view)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

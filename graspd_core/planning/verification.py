@@ -48,7 +48,7 @@ class VerificationContext:
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
-    hypotheses: Hypotheses | None
+    hypotheses: Hypotheses | None = None
 
 
 def parts_in_background(run: Run, scene: Scene) -> Parts:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import first_hits
 from graspd_core.mesh.topology import moved_mesh
-from graspd_core.reconstruction.reconstruct import Evidence
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.se3 import perpendicular
 from graspd_core.types import TriangleMesh
 

@@ -9,7 +9,8 @@ import numpy as np
 from graspd_core.errors import GraspdError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
-from graspd_core.reconstruction.reconstruct import Evidence, closed_mesh
+from graspd_core.reconstruction.evidence import Evidence
+from graspd_core.reconstruction.reconstruct import closed_mesh
 from graspd_core.reconstruction.shape_completion import RULES, guess_by
 from graspd_core.types import TriangleMesh
 

@@ -19,6 +19,7 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, nothing, point_step
 from graspd_core.reconstruction.poisson import GRID_CELLS, close_surface, fit_poisson, grid_cell, part_walls
@@ -29,26 +30,6 @@ from graspd_core.types import Plane, TriangleMesh
 
 # Share of the seen points that must lie on the result.
 MIN_FITTED_SHARE = 0.85
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What was seen of an object of which a good part was hidden: other guesses of that part are made of it.
-
-    Attributes:
-        seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
-        rotation, origin: of that frame in the views' [m].
-        chosen: the rule that the reconstruction took; empty where none applied.
-        settings: of the reconstruction.
-    """
-
-    seen: Surfels
-    free_space: FreeSpace
-    step: float
-    rotation: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
-    chosen: str
-    settings: ReconstructionConfig
 
 
 @dataclass(frozen=True)
@@ -71,7 +52,11 @@ class Reconstruction:
 
 
 def reconstruct(
-    views: Sequence[PointCloud], *, support: Plane | None = None, settings: ReconstructionConfig | None = None
+    views: Sequence[PointCloud],
+    *,
+    support: Plane | None = None,
+    settings: ReconstructionConfig | None = None,
+    whole: Sequence[PointCloud] = (),
 ) -> Reconstruction:
     """The closed surface of the object that the views show.
 
@@ -80,6 +65,7 @@ def reconstruct(
             cloud that shows it from all round may stand for many views.
         support: what the object stands on, in the same frame.
         settings: precision of the cameras, and sizes.
+        whole: all that the same cameras saw: what stands before the object hides what is behind it.
 
     Raises:
         CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
@@ -87,7 +73,9 @@ def reconstruct(
     settings = settings or ReconstructionConfig()
     views = _clean(views, settings)
     rotation, origin = _frame(views, support)
-    local = [PointCloud((v.points - origin) @ rotation, (v.viewpoint - origin) @ rotation) for v in views]
+    local = [_in_frame(view, rotation, origin) for view in views]
+    by_eye = {tuple(view.viewpoint.astype(float)): view for view in whole}
+    around = [_in_frame(by_eye[tuple(view.viewpoint)], rotation, origin) for view in views] if whole else ()
     step = point_step(local)
     standing = support is not None
     method, warnings, evidence = "poisson", (), None
@@ -98,7 +86,7 @@ def reconstruct(
         seen = merge_views(local, step, settings)
         lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, MAX_FOOT_HEIGHT_M)) if standing else 0.0
         free_space = FreeSpace(
-            make_view_depths(local), standing, lowest, settings.outline_slack, settings.surface_tolerance
+            make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
         method += f", {guess.method}" if guess.method else ""
@@ -109,6 +97,10 @@ def reconstruct(
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
     return Reconstruction(mesh, confidence, method, warnings, evidence)
+
+
+def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> PointCloud:
+    return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
 
 
 def closed_mesh(

@@ -16,7 +16,7 @@ from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
 from graspd_core.mesh.separate_bodies import bodies_apart
 from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
-from graspd_core.reconstruction.reconstruct import Evidence
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.confidence import confidence_grid

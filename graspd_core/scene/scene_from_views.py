@@ -53,7 +53,8 @@ def scene_from_views(
         seen = Segmentation(tuple(views), None, (), ())
     else:
         seen = segment(views, target=target, settings=settings.segmentation)
-    whole = reconstruct(seen.views, support=seen.support, settings=settings.reconstruction)
+    around = () if alone else views
+    whole = reconstruct(seen.views, support=seen.support, settings=settings.reconstruction, whole=around)
     scene = build_scene(
         whole.mesh,
         source=source,
