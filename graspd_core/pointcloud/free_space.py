@@ -23,6 +23,8 @@ SPACING_NEIGHBOURS = 5
 
 # What is this much nearer than the object's surface beside it stands before it [m].
 OCCLUDER_GAP_M = 0.01
+# Beside what was seen, hidden parts are looked for so far [m].
+HIDDEN_REACH_M = 0.1
 
 # A point so much deeper in empty space than the slack is impossible.
 CONTRADICTION_DEPTH_M = 0.01
@@ -101,7 +103,8 @@ def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | 
     cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MAX_IMAGE_CELLS)
     if cell < 1e-9:
         return None
-    margin = 6
+    # What is hidden may go on as far beside what is seen.
+    margin = 6 if whole is None else max(6, int(HIDDEN_REACH_M / (cell * float(np.median(local[:, 2])))))
     low = plane.min(0) - margin * cell
     index = tuple(np.floor((plane - low) / cell).astype(int).T)
     shape = tuple(int(i.max()) + margin + 1 for i in index)

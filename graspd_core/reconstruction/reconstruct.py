@@ -53,7 +53,6 @@ class Reconstruction:
 
 def reconstruct(
     views: Sequence[PointCloud],
-    *,
     support: Plane | None = None,
     settings: ReconstructionConfig | None = None,
     whole: Sequence[PointCloud] = (),

@@ -53,8 +53,7 @@ def scene_from_views(
         seen = Segmentation(tuple(views), None, (), ())
     else:
         seen = segment(views, target=target, settings=settings.segmentation)
-    around = () if alone else views
-    whole = reconstruct(seen.views, support=seen.support, settings=settings.reconstruction, whole=around)
+    whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
     scene = build_scene(
         whole.mesh,
         source=source,

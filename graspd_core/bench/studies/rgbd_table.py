@@ -10,7 +10,11 @@ import numpy as np
 from graspd_core.bench.report import markdown_table
 from graspd_core.bench.study import Record, Sections, thing_name
 
-NAMES = {0: "full mesh", 1: "1 view", 3: "3 views", 15: "15 views"}
+# By number of views, and whether other things stand beside.
+NAMES = {
+    (1, False): "1 view", (1, True): "1 view, crowded", (3, False): "3 views", (15, False): "15 views",
+    (0, False): "full mesh",
+}  # fmt: skip
 _HEADINGS = [
     "planned on", "first grasp holds on the truth", "of the full mesh's figure", "verified grasps that hold",
     "that lift too", "cases without a grasp", "first verified grasp, median (worst)", "Chamfer", "within 5 mm",
@@ -21,10 +25,10 @@ _HEADINGS = [
 def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Both tables."""
     good = [record for record in records if not record["error"]]
-    rows = {views: own for views in (1, 3, 15, 0) if (own := [r for r in good if r["views"] == views])}
+    rows = {row: own for row in NAMES if (own := [r for r in good if (r["views"], r["crowded"]) == row])}
     if not rows:
         return {}
-    full = _share(rows[0], "first_held") if 0 in rows else 0.0
+    full = _share(rows[0, False], "first_held") if (0, False) in rows else 0.0
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
     shown = [views for views in NAMES if views in rows]
     objects = [
@@ -37,6 +41,7 @@ def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
             markdown_table(_HEADINGS, body),
             told,
             markdown_table(["object", *(NAMES[views] for views in shown)], objects),
+            *_calibration([pair for r in good for pair in r.get("told", ())]),
         ]
     }
 
@@ -68,3 +73,17 @@ def _share(own: Sequence[Record], name: str) -> float:
 def _marks(own: Sequence[Record]) -> str:
     marks = "".join("\\*" if r.get("first_held") else "." for r in own)
     return f"{sum(r['held'] for r in own)}/{sum(r['verified'] for r in own)} {marks}"
+
+
+def _calibration(told: Sequence[tuple[float, bool]]) -> list[str]:
+    """How often grasps of each stated probability held on the truth, and the mean square of what that was off."""
+    if not told:
+        return []
+    levels = sorted({probability for probability, _ in told}, reverse=True)
+    held = {level: [hold for probability, hold in told if probability == level] for level in levels}
+    body = [[f"{level:.0%}", f"{np.mean(holds):.0%} of {len(holds)}"] for level, holds in held.items()]
+    brier = float(np.mean([(probability - hold) ** 2 for probability, hold in told]))
+    return [
+        f"Stated probability against what held on the truth, less sure grasps among them; Brier score {brier:.3f}:",
+        markdown_table(["stated", "held"], body),
+    ]

@@ -29,6 +29,7 @@ from graspd_core.rendering.tabletop import CAMERA, TabletopScene, ring_poses, ta
 from graspd_core.runtime import disk_cache
 from graspd_core.scene.scene import Obstacle, Scene, build_scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.segmentation.target_selection import Target
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.lift_trial import lift_trial
 from graspd_core.trials.world import PROTOCOLS, build_world
@@ -40,6 +41,8 @@ VIEWS = (0, 1, 3, 15)
 # Elevation of the camera at each start: a robot looks at its table from half above [deg].
 ELEVATIONS = (40.0, 50.0, 30.0)
 YAW = 0.3
+# Room between the object and each thing beside it [m].
+CLEAR = 0.04
 # Where a sphere of 5 mm about a true point meets the reconstruction, that point counts as found.
 FOUND, SAMPLES = 0.005, 20_000
 
@@ -47,16 +50,18 @@ FOUND, SAMPLES = 0.005, 20_000
 @dataclass(frozen=True)
 class Seen(ObjectCase):
     """Grasps of what `views` cameras see; 0 plans on the true mesh. The seed is of noise and grasps, and of the place
-    of the first camera."""
+    of the first camera. Where it is crowded, two other things stand beside and hide a part."""
 
     views: int = 1
+    crowded: bool = False
 
 
 def seen_cases(request: Request) -> tuple[Seen, ...]:
     """Every object from every number of views, by default from two places."""
     request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
-    return tuple(Seen(**vars(case), views=views) for case in cases for views in VIEWS[: 2 if request.quick else None])
+    seen = [(views, False) for views in VIEWS[: 2 if request.quick else None]] + [(1, True)]
+    return tuple(Seen(**vars(case), views=views, crowded=crowded) for case in cases for views, crowded in seen)
 
 
 def seen_seconds(case: Seen) -> float:
@@ -67,19 +72,31 @@ def seen_seconds(case: Seen) -> float:
 def run_seen(case: Seen) -> Record:
     """Everything that is reported of one case; a refusal is a result with its message."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
-    thing = case.object.removeprefix("shape:")
-    stage = tabletop(thing if case.object.startswith("shape:") else load_mesh(case.object), yaw=YAW)
+    stage = _stage(case)
     clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
     _load_libraries()
     # Or the full mesh would be met again at its next start.
     disk_cache.forget()
     began = time.perf_counter()
     try:
-        scene = scene_from_views(clouds) if case.views else _true_scene(stage, case.object)
+        middle = Target(point=0.5 * (stage.truth.vertices.min(0) + stage.truth.vertices.max(0)))
+        target = middle if case.crowded else None
+        scene = scene_from_views(clouds, target=target) if case.views else _true_scene(stage, case.object)
     except GraspdError as error:
         return {"refused": str(error), "scene_s": time.perf_counter() - began, "verified": 0, "held": 0}
     scene_s = time.perf_counter() - began
     return {"scene_s": scene_s, **reconstruction_error(scene, stage), **_grasps(case, scene, stage, hand)}
+
+
+def _stage(case: Seen) -> TabletopScene:
+    """The object on its table, and what stands `CLEAR` beside it, one of them towards the camera."""
+    thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)
+    alone = tabletop(thing, yaw=YAW)
+    if not case.crowded:
+        return alone
+    low, high = alone.truth.vertices.min(0), alone.truth.vertices.max(0)
+    beside = (("box", float(high[0]) + CLEAR + 0.03, 0.02), ("cylinder", -0.03, float(low[1]) - CLEAR - 0.033))
+    return tabletop(thing, yaw=YAW, obstacles=beside)
 
 
 def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
@@ -114,6 +131,9 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
     one = [hold_trial(world, grasp, protocol) for grasp in _verified(first)]
     holds = [(grasp, hold_trial(world, grasp, protocol)) for grasp in _verified(many)]
     lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]
+    # Those that hold on the likeliest shape and are less sure, too: how far is the probability right?
+    guessed = [grasp for grasp in many.grasps if grasp.probability is not None]
+    told = [(grasp.probability, hold_trial(world, grasp, protocol).passed) for grasp in guessed]
     timing = first.timing
     return {
         "first_s": None if timing.first_verified is None else timing.first_verified - timing.load - timing.sdf,
@@ -124,6 +144,7 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
         "lifted": sum(lift.passed for lift in lifts),
         "reasons": [trial.reason for trial in (*(hold for _, hold in holds), *lifts) if not trial.passed],
         "warnings": list(many.warnings),
+        "told": told,
     }
 
 
