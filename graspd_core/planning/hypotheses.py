@@ -6,7 +6,8 @@ many hold on the true object was measured (docs/clouds.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -14,6 +15,7 @@ from functools import lru_cache, partial
 from graspd_core.config.certainty_config import HELD_AFTER
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.planning.run_clock import Run
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.scene import Scene, build_scene, object_parts
@@ -27,6 +29,8 @@ from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
 _LESS_FRICTION = 2 / 3
 # Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
+# A guessed shape is not worth finer parts.
+_RESOLUTION, _PART_TOLERANCE_M, _PARTS = 40, 0.003, 32
 # How often the stop hook is asked while waiting for a world [s].
 _POLL = 0.02
 
@@ -64,56 +68,77 @@ def hypotheses_of(
         return None
     from graspd_core.reconstruction.other_shapes import other_rules
 
-    protocol = trials.protocol
-    slippery = at_friction(protocol, _LESS_FRICTION * Protocol.friction[0])
-    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
-
-    def later(name: str, physics: Protocol, build: Callable[[], World | None]) -> Hypothesis:
-        world = pool.submit(lambda: None if run.known_over() else build())
-        return Hypothesis(name, partial(_hold_in, world, physics))
-
-    found = [later(f"friction {slippery.friction[0]:.2g}", slippery, partial(_own_world, scene, hand, slippery))]
-    for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1):
-        found.append(Hypothesis(f"place {number}", partial(_hold_displaced, trials, error)))
+    slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
+    physics = {f"friction {slippery.friction[0]:.2g}": slippery}
+    builds: list[Callable[[], World | None]] = [partial(_own_world, scene, hand, slippery)]
     for rule in other_rules(scene.evidence):
-        name = f"hidden side by {rule}" if rule else "hidden side closed smoothly"
-        found.append(later(name, protocol, partial(_other_world, scene, hand, protocol, rule)))
-    pool.shutdown(wait=False)
-    return Hypotheses(tuple(found), allowed)
+        physics[f"hidden side by {rule}" if rule else "hidden side closed smoothly"] = trials.protocol
+        builds.append(partial(_other_world, scene, hand, trials.protocol, rule))
+    worlds = _Worlds(run, builds)
+    found = [Hypothesis(name, partial(_hold_in, worlds, k, physics[name])) for k, name in enumerate(physics)]
+    places = [
+        Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
+        for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
+    ]
+    return Hypotheses((*places, *found), allowed)
+
+
+class _Worlds:
+    """Worlds that a thread makes one after another, each when it or the one before it is first asked for."""
+
+    def __init__(self, run: Run, builds: Sequence[Callable[[], World | None]]) -> None:
+        self._run, self._builds, self._lock = run, builds, threading.Lock()
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
+        self._made: list[Future[World | None]] = []
+        self._begin(2)
+
+    def world(self, index: int, stop: StopHook) -> World | None:
+        """One of them; None where it cannot be made, or the hook says to stop."""
+        self._begin(index + 2)
+        while not wait([self._made[index]], timeout=_POLL).done:
+            if stop():
+                return None
+        return self._made[index].result()
+
+    def _begin(self, count: int) -> None:
+        with self._lock:
+            for build in self._builds[len(self._made) : count]:
+                self._made.append(self._pool.submit(self._make, build))
+
+    def _make(self, build: Callable[[], World | None]) -> World | None:
+        return None if self._run.known_over() else build()
 
 
 def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tuple[TrialResult, float]:
-    """Hold trials of a grasp under each in turn, until it fails under too many; and how likely it is to hold in truth.
+    """Hold trials of a grasp under each in turn, until the answer is known; and how likely it is to hold in truth.
 
-    The result tells the greatest travel and turn of the trials that it passed.
+    A trial that was not needed counts as failed for that probability. The result tells the greatest travel and turn of
+    the trials that were passed.
     """
-    worst, failed, tried = [0.0, 0.0], [], 0
+    worst, failed, tried, left = [0.0, 0.0], [], 0, len(hypotheses.items)
     for item in hypotheses.items:
+        if not len(failed) <= hypotheses.allowed < len(failed) + left:
+            break
         result = item.hold(grasp, stop)
         if stop():
             return TrialResult(HYPOTHESES, False, worst[0], worst[1], STOPPED), HELD_AFTER[-1]
+        left -= 1
         if result is None:
             continue
         tried += 1
         if result.passed:
             worst = [max(worst[0], result.displacement), max(worst[1], result.rotation)]
-            continue
-        failed.append(f"{item.name}: {result.reason}")
-        if len(failed) > hypotheses.allowed:
-            break
+        else:
+            failed.append(f"{item.name}: {result.reason}")
     passed = len(failed) <= hypotheses.allowed
     reason = "" if passed else f"fails under {len(failed)} of the {tried} hypotheses tried ({'; '.join(failed)})"
-    return TrialResult(HYPOTHESES, passed, worst[0], worst[1], reason), HELD_AFTER[
-        min(len(failed), len(HELD_AFTER) - 1)
-    ]
+    worst_case = min(len(failed) + left if passed else len(HELD_AFTER), len(HELD_AFTER) - 1)
+    return TrialResult(HYPOTHESES, passed, worst[0], worst[1], reason), HELD_AFTER[worst_case]
 
 
-def _hold_in(world: Future[World | None], protocol: Protocol, grasp: Grasp, stop: StopHook) -> TrialResult | None:
-    while not wait([world], timeout=_POLL).done:
-        if stop():
-            return None
-    found = world.result()
-    return None if found is None else hold_trial(found, grasp, protocol, stop=stop)
+def _hold_in(worlds: _Worlds, index: int, protocol: Protocol, grasp: Grasp, stop: StopHook) -> TrialResult | None:
+    world = worlds.world(index, stop)
+    return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:
@@ -137,7 +162,10 @@ def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -
         return None
     target = scene.object
     try:
-        other = build_scene(mesh, source=target.source, mass=target.mass, friction=target.friction).object
+        other = build_scene(
+            mesh, source=target.source, mass=target.mass, friction=target.friction, resolution=_RESOLUTION
+        )
     except GraspdError:
         return None
-    return build_world(hand, other, object_parts(other), protocol)
+    parts = run_isolated(convex_parts, other.object.mesh, other.sdf, tolerance=_PART_TOLERANCE_M, max_parts=_PARTS)
+    return build_world(hand, other.object, parts, protocol)

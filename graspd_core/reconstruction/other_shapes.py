@@ -15,7 +15,7 @@ from graspd_core.reconstruction.shape_completion import RULES, guess_by
 from graspd_core.types import TriangleMesh
 
 # A trial feels no finer detail: cells along the longest side, Poisson's finest cell, and faces.
-_CELLS, _POISSON_CELL_M, _FACES = 40, 0.004, 4000
+_CELLS, _POISSON_CELL_M, _FACES = 40, 0.006, 4000
 # Two shapes nearer to each other than this are one [m].
 _SAME_M = 5e-4
 _SAMPLES = 1500
