@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
-import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS
@@ -24,7 +24,7 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing
+from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, WatchHook
 
 
 def plan_grasps(
@@ -40,6 +40,7 @@ def plan_grasps(
     measure: bool = True,
     progress: ProgressHook | None = None,
     stop: StopHook | None = None,
+    watch: WatchHook | None = None,
 ) -> GraspResult:
     """Plan grasps and try them in rank order until `count` pass all trials of the scene; those that fail come last.
 
@@ -52,7 +53,7 @@ def plan_grasps(
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
         measure: whether grasps get their metrics, those that failed a trial excepted; it takes longer than a trial.
-        progress: called from this thread with `Progress` values.
+        progress, watch: called from this thread with `Progress` values, and with the hands that the run works on.
         stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
 
     Raises:
@@ -60,19 +61,18 @@ def plan_grasps(
         ResourceError: the machine has too little memory for so many grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
-    check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
-    run = Run(time.perf_counter(), deadline, progress, stop)
-    support, message, far, rounds = scene.support, "", np.zeros(3), []
+    asked: dict[str, Any] = {"count": count, "seed": seed, "verify": verify, "device": device}
+    check_request(deadline=deadline, **asked)
+    run = Run(time.perf_counter(), deadline, progress, stop, watch)
+    support, message, rounds = scene.support, "", []
     if not run.over():  # else it begins nothing
-        scene, far = planning_scene(scene, config.resolution)
+        scene, run.origin = planning_scene(scene, config.resolution)
         hand = with_candidates(hand, config.problem.fine_candidates)
         message = out_of_reach(scene, hand)
         rounds = [] if message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    found = run_rounds(
-        run, scene, hand, rounds, parts, count=count, seed=seed, verify=verify, device=device, measure=measure
-    )
-    moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
+    found = run_rounds(run, scene, hand, rounds, parts, measure=measure, **asked)
+    moved = tuple(moved_grasp(grasp, run.origin) for grasp in _ranked(run, found, config, seed))
     timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     model = scene.object
