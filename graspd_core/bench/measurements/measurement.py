@@ -16,7 +16,7 @@ from graspd_core.methods.plan_config import PlanConfig, to_mapping
 Kind = Literal["raw", "verified", "pace", "start"]
 
 # Parts of the package that no figure of a cell depends on; of the benchmark itself, one folder counts.
-_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench")
+_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench", "viewer")
 
 
 @dataclass(frozen=True)
