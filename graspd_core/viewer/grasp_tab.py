@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import Grasp
 from graspd_core.viewer.drawing import contact_parts, force_parts, weakest_parts
 from graspd_core.viewer.grasp_list import ALL, FILTERS, ORDERS, figures_html, label, listed, table_html
-from graspd_core.viewer.latest_jobs import LatestJobs
 from graspd_core.viewer.mechanics import Mechanics
 from graspd_core.viewer.motion import STAGES, posture_at
 from graspd_core.viewer.scene_nodes import SceneNodes

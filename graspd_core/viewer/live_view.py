@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from graspd_core.hands.model import HandModel
+from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import Progress, Snapshot, Stage, Verdict
 from graspd_core.viewer.drawing import HAND, VERDICTS
-from graspd_core.viewer.latest_jobs import LatestJobs
 from graspd_core.viewer.motion import skeletons
 from graspd_core.viewer.scene_nodes import SceneNodes
 from graspd_core.viewer.session import Session

@@ -16,8 +16,8 @@ from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.shapes import SHAPES
 from graspd_core.methods.plan_config import load_preset, preset_names
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import Verdict
-from graspd_core.viewer.latest_jobs import LatestJobs
 from graspd_core.viewer.live_view import LiveView
 from graspd_core.viewer.plan_request import ENDINGS, MOST_GRASPS, UNITS, PlanRequest, Upload, check, load_object
 from graspd_core.viewer.session import Session, make_session

@@ -6,13 +6,13 @@ import html
 from typing import Any
 
 from graspd_core.errors import GraspdError
+from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.scene.scene import object_parts
 from graspd_core.trials.trial_recording import Recording, record_trial
 from graspd_core.trials.trial_registry import TRIALS, TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, at_friction
 from graspd_core.types import Grasp
 from graspd_core.viewer.drawing import force_parts
-from graspd_core.viewer.latest_jobs import LatestJobs
 from graspd_core.viewer.scene_nodes import SceneNodes
 from graspd_core.viewer.session import Session
 

@@ -8,9 +8,9 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
+from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.viewer.grasp_tab import GraspTab
 from graspd_core.viewer.help_text import HELP
-from graspd_core.viewer.latest_jobs import LatestJobs
 from graspd_core.viewer.live_view import LiveView
 from graspd_core.viewer.plan_tab import PlanTab
 from graspd_core.viewer.scene_nodes import SceneNodes
