@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
+.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps pictures soak sanitize fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -52,6 +52,9 @@ bench-rgbd: setup  ## make the table of docs/clouds.md anew: shapes on a table, 
 
 bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of where methods stop working (resumable)
 	$(RUN)/python benchmarks/maps.py
+
+pictures: setup  ## the pictures of docs/viewer.md anew, the same every time (half a minute)
+	$(RUN)/python benchmarks/pictures.py
 
 soak: setup  ## ten minutes of mixed load on the node: memory, latencies, answers
 	$(RUN)/python benchmarks/soak.py --minutes 10

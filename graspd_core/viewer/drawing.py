@@ -13,12 +13,13 @@ from graspd_core.hands.hand_mesh import primitive_mesh
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.scene.confidence import sample_confidence
-from graspd_core.scene.scene import Scene
+from graspd_core.scene.scene import ObjectModel, Scene
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Contact, Plane, TriangleMesh, Verdict
 
 Colour = tuple[float, float, float]
 OBJECT, GUESSED, HAND = (0.85, 0.55, 0.25), (0.80, 0.45, 0.65), (0.40, 0.50, 0.68)
+SEEN = (0.12, 0.43, 0.24)
 SUPPORT, NEIGHBOUR = (0.70, 0.72, 0.75), (0.55, 0.58, 0.50)
 NORMAL, FORCE, WEAKEST, TURN = (0.15, 0.45, 0.95), (0.90, 0.20, 0.25), (0.75, 0.15, 0.80), (0.95, 0.70, 0.10)
 VERDICTS = {
@@ -26,8 +27,8 @@ VERDICTS = {
     Verdict.UNVERIFIED: (0.60, 0.62, 0.66),
     Verdict.FAILED: (0.85, 0.20, 0.20),
 }
-# Arrows: a contact's normal and a weakest push [m], and metres per newton of a squeeze force.
-NORMAL_LENGTH, PUSH_LENGTH, FORCE_LENGTH = 0.02, 0.08, 0.008
+# Arrows: a contact's normal [m], metres per newton of a force; of a push radii of the object, so that it comes out.
+NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.008, (1.1, 0.7)
 _SHAFT, _SLICE = 0.0012, 96
 
 
@@ -85,14 +86,15 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
     return [Part("forces", arrows(tips - FORCE_LENGTH * forces[strong], tips), FORCE)]
 
 
-def weakest_parts(push: Float[np.ndarray, "6"], center: Float[np.ndarray, "3"]) -> list[Part]:
+def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
     """The push that a grasp resists least: its force at the centre of mass, and the axis that it turns about."""
-    kinds = (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN))
-    return [
-        Part(name, arrows(center[None], (center + PUSH_LENGTH * way)[None], 2 * _SHAFT), colour)
-        for name, way, colour in kinds
-        if np.linalg.norm(way) > 0.05
-    ]
+    center, parts = target.center_of_mass, []
+    for name, way, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
+        share = float(np.linalg.norm(way))
+        if share > 0.05:
+            length = target.radius * (PUSH_LENGTH[0] + PUSH_LENGTH[1] * share)
+            parts.append(Part(name, arrows(center[None], (center + length * way / share)[None], 1.5 * _SHAFT), colour))
+    return parts
 
 
 def sdf_slice(

@@ -156,8 +156,8 @@ class GraspTab:
         self._mechanics = self._mechanics or Mechanics(session)
         pressing, push = self._mechanics.squeeze_forces(grasp), self._mechanics.weakest_push(grasp)
         self._nodes.draw("forces", force_parts(pressing.positions, pressing.forces))
-        center = session.scene.object.center_of_mass
-        self._nodes.draw("weakest", weakest_parts(push, center) if push is not None else ())
+        target = session.scene.object
+        self._nodes.draw("weakest", weakest_parts(push, target) if push is not None else ())
 
     def _draw_slice(self) -> None:
         axis = _AXES.index(self._axis.value) - 1 if self._axis.value in _AXES else -1

@@ -12,11 +12,10 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import perpendicular, quaternion_from_rotation
 from graspd_core.types import Posture
-from graspd_core.viewer.drawing import Colour, Part, hand_parts, scene_parts, sdf_slice, slice_axes
+from graspd_core.viewer.drawing import SEEN, Colour, Part, hand_parts, scene_parts, sdf_slice, slice_axes
 from graspd_core.viewer.motion import placed_links
 from graspd_core.viewer.session import Session
 
-_SEEN = (30, 110, 60)
 _MOST_POINTS = 20_000
 
 
@@ -123,7 +122,7 @@ class SceneNodes:
         if len(points):
             every = -(-len(points) // _MOST_POINTS)
             shown = points[::every].astype(np.float32)
-            nodes = [self._server.scene.add_point_cloud("/cloud", shown, _SEEN, point_size=0.0012)]
+            nodes = [self._server.scene.add_point_cloud("/cloud", shown, SEEN, point_size=0.0012)]
         self._groups["cloud"] = nodes
 
     def _mesh(self, name: str, part: Part) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,10 +50,11 @@ def a_grasp() -> Grasp:
     return Grasp(posture(0.0, 0.1), posture(0.1, 0.5), posture(0.1, 0.6), (contact,), 1.5, metrics, (trial,))
 
 
-def an_answer(grasp: Grasp) -> GraspArray:
+def an_answer(grasp: Grasp) -> Any:
     header = Header(frame_id="camera", stamp=Time())
-    message = grasp_message(grasp, 0, "can-1", header, HAND, Pace())
-    return GraspArray(header=header, request_id="can-1", message="all is well", grasps=[message])
+    answer = GraspArray(header=header, request_id="can-1", message="all is well")
+    answer.grasps = [grasp_message(grasp, 0, "can-1", header, HAND, Pace())]
+    return answer
 
 
 def test_a_grasp_comes_back_from_its_message():
