@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-Work = Callable[[], None]
+Work = Callable[[], object]
 
 
 class LatestJobs:
