@@ -133,8 +133,8 @@ def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], rad
     for start, end in zip(starts, ends, strict=True):
         length = float(np.linalg.norm(end - start))
         head = min(5 * radius, 0.6 * length)
-        shaft = trimesh.creation.cylinder(radius=radius, height=length - head, sections=8)
-        cone = trimesh.creation.cone(radius=3 * radius, height=head, sections=12)
+        shaft = trimesh.creation.cylinder(radius=radius, height=length - head, sections=6)
+        cone = trimesh.creation.cone(radius=3 * radius, height=head, sections=8)
         along = (end - start) / max(length, 1e-12)
         side = perpendicular(along)
         turn = np.column_stack([side, np.cross(along, side), along])

@@ -20,7 +20,7 @@ _LESS = ("penetration", "self_penetration", "intersection_volume")
 ORDERS = ("rank", "score", "displacement", *METRICS)
 # Columns of the table, and how many rows are shown about the chosen one.
 _COLUMNS, _AROUND = ("epsilon", "penetration", "contact_area"), 2
-_BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
+BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _OTHER_FIGURES = {
     "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",
     "displacement": "farthest that the object's centre of mass moved in the trial, until the answer was known",
@@ -70,7 +70,7 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
         f"{sum(g.verdict is v for g in grasps)} {v}" for v in Verdict if any(g.verdict is v for g in grasps)
     )
     return (
-        f"{_BLOCK}{middle + 1} of {len(ranks)} shown ({counts})"
+        f"{BLOCK}{middle + 1} of {len(ranks)} shown ({counts})"
         f"<table style='width:100%;text-align:right'><tr><th>#</th><th></th>{head}</tr>{''.join(rows)}</table></div>"
     )
 
@@ -97,7 +97,7 @@ def figures_html(grasp: Grasp, rank: int) -> str:
             figures.append(_figure(row.name.replace("_", " "), text, row.description))
     links = "touching: " + html.escape(", ".join(contact.link for contact in grasp.contacts) or "nothing")
     columns = f"<div style='columns:2;column-gap:1em'>{''.join(figures)}</div>"
-    return f"{_BLOCK}{head}{columns}{links}</div>"
+    return f"{BLOCK}{head}{columns}{links}</div>"
 
 
 def _figure(name: str, value: str, meaning: str) -> str:

@@ -54,7 +54,7 @@ class GraspTab:
         self._figures = gui.add_html("")
         with gui.add_folder("What is shown", expand_by_default=False):
             self._boxes = {group: gui.add_checkbox(_NAMES[group], shown) for group, shown in _SHOWN.items()}
-            self._solid = gui.add_slider("Hand's opacity", 0.1, 1.0, 0.05, 1.0)
+            self._solid = gui.add_slider("Opacity", 0.1, 1.0, 0.05, 1.0)
             self._axis = gui.add_dropdown("Distance slice", _AXES, hint="blue inside, red outside, white the surface")
             self._share = gui.add_slider("Slice at", 0.0, 1.0, 0.01, 0.5)
         self._connect()

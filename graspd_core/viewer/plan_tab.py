@@ -18,6 +18,7 @@ from graspd_core.methods.plan_config import load_preset, preset_names
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import Verdict
+from graspd_core.viewer.grasp_list import BLOCK
 from graspd_core.viewer.live_view import LiveView
 from graspd_core.viewer.plan_request import ENDINGS, MOST_GRASPS, UNITS, PlanRequest, Upload, check, load_object
 from graspd_core.viewer.session import Session, make_session
@@ -57,7 +58,7 @@ class PlanTab:
         self._halt = gui.add_button("Stop", disabled=True)
         self._save = gui.add_button("Save grasps.json", disabled=True)
         self._bar = gui.add_progress_bar(0.0)
-        self._status = gui.add_html("nothing planned yet")
+        self._status = gui.add_html(f"{BLOCK}nothing planned yet</div>")
         self._file.on_upload(self._take)
         self._plan.on_click(lambda _: self.plan())
         self._halt.on_click(lambda _: self._stop.set())
@@ -69,7 +70,7 @@ class PlanTab:
 
     def tell(self, line: str, share: float) -> None:
         """Show how far a run is. From the drawing thread."""
-        self._status.content, self._bar.value = html.escape(line), 100.0 * min(max(share, 0.0), 1.0)
+        self._status.content, self._bar.value = f"{BLOCK}{html.escape(line)}</div>", 100.0 * min(max(share, 0.0), 1.0)
 
     def _say(self, line: str, share: float = 0.0) -> None:
         """Show something in place of what a run has told before, from any thread."""

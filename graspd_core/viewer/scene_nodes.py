@@ -29,7 +29,13 @@ class SceneNodes:
         self._object: Any = None
         self._hidden: set[str] = set()
         self._opacity = 1.0
-        server.scene.add_light_hemisphere("/light", intensity=1.2)
+        # viser's own lights, shadows and reflections bring a browser that draws in software to 1 frame a second.
+        server.scene.configure_default_lights(False)
+        server.scene.configure_environment_map(None)
+        server.scene.add_light_hemisphere(
+            "/light/sky", sky_color=(255, 255, 255), ground_color=(90, 90, 110), intensity=3.0
+        )
+        server.scene.add_light_directional("/light/sun", intensity=1.5, cast_shadow=False, position=(1.0, 1.0, 2.0))
 
     def show(self, session: Session) -> None:
         """Draw a session's object and hand anew, and nothing else."""
@@ -61,7 +67,7 @@ class SceneNodes:
             node.remove()
         if len(lines):
             tints = np.repeat((255 * colours).astype(np.uint8)[:, None], 2, axis=1)
-            self._groups["lines"] = [self._server.scene.add_line_segments("/lines", lines, tints)]
+            self._groups["lines"] = [self._server.scene.add_line_segments("/lines", lines, tints, thickness=0.0015)]
 
     def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
         """The signed distance on a plane square to an axis; None for none."""
@@ -127,7 +133,8 @@ class SceneNodes:
 
     def _mesh(self, name: str, part: Part) -> Any:
         return self._server.scene.add_mesh_simple(
-            name, part.mesh.vertices, part.mesh.faces, color=_bytes(part.colour), side="double", flat_shading=True,
+            name, part.mesh.vertices, part.mesh.faces, color=_bytes(part.colour), flat_shading=True,
+            side="front" if name.startswith("/hand") else "double",
             opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
@@ -141,7 +148,7 @@ class SceneNodes:
         elif session.grasps:
             middle = session.grasps[0].grasp.position
         side = perpendicular(up)
-        eye = middle + (0.15 + 1.8 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up)
+        eye = middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up)
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
             camera.position, camera.look_at = eye, middle

@@ -13,6 +13,7 @@ from graspd_core.trials.trial_registry import TRIALS, TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, at_friction
 from graspd_core.types import Grasp
 from graspd_core.viewer.drawing import force_parts
+from graspd_core.viewer.grasp_list import BLOCK
 from graspd_core.viewer.scene_nodes import SceneNodes
 from graspd_core.viewer.session import Session
 
@@ -68,12 +69,12 @@ class TrialControls:
 
     def _run(self) -> None:
         if self._session is None or self._grasp is None or self._session.scene is None:
-            self._text.content = "<i>a trial needs a grasp and its object</i>"
+            self._text.content = f"{BLOCK}a trial needs a grasp and its object</div>"
             return
         try:
             self._recording = record_trial(self._context(), self._grasp, self._name.value)
         except GraspdError as error:
-            self._text.content = f"<i>{html.escape(str(error))}</i>"
+            self._text.content = f"{BLOCK}{html.escape(str(error))}</div>"
             return
         self._time.max, self._time.disabled = max(len(self._recording.frames) - 1, 1), False
         self._play_from(0)
@@ -103,7 +104,8 @@ class TrialControls:
         if recording is None:
             return
         if not recording.frames:
-            self._text.content = f"failed before its first step: <b>{html.escape(recording.result.reason)}</b>"
+            reason = html.escape(recording.result.reason)
+            self._text.content = f"{BLOCK}failed before its first step: <b>{reason}</b></div>"
             return
         last = len(recording.frames) - 1
         index = min(max(index, 0), last)
@@ -123,6 +125,6 @@ def _told(recording: Recording, index: int, stage: str) -> str:
     end = seconds * (len(recording.frames) - 1)
     line = f"{seconds * index:.2f} s of {end:.2f} s: {html.escape(stage)}"
     if result.passed:
-        return f"{line}<br><b style='color:rgb(40,165,75)'>passed</b>"
+        return f"{BLOCK}{line}<br><b style='color:rgb(40,165,75)'>passed</b></div>"
     failed = f"failed at {end:.2f} s: {html.escape(result.reason)}"
-    return f"{line}<br><b style='color:rgb(215,50,50)'>{failed}</b>"
+    return f"{BLOCK}{line}<br><b style='color:rgb(215,50,50)'>{failed}</b></div>"
