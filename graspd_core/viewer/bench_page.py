@@ -51,7 +51,7 @@ def save_bench_page(folder: Path, page: Path) -> None:
         raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
     # Within a script only this sequence could end it.
     text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
-    save_text(page, _PAGE.replace("@TITLE@", html.escape(str(folder))).replace("@DATA@", text))
+    save_text(page, _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text))
 
 
 def page_data(records: Sequence[Record]) -> dict[str, Any]:
