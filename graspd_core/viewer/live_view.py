@@ -16,7 +16,7 @@ from graspd_core.viewer.scene_nodes import SceneNodes
 from graspd_core.viewer.session import Session
 
 # Least time from one picture to the next [s], and hands in one at most.
-INTERVAL, _MOST_HANDS = 0.1, 256
+INTERVAL, _MOST_HANDS = 0.2, 256
 _WORDS = {Stage.OPTIMISE: "searching", Stage.VERIFY: "trying"}
 
 

@@ -38,7 +38,7 @@ PATIENCE = 20_000  # milliseconds until what is waited for is held to never come
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Starting a browser on a busy machine takes its time."""
     for item in items:
-        if "test/viewer" in item.path.as_posix() and "page" in getattr(item, "fixturenames", ()):
+        if "test/viewer" in item.path.as_posix() and "visit" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.timeout(300))
 
 

@@ -135,7 +135,7 @@ def test_of_each_kind_the_newest_job_is_done_and_a_fault_ends_nothing():
     assert [type(error) for error in failed] == [ZeroDivisionError]
 
 
-def test_a_live_view_draws_ten_times_a_second_at_most_and_the_last_state(grasps_file):
+def test_a_live_view_draws_five_times_a_second_at_most_and_the_last_state(grasps_file):
     session = open_grasps(grasps_file)
     drawn: list[tuple[int, np.ndarray]] = []
 
