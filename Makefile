@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format demo bench bench-quick bench-rgbd bench-maps pictures soak sanitize fuzz clean
+.PHONY: help setup test check format docs pictures wheel demo bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -34,27 +34,36 @@ format: setup  ## format and sort imports in place
 	$(RUN)/ruff check --fix .
 	$(RUN)/ruff format .
 
+docs: setup  ## the pages of docs/ and the reference of the library, to build/site; warnings are errors
+	$(RUN)/mkdocs build
+	@echo build/site/index.html
+
+pictures: setup  ## the pictures of README.md and docs/viewer.md anew, the same every time (half a minute)
+	$(RUN)/python benchmarks/pictures.py
+
+wheel: setup  ## a source distribution and a wheel, to dist/
+	$(RUN)/python -m build
+
 demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and figures out, in demo/
 	$(RUN)/python examples/demo.py
 
 BENCH := $(RUN)/graspd bench --processes 2
+PAGES := README.md docs/bench.md docs/hands.md docs/clouds.md docs/stress.md docs/metrics.md
 
-bench: setup  ## all methods and presets on all shapes: README's chart and tables anew (an hour and more; resumable)
-	$(BENCH) --suite main --suite ladder --suite hands --out results/bench --chart docs/figures/bench \
-		--readme README.md --readme docs/bench.md --readme docs/hands.md
+bench: setup  ## every study: the charts and tables of README and docs/ anew (under 90 minutes on two cores; resumable)
+	@mkdir -p results
+	$(RUN)/python benchmarks/mano_synthetic.py results/synthetic.pkl
+	$(BENCH) mano --hand results/synthetic.pkl --out results/mano --readme docs/hands.md
+	$(BENCH) all --chart docs/figures/bench $(addprefix --readme ,$(PAGES))
 
 bench-quick: setup  ## a small part of it, in minutes, to results/bench-quick
 	$(BENCH) --quick --out results/bench-quick --chart results/bench-quick/chart
 
-bench-rgbd: setup  ## make the table of docs/clouds.md anew: shapes on a table, rendered with sensor noise (an hour)
-	$(RUN)/python benchmarks/rgbd.py --readme docs/clouds.md
-	$(if $(FRAMES),$(RUN)/python benchmarks/rgbd.py --frames $(FRAMES))
+bench-rgbd: setup  ## the table of docs/clouds.md anew: shapes on a table, rendered with sensor noise; FRAMES=DIR: real ones
+	$(BENCH) $(if $(FRAMES),frames --objects $(FRAMES) --out results/frames,rgbd) --readme docs/clouds.md
 
-bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of where methods stop working (resumable)
-	$(RUN)/python benchmarks/maps.py
-
-pictures: setup  ## the pictures of docs/viewer.md anew, the same every time (half a minute)
-	$(RUN)/python benchmarks/pictures.py
+bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of where methods stop working
+	$(BENCH) maps --chart docs/figures/bench --readme docs/stress.md
 
 soak: setup  ## ten minutes of mixed load on the node: memory, latencies, answers
 	$(RUN)/python benchmarks/soak.py --minutes 10

@@ -161,7 +161,8 @@ def layouts() -> list[bytes]:
 
 
 def _messages() -> list[Any]:
-    from graspd_core.bags.writer import camera_info_message, cloud_message, depth_message, transforms_message
+    from bag_writer import camera_info_message, cloud_message, depth_message, transforms_message
+
     from graspd_core.pointcloud.camera import PinholeCamera
 
     camera = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0, (0.1, -0.2, 0.001, -0.001, 0.05))
@@ -188,7 +189,7 @@ def messages() -> list[bytes]:
 
 def bags() -> list[bytes]:
     """A recording of each kind of message, in both storages."""
-    from graspd_core.bags.writer import Record, write_bag
+    from bag_writer import Record, write_bag
 
     topics = ("/points", "/depth/image_raw", "/depth/camera_info", "/tf", "/depth/image_rect")
     records = [

@@ -204,9 +204,10 @@ def _bag(path: Path) -> Any:
 
 def _message(path: Path) -> Any:
     """A message of one of four types, named by the first byte, as CDR."""
+    from bag_writer import camera_info_message
+
     from graspd_core.bags.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
     from graspd_core.bags.reader import CLOUD, IMAGE, INFO, TRANSFORMS, jazzy_types
-    from graspd_core.bags.writer import camera_info_message
     from graspd_core.errors import FormatError
     from graspd_core.pointcloud.camera import PinholeCamera
     from graspd_core.transforms import TransformBuffer
@@ -225,7 +226,7 @@ def _message(path: Path) -> Any:
     camera = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0)
     if kind == IMAGE:
         return cloud_from_depth_message(message, camera_info_message(camera, "c", 0))
-    from graspd_core.bags.writer import depth_message
+    from bag_writer import depth_message
 
     image = depth_message(np.full((3, 4), 0.5), "c", 0)
     return cloud_from_depth_message(image, message), cloud_from_depth_message(image, message, rectified=True)
@@ -254,12 +255,12 @@ TARGETS: dict[str, Target] = {
         ),
         Target(
             "mjcf", _hand, "xml", lambda: MJCFS, _errors("HandError"),
-            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_values", "_geoms"))),
+            (*_HANDS, *(f"graspd_core.hands.readers.mjcf{n}" for n in ("", "_geoms"))),
             (*_NUMBERS, "polycoef=", "eulerseq=", "childclass=", "<freejoint/>", "quat=", "xyaxes=", "fromto="),
         ),
         Target(
             "description", _description, "yaml", lambda: DESCRIPTIONS, _errors("HandError"),
-            ("graspd_core.hands.readers.description", "graspd_core.hands.readers.mount"),
+            ("graspd_core.hands.readers.description",),
             (*_NUMBERS, *_YAML, "palm:", "!!timestamp", ".nan"),
         ),
         Target(

@@ -2,8 +2,8 @@
 
     python benchmarks/pictures.py [--figures docs/figures]
 
-view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and view_failed.png: rays against the meshes of
-`graspd_core.viewer.drawing`, so that no browser and no screen is needed.
+grasps.png of README.md, and view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and view_failed.png of
+docs/viewer.md: rays against the meshes of `graspd_core.viewer.drawing`, so that no browser and no screen is needed.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ os.environ.update(OMP_NUM_THREADS="1")
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from graspd_core import HandModel, PlanConfig, hand_names, load_hand, load_preset, load_scene, plan_grasps
 from graspd_core.rendering.depth_noise import DepthNoise
-from graspd_core.rendering.render import camera_of_view, look_at, render_shaded, save_png
+from graspd_core.rendering.render import camera_of_view, look_at, render_scene, render_shaded, save_png
 from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core.scene.scene import Scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
@@ -30,12 +31,16 @@ from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.trials.trial_recording import record_trial
 from graspd_core.trials.trial_registry import build_worlds
 from graspd_core.trials.world import PROTOCOLS
-from graspd_core.types import Grasp, Posture, TriangleMesh
+from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
 from graspd_core.viewer.drawing import SEEN, Part, contact_parts, force_parts, hand_parts, scene_parts, weakest_parts
 from graspd_core.viewer.mechanics import Mechanics
 from graspd_core.viewer.motion import STAGES, placed_links, posture_at
 from graspd_core.viewer.session import Session
 
+# What is grasped on the README's picture, and by which hand.
+PAIRS = (("shape:mug", "allegro_right"), ("shape:torus", "barrett_like"), ("shape:hammer", "leap_right"))
+# Ways to turn things before they are looked at [rad].
+TURNS = np.arange(0.0, 2 * np.pi, np.pi / 8)
 # Pixels of a picture's side; rays are cast through four times as many.
 SIDE, FINER = 360, 2
 
@@ -49,16 +54,30 @@ def main() -> None:
     mug, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("balanced")
     grasps = plan_grasps(mug, hand, count=8, preset=config, measure=False).grasps
     pictures = {
-        "hero": hero(mug, hand, config, grasps[0]),
-        "sequence": sequence(mug, hand, grasps[0]),
-        "cloud": cloud(),
-        "hands": hands(),
-        "failed": failed(),
+        "grasps": pairs(),
+        "view_hero": hero(mug, hand, config, grasps[0]),
+        "view_sequence": sequence(mug, hand, grasps[0]),
+        "view_cloud": cloud(),
+        "view_hands": hands(),
+        "view_failed": failed(),
     }
     for name, picture in pictures.items():
-        path = options.figures / f"view_{name}.png"
+        path = options.figures / f"{name}.png"
         save_png(picture, path)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+def pairs() -> np.ndarray:
+    """Three hands, each with the best grasp that held."""
+    found = []
+    for source, name in PAIRS:
+        scene, hand = load_scene(source), load_hand(name)
+        best = plan_grasps(scene, hand, count=4, measure=False).grasps[0]
+        if best.verdict is not Verdict.VERIFIED:
+            raise RuntimeError(f"{source} by {name}: {best.reason}")
+        drawn, held = scene_parts(scene), at(hand, best.grasp)
+        found.append(shot(scene, drawn + held, near=1.25, turn=clearest(scene, drawn, held)))
+    return np.hstack(found)
 
 
 def hero(scene: Scene, hand: HandModel, config: PlanConfig, grasp: Grasp) -> np.ndarray:
@@ -88,7 +107,9 @@ def cloud() -> np.ndarray:
     best = plan_grasps(scene, hand, count=1, preset="fast", measure=False).grasps[0]
     drawn = scene_parts(scene)
     seen = [dots(np.concatenate([view.points for view in views]), scene), *drawn[2:3]]
-    return np.hstack([shot(scene, p, near=1.3) for p in (seen, drawn, [*drawn, *at(hand, best.grasp)])])
+    held = at(hand, best.grasp)
+    turn = clearest(scene, drawn[:2], held)
+    return np.hstack([shot(scene, p, near=1.3, turn=turn) for p in (seen, drawn, drawn + held)])
 
 
 def dots(points: np.ndarray, scene: Scene) -> Part:
@@ -141,22 +162,41 @@ def moved(part: Part, position: np.ndarray, quaternion: np.ndarray) -> Part:
     return replace(part, mesh=TriangleMesh(part.mesh.vertices @ rotation.T + position, part.mesh.faces))
 
 
-def shot(scene: Scene, parts: Sequence[Part], *, width: float = 1.0, near: float = 1.0) -> np.ndarray:
+def shot(
+    scene: Scene, parts: Sequence[Part], *, width: float = 1.0, near: float = 1.0, turn: float = 0.0
+) -> np.ndarray:
     """A picture of parts, the support's free side up; `width` is its share of the height."""
+    meshes, pose = stood(scene, parts, near, turn)
+    colours = [part.colour for part in parts]
+    size = {"width": round(width * SIDE) * FINER, "height": SIDE * FINER}
+    fine = render_shaded(list(zip(meshes, colours, strict=True)), T_world_camera=pose, **size).astype(float)
+    rows, columns = SIDE, round(width * SIDE)
+    return fine.reshape(rows, FINER, columns, FINER, 3).mean((1, 3)).astype(np.uint8)
+
+
+def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> float:
+    """The turn in which the fewest of what is shown is hidden by what may be before it [rad]."""
+
+    def seen(turn: float) -> int:
+        meshes, pose = stood(scene, [*shown, *before], 1.0, turn)
+        return int(np.isin(render_scene(meshes, camera_of_view(60, 60), pose)[1], range(len(shown))).sum())
+
+    return max(TURNS, key=seen)
+
+
+def stood(
+    scene: Scene, parts: Sequence[Part], near: float, turn: float
+) -> tuple[list[TriangleMesh], Float[np.ndarray, "4 4"]]:
+    """Meshes with up at z, from where the light comes, turned about it; and the camera."""
     corners = scene.object.mesh.vertices
     middle = 0.5 * (corners.min(0) + corners.max(0))
     up = np.array([0.0, 0.0, 1.0]) if scene.support is None else scene.support.normal
-    side = perpendicular(up)
-    away = 0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up
-    eye = middle + (0.30 + 1.2 * float(np.ptp(corners, axis=0).max())) / near * away
-    # The light comes from z: the world is turned so that up is there.
-    turn = np.stack([side, np.cross(up, side), up])
-    pose = look_at(turn @ (eye - middle), np.zeros(3))
-    meshes = [(TriangleMesh((p.mesh.vertices - middle) @ turn.T, p.mesh.faces), p.colour) for p in parts]
-    size = {"width": round(width * SIDE) * FINER, "height": SIDE * FINER}
-    fine = render_shaded(meshes, T_world_camera=pose, **size).astype(float)
-    rows, columns = SIDE, round(width * SIDE)
-    return fine.reshape(rows, FINER, columns, FINER, 3).mean((1, 3)).astype(np.uint8)
+    first = perpendicular(up)
+    side = np.cos(turn) * first + np.sin(turn) * np.cross(up, first)
+    rotation = np.stack([side, np.cross(up, side), up])
+    distance = (0.30 + 1.2 * float(np.ptp(corners, axis=0).max())) / near
+    pose = look_at(distance * np.array([0.75, 0.55, 0.45]), np.zeros(3))
+    return [TriangleMesh((p.mesh.vertices - middle) @ rotation.T, p.mesh.faces) for p in parts], pose
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """A node under mixed load for minutes: does its memory stay flat, does it answer in time, does each request end once?
 
-    python benchmarks/soak.py --minutes 10 [--out results/soak.json]
+    python benchmarks/soak.py [--minutes 10] [--out results/soak] [--readme docs/ros.md]
 
 Three processes besides this one's client: the node (with a timer of its own to measure by), a camera of 640×480 at
-30 Hz, and a control that only ticks: how late that comes is the machine's doing. Nothing is mocked. Prints a Markdown
-table, and what of the targets is met.
+30 Hz, and a control that only ticks: how late that comes is the machine's doing. Nothing is mocked. The record, the
+line on its origin and the filling of pages are those of `graspd bench`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,18 @@ import random
 import subprocess
 import sys
 import tempfile
-import threading
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from graspd_core.bench.report import fill, markdown_table, sourced, written
+from graspd_core.bench.result_store import code_version, write_record
+from graspd_core.bench.run_cases import Job, run_job
+from graspd_core.bench.study import Case, Record, Sections
 
 PARTS = Path(__file__).with_name("soak_parts.py")
 SAMPLE_PERIOD = 5.0  # seconds between two looks at the node's memory
@@ -36,13 +42,15 @@ LIMITS = {
 }
 
 
-def main() -> int:
-    """Run, print the table and the targets; 1 when one of them is not met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--out", type=Path, help="figures as JSON")
-    options = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parents[1]))
+@dataclass(frozen=True)
+class Soak(Case):
+    """Minutes of load."""
+
+    minutes: float
+
+
+def run_soak(case: Soak) -> Record:
+    """All figures of one run, in a domain and a cache of its own."""
     from graspd_core.paths import config_dir
 
     with tempfile.TemporaryDirectory() as folder:
@@ -53,16 +61,10 @@ def main() -> int:
             "XDG_CACHE_HOME": folder,
             "ROS_LOG_DIR": folder,
         }
-        figures = soak(Path(folder), options.minutes * 60)
-    figures["targets"] = targets(figures)
-    print(table(figures))
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(figures, indent=1) + "\n")
-    return int(not all(figures["targets"].values()))
+        return soak(Path(folder), case.minutes * 60)
 
 
-def soak(folder: Path, seconds: float) -> dict[str, Any]:
+def soak(folder: Path, seconds: float) -> Record:
     """Start the processes, keep them busy, gather the figures."""
     from soak_client import SCENES, Client  # it imports ROS, which reads the environment set above
 
@@ -71,149 +73,123 @@ def soak(folder: Path, seconds: float) -> dict[str, Any]:
 
     for shape in ("sphere", "mug", "box"):
         save_mesh(make_shape(shape), folder / f"{shape}.obj")
-    notes = folder / "node.jsonl"
+    notes, log = folder / "node.jsonl", (folder / "node.log").open("w")
     parameters = ["--ros-args", "-p", "cloud_policy:=off", "-p", "queue_size:=4"]
-    log = (folder / "node.log").open("w")
     run_node = [sys.executable, str(PARTS), "node", str(notes), *parameters]
     node = subprocess.Popen(run_node, cwd=folder, stdout=log, stderr=log)
-    camera = control = None
+    others: list[subprocess.Popen[str]] = []
+    memory: list[float] = []
     try:
-        client = Client()
+        client = Client(lambda: memory.append(_memory(node.pid)), SAMPLE_PERIOD)
         client.wait(lambda: client.ready or node.poll() is not None, "the node to be ready")
         if not client.ready:
-            sys.exit(f"soak: the node did not start:\n{(folder / 'node.log').read_text()}")
-        camera, control = [
-            subprocess.Popen([sys.executable, str(PARTS), part, str(seconds)], stdout=subprocess.PIPE, text=True)
-            for part in ("camera", "control")
-        ]
-        memory = Memory(node.pid)
-        end = time.monotonic() + seconds
-        script = random.Random(0)
+            raise RuntimeError(f"the node did not start:\n{(folder / 'node.log').read_text()}")
+        for part in ("camera", "control"):
+            command = [sys.executable, str(PARTS), part, str(seconds)]
+            others.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        end, script = time.monotonic() + seconds, random.Random(0)
         while time.monotonic() < end and node.poll() is None:
             script.choice(SCENES)(client, script)
         alive = node.poll() is None
         client.settle()
-        sent = int(camera.communicate(timeout=60)[0] or 0)
-        ticks = json.loads(control.communicate(timeout=60)[0] or "[]")
+        sent, ticks = (json.loads(process.communicate(timeout=60)[0] or "[]") for process in others)
         time.sleep(6.0)  # the node's last notes
-        memory.stop()
         node.terminate()
         node.wait(10)
     finally:
-        for process in (node, camera, control):
-            if process is not None and process.poll() is None:
+        for process in (node, *others):
+            if process.poll() is None:
                 process.kill()
-    noted: dict[str, list[float]] = {"late": [], "ages": []}
-    for line in notes.read_text().splitlines():
-        for key, values in json.loads(line).items():
-            noted[key] += values
-    cache = sum(path.stat().st_size for path in (folder / "graspd").glob("*")) / 1e6
+    lines = [json.loads(line) for line in notes.read_text().splitlines()]
+    late, ages = ([value for line in lines for value in line[key]] for key in ("late", "ages"))
     figures = client.figures()
-    waits = {name: spread(values) for name, values in sorted(figures.pop("waits").items())}
-    return figures | memory.figures() | {
-        "seconds": seconds,
+    waits = {"timer lateness in the node": late, "lateness of a process that only ticks": ticks, "cloud age": ages}
+    tenth = max(len(ages) // 10, 1)
+    return {
+        **figures,
+        "waits": {name: spread(values) for name, values in (waits | figures["waits"]).items() if values},
         "alive": alive,
-        "waits": {
-            "timer lateness in the node": spread(noted["late"]),
-            "lateness of a process that only ticks": spread(ticks),
-            **waits,
-            "cloud age": spread(noted["ages"]),
-        },
-        "clouds sent": sent,
-        "clouds received": len(noted["ages"]),
-        "cloud age, medians of the first and last tenth [ms]": tenths(noted["ages"]),
-        "disk cache [MB]": cache,
-    }  # fmt: skip
-
-
-class Memory:
-    """Samples the resident memory of the node and its children."""
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-        self._samples: list[float] = []
-        self._over = threading.Event()
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self) -> None:
-        from graspd_ros.diagnostics import resident_memory
-
-        while not self._over.wait(SAMPLE_PERIOD) and (memory := resident_memory(self._pid)):
-            self._samples.append(memory / 1e6)
-
-    def stop(self) -> None:
-        self._over.set()
-
-    def figures(self) -> dict[str, Any]:
-        """Growth: the median of the last fifth over that of the first fifth after settling; None: unknown."""
-        flat = self._samples[int(SETTLED * len(self._samples)) :]
-        fifth = max(len(flat) // 5, 1)
-        growth = float(np.median(flat[-fifth:]) / np.median(flat[:fifth]) - 1) if len(flat) > 1 else None
-        return {"memory [MB]": [round(value) for value in self._samples], "growth": growth}
-
-
-def targets(figures: dict[str, Any]) -> dict[str, bool]:
-    """What is expected of the node, and whether it did so; what was not measured is not met."""
-    growth = figures["growth"]
-    met = {
-        "the node is alive at the end": figures["alive"],
-        "no request is lost": figures["requests"] > 0 and not figures["lost"],
-        "none is answered twice": not figures["twice"],
-        "the client waits for nothing in vain": not figures["timeouts"],
-        f"memory grows by {GROWTH:.0%} at most": growth is not None and growth <= GROWTH,
+        "memory_mb": memory,
+        "clouds": [len(ages), sent],
+        "ages_ms": [float(np.median(part) * 1e3) for part in (ages[:tenth], ages[-tenth:])] if ages else [],
+        "cache_mb": sum(path.stat().st_size for path in (folder / "graspd").glob("*")) / 1e6,
     }
-    for begin, limit in LIMITS.items():
-        found = [s["p99"] for name, s in figures["waits"].items() if name.startswith(begin) and s]
-        met[f"{begin}: p99 below {limit:.0f} ms"] = bool(found) and max(found) < limit
-    return met
 
 
-def spread(values: list[float]) -> dict[str, float]:
+def _memory(pid: int) -> float:
+    from graspd_ros.diagnostics import resident_memory
+
+    return resident_memory(pid) / 1e6
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
     """Median, 99th percentile and greatest [ms]."""
-    if not values:
-        return {}
     median, p99 = np.percentile(values, [50, 99]) * 1e3
     return {"n": len(values), "p50": float(median), "p99": float(p99), "max": max(values) * 1e3}
 
 
-def tenths(values: list[float]) -> list[float]:
-    """Medians of the first and the last tenth [ms]: whether a delay grows."""
-    part = max(len(values) // 10, 1)
-    return [float(np.median(values[:part]) * 1e3), float(np.median(values[-part:]) * 1e3)] if values else []
+def growth(memory: Sequence[float]) -> float | None:
+    """The median of the last fifth over that of the first fifth after settling, less one; None: unknown."""
+    flat = memory[int(SETTLED * len(memory)) :]
+    fifth = max(len(flat) // 5, 1)
+    return float(np.median(flat[-fifth:]) / np.median(flat[:fifth]) - 1) if len(flat) > 1 else None
 
 
-def table(figures: dict[str, Any]) -> str:
-    """The figures as Markdown."""
-    memory = figures["memory [MB]"] or [0]
-    first, last = [f"{value:.1f}" for value in figures["cloud age, medians of the first and last tenth [ms]"]] or "--"
-    growth = figures["growth"]
-    rows = [
-        "| what | n | median [ms] | p99 [ms] | max [ms] |",
-        "|---|---|---|---|---|",
-        *(
-            f"| {name} | {s['n']} | {s['p50']:.1f} | {s['p99']:.1f} | {s['max']:.1f} |"
-            for name, s in figures["waits"].items()
-            if s
-        ),
-        "",
-        "| what | figure |",
-        "|---|---|",
-        f"| time | {figures['seconds'] / 60:.1f} min; node alive at the end: {'yes' if figures['alive'] else 'no'} |",
-        f"| memory | {memory[0]} MB at first, {memory[-1]} MB at last, {max(memory)} MB at most; "
-        f"grown {'by nobody knows what' if growth is None else f'{growth:+.1%}'} after the first fifth |",
-        f"| requests | {figures['requests']}: {figures['lost']} lost, {figures['twice']} answered twice; "
-        f"{figures['timeouts']} waits in vain |",
-        f"| answers | {', '.join(f'{count} {name}' for name, count in figures['statuses'].items())} |",
-        f"| codes | {', '.join(f'{count} {name}' for name, count in figures['codes'].items())} |",
-        f"| clouds of 9.8 MB | {figures['clouds received']} of {figures['clouds sent']} received; "
-        f"age {first} ms in the first tenth, {last} ms in the last |",
-        f"| disk cache | {figures['disk cache [MB]']:.0f} MB |",
-        "",
-        "| target | |",
-        "|---|---|",
-        *(f"| {name} | {'met' if met else 'NOT met'} |" for name, met in figures["targets"].items()),
+def targets(record: Record) -> dict[str, bool]:
+    """What is expected of the node, and whether it did so; what was not measured is not met."""
+    grown = growth(record["memory_mb"])
+    met = {
+        "the node is alive at the end": record["alive"],
+        "no request is lost": record["requests"] > 0 and not record["lost"],
+        "none is answered twice": not record["twice"],
+        "the client waits for nothing in vain": not record["timeouts"],
+        f"memory grows by {GROWTH:.0%} at most": grown is not None and grown <= GROWTH,
+    }
+    for begin, limit in LIMITS.items():
+        found = [s["p99"] for name, s in record["waits"].items() if name.startswith(begin)]
+        met[f"{begin}: p99 below {limit:.0f} ms"] = bool(found) and max(found) < limit
+    return met
+
+
+def soak_sections(record: Record) -> Sections:
+    """The waits, the counts, and what of the targets is met."""
+    waits = [[name, *(f"{s[key]:.{int(key != 'n')}f}" for key in s)] for name, s in record["waits"].items()]
+    memory, grown = record["memory_mb"] or [0.0], growth(record["memory_mb"])
+    first, last = (f"{age:.1f}" for age in record["ages_ms"] or [float("nan")] * 2)
+    got, sent = record["clouds"]
+    counts = [
+        ["memory [MB]", f"{memory[0]:.0f} at first, {memory[-1]:.0f} at last, {max(memory):.0f} at most"],
+        ["growth after the first fifth", "unknown" if grown is None else f"{grown:+.1%}"],
+        ["requests", ", ".join(f"{record[key]} {key}" for key in ("requests", "lost", "twice", "timeouts"))],
+        ["answers", ", ".join(f"{count} {name}" for name, count in (record["statuses"] | record["codes"]).items())],
+        ["clouds of 9.8 MB", f"{got} of {sent} received; age {first} ms at first, {last} ms at last"],
+        ["disk cache", f"{record['cache_mb']:.0f} MB"],
     ]
-    return "\n".join(rows)
+    met = [[name, "met" if good else "NOT met"] for name, good in targets(record).items()]
+    told = f"{record['minutes']:g} minutes: clouds at 30 Hz, requests of every kind, cancels."
+    heads = (["what", "n", "median [ms]", "p99 [ms]", "max [ms]"], ["what", "figure"], ["target", ""])
+    tables = (markdown_table(head, body) for head, body in zip(heads, (waits, counts, met), strict=True))
+    return {"faults": [told, *tables]}
+
+
+def main() -> int:
+    """Run, print the tables; 1 when a target is not met."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=Path("results/soak"), metavar="DIR")
+    parser.add_argument("--readme", type=Path, help="fill its section of the name `faults`")
+    options = parser.parse_args()
+    case = Soak(options.minutes)
+    record: dict[str, Any] = run_job(Job("soak", case, run_soak, code_version()))
+    write_record(options.out, "soak", case, record)
+    if record["error"]:
+        print(record["error"], file=sys.stderr)
+        return 1
+    sections = sourced("make soak", [record], soak_sections(record))
+    print(written(sections["faults"]))
+    if options.readme:
+        fill(options.readme, sections)
+    return int(not all(targets(record).values()))
 
 
 if __name__ == "__main__":

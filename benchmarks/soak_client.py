@@ -38,8 +38,10 @@ MALFORMED: tuple[dict[str, Any], ...] = (
 class Client:
     """One node that talks to graspd; everything happens while it spins."""
 
-    def __init__(self) -> None:
+    def __init__(self, sample: Callable[[], None], period: float) -> None:
+        """Args: what is called every `period` seconds while it spins."""
         rclpy.init()
+        self._sample, self._period, self._sampled = sample, period, 0.0
         self.node = rclpy.create_node("soak_client")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
@@ -74,6 +76,9 @@ class Client:
         """A little while; a trivial service is called all the time."""
         self._executor.spin_once(timeout_sec=0.005)
         now = time.monotonic()
+        if self.ready and now - self._sampled >= self._period:
+            self._sampled = now
+            self._sample()
         if self._ping is not None and self._ping.done():
             self.waits["trivial service"].append(now - self._pinged)
             self._ping = None

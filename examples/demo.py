@@ -27,9 +27,9 @@ from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import String
 
-from graspd_core import cloud_from_depth, hand_mesh, load_hand, make_shape, save_mesh
+from graspd_core import Posture, TriangleMesh, cloud_from_depth, load_hand, make_shape, save_mesh
+from graspd_core.formats.grasp_page import placed_hand
 from graspd_core.rendering.render import camera_of_view, look_at, render_depth, render_shaded, save_png
-from graspd_core.types import TriangleMesh
 
 GRASPS = 8
 TIMEOUT = 180.0  # seconds; each step takes a few on a quiet machine
@@ -56,7 +56,8 @@ class Robot:
         self.joints: JointState | None = None
         self.pose: PoseStamped | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(String, "/graspd/status", self._on_status, 50)
+        told = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(String, "/graspd/status", self._on_status, told)
         self.node.create_subscription(JointState, "/graspd/joint_states", self._on_joints, latched)
         self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self._on_pose, latched)
         self.mesh = self.node.create_publisher(String, "/graspd/mesh", 10)
@@ -117,10 +118,9 @@ def hand_in_object_frame(joints: JointState, stamped: PoseStamped) -> TriangleMe
     """The hand at the joints and the pose that came over the topics."""
     hand = load_hand("allegro_right")
     value_of = dict(zip(joints.name, joints.position, strict=True))
-    mesh = hand_mesh(hand, np.array([value_of[name] for name in hand.joint_names]))
-    position, orientation = stamped.pose.position, stamped.pose.orientation
-    rotation = rotation_of(orientation.x, orientation.y, orientation.z, orientation.w)
-    return TriangleMesh(mesh.vertices @ rotation.T + [position.x, position.y, position.z], mesh.faces)
+    at, turn = stamped.pose.position, stamped.pose.orientation
+    position, quaternion = np.array([at.x, at.y, at.z]), np.array([turn.w, turn.x, turn.y, turn.z])
+    return placed_hand(hand, Posture(position, quaternion, np.array([value_of[name] for name in hand.joint_names])))
 
 
 def say(line: str) -> None:
@@ -133,17 +133,6 @@ def describe(best: dict[str, Any]) -> str:
         parts.append(f"penetration {best['metrics']['penetration_mm']:.1f} mm")
     parts += [f"moved {trial['displacement'] * 100:.2f} cm in the {trial['name']} trial" for trial in best["trials"]]
     return ", ".join(parts)
-
-
-def rotation_of(x: float, y: float, z: float, w: float) -> np.ndarray:
-    """Rotation matrix of a unit quaternion."""
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def cloud_of(mug: TriangleMesh) -> PointCloud2:

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 PROBE_TIMEOUT = 60.0  # seconds; a cold disk takes several for torch or Open3D
-_SETUP = "run `make setup`, or pip install -c constraints.txt -e '.[ros,bench,dev]'"
+_SETUP = "run `make setup` in the checkout, or pip install graspd again"
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
 # distribution: module
 _LIBRARIES = {
@@ -96,8 +96,8 @@ def run_checks() -> list[Check]:
         ("compiled kernel", _KERNEL, f"torch does its work, 30 times slower: {_SETUP}", False),
         *((name, _import_probe(name, module), _SETUP, True) for name, module in _LIBRARIES.items()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
-        ("pybullet", _BULLET, "only benchmarks need it, on Python 3.11: pip install -e '.[bench]'", False),
-        ("ROS 2 (rclpy)", _ROS, "only the node needs it: pip install -c constraints.txt -e '.[ros]'", False),
+        ("pybullet", _BULLET, "only benchmarks need it: make setup, on Python 3.11", False),
+        ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup (docs/ros.md)", False),
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:
         probed = list(pool.map(lambda probe: try_code(*probe), probes))

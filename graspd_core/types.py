@@ -82,6 +82,10 @@ class Contact:
     normal: tuple[float, float, float]
 
 
+# Name of the trial under what else may be true of the scene: who fails it alone is neither verified nor failed.
+HYPOTHESES = "hypotheses"
+
+
 @dataclass(frozen=True)
 class TrialResult:
     """What one trial of one grasp measured; `graspd_core.trials.trial_registry` lists the trials that planning runs.
@@ -148,22 +152,30 @@ class Grasp:
         score: the optimiser's own measure, larger is better; ranks grasps before any trial.
         metrics: static quality, None until measured.
         trials: in the order that they were run; the first failure ends them.
+        probability: of holding on the true object, where a part of its shape was guessed (docs/clouds.md); else None.
     """
 
     pregrasp: Posture
     grasp: Posture
     squeeze: Posture
-    contacts: tuple[Contact, ...]
-    score: float
+    contacts: tuple[Contact, ...] = ()
+    score: float = 0.0
     metrics: GraspMetrics | None = None
     trials: tuple[TrialResult, ...] = ()
+    probability: float | None = None
 
     @property
     def verdict(self) -> Verdict:
-        """Unverified without a trial, failed after a failed one, otherwise verified."""
-        if not self.trials:
-            return Verdict.UNVERIFIED
-        return Verdict.VERIFIED if all(trial.passed for trial in self.trials) else Verdict.FAILED
+        """Verified if all trials passed, failed if one did not on the likeliest scene; otherwise unverified."""
+        failed = {trial.name for trial in self.trials if not trial.passed}
+        if self.trials and not failed:
+            return Verdict.VERIFIED
+        return Verdict.FAILED if failed - {HYPOTHESES} else Verdict.UNVERIFIED
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is as sure as was asked for: verified, or found where no trial was asked for."""
+        return self.verdict is Verdict.VERIFIED or not self.trials
 
     @property
     def reason(self) -> str:
@@ -246,6 +258,8 @@ class GraspResult:
     """What a run gives back: an outcome, always, and the grasps in rank order, verified ones first.
 
     `support` is what the object stood on, None where it floated. `audits` counts checks of trials that stop early.
+    `next_view` is `T_object_camera` [m] of one more view that would show most of the hidden side, where grasps hold on
+    the likeliest shape and none is sure enough.
     """
 
     outcome: Outcome
@@ -257,3 +271,4 @@ class GraspResult:
     warnings: tuple[str, ...] = field(default=())
     support: Plane | None = None
     audits: AuditCount = AuditCount()
+    next_view: Float[np.ndarray, "4 4"] | None = None

@@ -27,8 +27,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from graspd_core import all_joint_names, hand_names, load_hand, trim_heap, warm_up
+from graspd_core import hand_names, load_hand, warm_up
 from graspd_core.errors import GraspdError
+from graspd_core.hands.model import all_joint_names
+from graspd_core.runtime.heap import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action_server import GoalServer
 from graspd_ros.diagnostics import health_message, resident_memory

@@ -36,6 +36,7 @@ SHARED_NODE = {
     for name in (
         "outputs/test_messages",
         "test_action_server",
+        "test_client_example",
         "test_faults",
         "test_hostile",
         "test_node",

@@ -14,20 +14,22 @@ from graspd_core.methods.plan_config import load_preset
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+USAGE = (ROOT / "docs" / "usage.md").read_text()
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *sorted(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))]
 
 
-def test_the_python_of_the_readme_runs(capsys: pytest.CaptureFixture[str]):
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+@pytest.mark.parametrize("page", [README, USAGE], ids=["README", "usage"])
+def test_the_python_runs(page: str, capsys: pytest.CaptureFixture[str]):
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert blocks
     for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
+        exec(compile(block, "page", "exec"), {})
     assert capsys.readouterr().out.count("verified") == 2
 
 
-def test_the_commands_of_the_readme_parse():
-    lines = [line.split("#")[0].strip() for line in README.splitlines() if line.startswith("    graspd ")]
-    assert len(lines) >= 6
+def test_the_commands_of_the_usage_page_parse():
+    lines = [line.split("#")[0].strip() for line in USAGE.splitlines() if line.startswith("    graspd ")]
+    assert len(lines) >= 12
     for line in lines:
         build_parser().parse_args(shlex.split(line)[1:])
 
@@ -45,10 +47,11 @@ def test_the_format_page_is_of_the_version_written():
     assert f"`{FORMAT}`, version {VERSION}" in page
 
 
-def test_presets_named_in_the_readme_exist():
-    for name in re.search(r"preset \(([a-z, ]+), or", README).group(1).split(", "):  # pyright: ignore[reportOptionalMemberAccess]
+def test_presets_named_in_the_documents_exist(tmp_path: Path):
+    named = re.search(r"preset \(([a-z, ]+), or", USAGE).group(1).split(", ")  # pyright: ignore[reportOptionalMemberAccess]
+    table = README.split("<!-- bench-short:begin -->")[1].split("<!-- bench-short:end -->")[0]
+    for name in [*named, *re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)]:
         load_preset(name)
-
-
-def test_results_have_a_place():
-    assert README.index("<!-- bench:begin -->") < README.index("<!-- bench:end -->") < README.index("## Quick start")
+    (own,) = re.findall(r"```yaml\n(.*?)```", USAGE, re.DOTALL)
+    (tmp_path / "own.yaml").write_text(own)
+    assert load_preset(str(tmp_path / "own.yaml")) != load_preset("balanced")

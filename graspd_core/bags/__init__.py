@@ -1,1 +1,1 @@
-"""Recordings: rosbag2 bags read and written without ROS, and what their messages hold as arrays."""
+"""Recordings: rosbag2 bags read without ROS, and what their messages hold as arrays."""

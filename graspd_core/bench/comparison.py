@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.result_store import Record
+from graspd_core.bench.study import Record
 
 # Figures compared: heading, digits, and the least change worth a line (a share of the old value, or absolute).
 FIGURES = {
@@ -74,7 +74,8 @@ def _mean(group: Sequence[Row], figure: str) -> float | None:
 
 
 def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
-    """The moves as a table; what only one of the runs has is named below it."""
+    """The moves of cells as a table; what only one of the runs has is named below it."""
+    old, new = ([record for record in records if "kind" in record] for records in (old, new))
     lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
     for move in moves(old, new):
         heading, digits = FIGURES[move.figure][:2]

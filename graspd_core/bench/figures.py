@@ -8,8 +8,9 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from graspd_core.bench.result_store import Record
+from graspd_core.bench.study import Record
 from graspd_core.metrics.metric_registry import METRICS
 
 # Shares of grasps that passed a trial; a grasp that was not found did not pass.
@@ -60,14 +61,14 @@ def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
     # Where nothing was found there is no trace of the trials: those of the other records are meant, and the first.
     ran = {TRIAL_FIGURES[0]}
     for record in records:
-        if record["kind"] == kind and not record["error"]:
+        if record.get("kind") == kind and not record["error"]:
             groups.setdefault((record["name"], record["object"]), []).append(record)
             ran.update(trial for grasp in record["grasps"] for trial in TRIAL_FIGURES if trial in grasp)
     return [_row(group, ran) for group in groups.values()]
 
 
 def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
-    asked, held = sum(r["asked"] for r in group), sum(r["held"] for r in group)
+    asked, held = sum(r["count"] for r in group), sum(r["held"] for r in group)
     grasps = [grasp for r in group for grasp in r["grasps"]]
     figures = [_grasp_figures(grasp) for grasp in grasps]
     names = _grasp_figures({})
@@ -132,3 +133,13 @@ def _median(values: Iterable[float | None]) -> float | None:
 def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
     value = (grasp.get(trial) or {}).get(figure)
     return None if value is None else float(value)
+
+
+def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
+    """Which points are on the front where less is better on every axis.
+
+    A point is off it when another is no worse on every axis and better on one; equal points are on it together.
+    """
+    no_worse = (points[:, None] <= points[None]).all(-1)
+    better = (points[:, None] < points[None]).any(-1)
+    return np.asarray(~(no_worse & better).any(0))

@@ -1,57 +1,83 @@
-"""Finished cells on disk, a file each, and all of them in one results file."""
+"""Records on disk, a file each, kept under everything that was asked for; and all of a run in one results file."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterable, Sequence
+import math
+import os
+import platform
+import re
+import subprocess
+import traceback
+from collections.abc import Sequence
+from datetime import date
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from graspd_core.bench.measurements.measurement import Cell, cell_file, cell_key
+from graspd_core.bench.study import Case, Record
 from graspd_core.errors import FormatError
 from graspd_core.formats.grasps_json import save_text
 
-FORMAT, VERSION = "graspd/bench", 1
+FORMAT, VERSION = "graspd/bench", 2
+# Parts of the package that no figure depends on; of the benchmark itself, a study names its own.
+_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench", "viewer")
 
-Record = dict[str, Any]
+
+def case_key(study: str, case: Case) -> str:
+    """Hash of everything that a case asks, hexadecimal. The code that answers is recorded beside it."""
+    return hashlib.sha256(json.dumps({"study": study, **case.asked()}, sort_keys=True).encode()).hexdigest()
 
 
-def write_cell(folder: Path, cell: Cell, record: Record) -> None:
+def case_file(study: str, case: Case) -> str:
+    """Name of the file that a record is kept in: for the eye, then for certain."""
+    words = re.sub(r"[^A-Za-z0-9_.=-]+", "_", f"{study}-{case.label}")
+    return f"{words[:120]}-{case_key(study, case)[:12]}.json"
+
+
+def head(study: str, case: Case, code: str) -> Record:
+    """The part of a record that is known before the run."""
+    return {
+        **case.shown(),
+        "study": study,
+        "label": case.label,
+        "key": case_key(study, case),
+        "code": code,
+        "commit": commit(),
+        "made": date.today().isoformat(),
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}",
+        "error": "",
+    }
+
+
+def failure(error: BaseException, kind: str = "raised") -> Record:
+    """What is written of a case that raised, died or hung: the only failure record there is."""
+    where = "".join(traceback.format_exception(error))
+    told = " ".join(str(error).split())
+    return {"failed": kind, "error": f"{type(error).__name__}: {told}", "traceback": where}
+
+
+def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
     """Keep a record; its file appears whole or not at all, whatever kills the process."""
-    save_text(folder / cell_file(cell), json.dumps(record, indent=1, allow_nan=False) + "\n")
+    save_text(folder / case_file(study, case), json.dumps(finite(record), indent=1, allow_nan=False) + "\n")
 
 
-def read_cell(folder: Path, cell: Cell, code: str | None) -> Record | None:
-    """The record of a cell that finished without error under `code` (None: under any); None where there is none."""
-    return kept_record(folder / cell_file(cell), cell_key(cell), code)
-
-
-def kept_record(path: Path, key: str, code: str | None) -> Record | None:
-    """What a file holds under `key`, if that ended without error under `code` (None: under any)."""
+def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
+    """The record of a case under `code` (None: under any), where it failed only with `failed`; None: there is none."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    good = isinstance(record, dict) and record.get("key") == key and not record.get("error")
-    return record if good and (code is None or record.get("code") == code) else None
-
-
-def read_cells(folder: Path, cells: Iterable[Cell], code: str | None) -> dict[Cell, Record]:
-    """Those of `cells` that have finished."""
-    found = ((cell, read_cell(folder, cell, code)) for cell in cells)
-    return {cell: record for cell, record in found if record is not None}
+    if not isinstance(record, dict) or record.get("key") != case_key(study, case):
+        return None
+    return record if (failed or not record.get("error")) and code in (None, record.get("code")) else None
 
 
 def write_results(path: Path, records: Sequence[Record]) -> None:
     """All records in one file."""
-    whole = {
-        "format": FORMAT,
-        "version": VERSION,
-        "codes": sorted({record["code"] for record in records}),
-        "machines": sorted({record["machine"] for record in records}),
-        "cells": records,
-    }
-    save_text(path, json.dumps(whole, allow_nan=False) + "\n")
+    save_text(path, json.dumps({"format": FORMAT, "version": VERSION, "records": records}, allow_nan=False) + "\n")
 
 
 def read_results(path: Path) -> list[Record]:
@@ -70,4 +96,46 @@ def read_results(path: Path) -> list[Record]:
         raise FormatError(f"{path}: not a {FORMAT} file; `graspd bench` writes one as results.json")
     if whole.get("version") != VERSION:
         raise FormatError(f"{path}: version {whole.get('version')!r}; this reader knows {VERSION}")
-    return whole["cells"]
+    return whole["records"]
+
+
+@lru_cache
+def code_version(sources: tuple[str, ...] = ()) -> str:
+    """The package's version and a hash of the sources that figures depend on: all but those of `_BESIDE`.
+
+    The kernel's C++ counts. Of the benchmark itself only the files that the globs `sources` name below `bench` do.
+    """
+    root = Path(__file__).parents[1]
+    files = {path for pattern in ("*.py", "*.cpp", "*.h", "*.hpp") for path in root.rglob(pattern)}
+    counted = {path for path in files if path.relative_to(root).parts[0] not in _BESIDE}
+    counted.update(path for pattern in sources for path in (root / "bench").glob(pattern))
+    digest = hashlib.sha256()
+    for path in sorted(counted):
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + path.read_bytes())
+    try:
+        released = version("graspd")
+    except PackageNotFoundError:
+        released = "unreleased"
+    return f"{released}+{digest.hexdigest()[:12]}"
+
+
+@lru_cache
+def commit() -> str:
+    """Short name of the commit that is checked out, with a plus where files differ from it; nothing outside a clone."""
+    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
+    try:
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip()
+
+
+def finite(value: Any) -> Any:
+    """The same, with None for every number that JSON does not know."""
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,37 +1,32 @@
-"""What is run: suites of cells, and the objects, presets and counts that they are made of.
-
-`SUITES` is the registry: a new suite is a function from `Request` to cells, and a row in it.
-"""
+"""The suites of cells: presets on objects, settings swept, hands compared; and the counts that they are made of."""
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspd_core.bench.measurements.benchmark_trials import TRIALS, USUAL
 from graspd_core.bench.measurements.measurement import Cell, Kind
 from graspd_core.bench.names import hand_row
-from graspd_core.errors import ConfigError, MeshError
-from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
-from graspd_core.mesh.shapes import SHAPES, make_shape
+from graspd_core.bench.study import Request, all_shapes, find_objects
+from graspd_core.errors import ConfigError
+from graspd_core.hands.library import hand_names
 from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset, override, preset_names
-from graspd_core.paths import config_dir
 
-# Grasps of a raw cell by method: the slow ones are asked for fewer.
 # Verified grasps that a planned cell asks for, and the batch that pace is taken at.
 VERIFIED, BATCH = 8, 32
-# Grasps of a raw cell by which hands are compared.
+# Grasps of a raw cell by which hands are compared, and of a sweep over decades.
 HAND_COUNT = 8
 # Presets that people plan with.
 PLANNED = ("fast", "balanced", "accurate")
 # What `balanced` is compared with: the same effort in every round.
 STEADY = "balanced_steady"
-# Trials of the settings sweep (suite `ladder`).
+# Orders the verified grasps in another way: its raw grasps are those of `balanced`.
+_RANKED = "robust"
+# Of settings with more steps than this a raw cell is asked for fewer grasps: they take seconds each.
+_LONG, _LONG_COUNT = 2000, 4
+# Trials of the settings sweeps.
 _SWEEP_TRIALS = ("standard",)
 _SWEEP_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
 _SWEEP_PRESET = "balanced"
@@ -39,6 +34,9 @@ _QUICK_OBJECTS = ("shape:sphere", "shape:box", "shape:mug")
 _QUICK_COUNT = 4
 # The others take minutes a cell.
 _QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
+
+# CPU seconds of one grasp by method, on a quiet core; of long settings, and of other methods, below.
+_SECONDS = {"closed_form": 0.05, "graspd2022": 1.2, "annealing": 3.3, "random_closure": 0.3}
 
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
 # Sweep values: what is changed, and to what; all else stays at `balanced`.
@@ -51,117 +49,87 @@ SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
         for share in (0.2, 0.5, 1.0, 2.0, 4.0)
     ],
 }
+# Three decades: title, preset, setting and its values; the preset's own is among them.
+DECADES = (
+    (
+        "Grasp'D, stiffness [N/m]",
+        "graspd2022_short",
+        "graspd2022.contact.stiffness",
+        (30, 100, 300, 1e3, 3e3, 1e4, 3e4),
+    ),
+    ("Grasp'D, friction", "graspd2022_short", "graspd2022.contact.friction", (0.02, 0.06, 0.2, 0.8, 2.0, 6.0, 20.0)),
+    ("closed form, width [mm]", "balanced", "closed_form.delta_end", (1e-4, 4e-4, 1e-3, 4e-3, 1e-2, 4e-2, 1e-1)),
+    ("closed form, friction", "balanced", "problem.friction", (0.02, 0.06, 0.2, 0.4, 2.0, 6.0, 20.0)),
+)
 
 
-@dataclass(frozen=True)
-class SuiteRequest:
-    """What a caller wants run; empty and None mean the suite's own choice.
-
-    Attributes:
-        presets: names or files.
-        objects: shape:NAME, mesh files, or folders of them.
-        seeds: of every cell.
-        count: grasps of a raw cell.
-        hand: name or path.
-        trials: of raw grasps.
-        quick: a small run that takes minutes.
-    """
-
-    presets: tuple[str, ...] = ()
-    objects: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = (0,)
-    count: int | None = None
-    hand: str = "allegro_right"
-    trials: tuple[str, ...] = ()
-    quick: bool = False
-
-
-@dataclass(frozen=True)
-class Object:
-    """One object and the hash of its content."""
-
-    source: str
-    sha256: str = field(repr=False)
-
-
-def cells_of(suites: Sequence[str], request: SuiteRequest) -> tuple[Cell, ...]:
-    """All cells of some suites, those of one object next to each other.
-
-    Raises:
-        GraspdError: a name of a suite, preset, object, hand or trial is unknown, or a number out of range; the message
-            lists the valid ones.
-    """
-    for name in suites:
-        if name not in SUITES:
-            raise ConfigError(f"unknown suite {name!r}; valid suites: {', '.join(SUITES)}, stress")
-    for name in request.trials:
-        if name not in TRIALS:
-            raise ConfigError(f"unknown trial {name!r}; valid trials: {', '.join(TRIALS)}")
-    if request.count is not None and not 1 <= request.count <= 1024:
-        raise ConfigError(f"count: {request.count} grasps; valid: 1 to 1024")
-    for seed in request.seeds:
-        if not 0 <= seed < 2**31:
-            raise ConfigError(f"seed: {seed}; valid: 0 to 2^31 - 1")
-    return tuple(dict.fromkeys(cell for name in suites for cell in SUITES[name](request)))
-
-
-def main_suite(request: SuiteRequest) -> tuple[Cell, ...]:
+def main_suite(request: Request) -> tuple[Cell, ...]:
     """Every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
-    make = _Maker(request)
-    defaults = [name for name in preset_names() if not request.quick or name in _QUICK_PRESETS]
+    names = (name for name in preset_names() if name != _RANKED)
+    defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
     planned = {name: config for name, config in presets.items() if name in PLANNED}
     if "balanced" in planned:
         planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
-    objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
+    trials = _trials(request, USUAL)
     cells: list[Cell] = []
-    for thing in objects:
+    for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
-            cells += make("raw", name, config, thing, _count(request, config), request.trials or USUAL)
+            cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
         # The closed form's own presets are what `plan_grasps` is used with; the others are only compared raw.
         for name, config in planned.items():
-            cells += make("verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
+            cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
     if not request.objects:
-        (cylinder,), (mug,) = find_objects(("shape:cylinder",)), find_objects(("shape:mug",))
         for name in (name for name in PLANNED if name in presets):
-            cells += make("pace", name, presets[name], cylinder, BATCH)[:1]
+            cells += _cells(request, "pace", name, presets[name], "shape:cylinder", BATCH)[:1]
         if "balanced" in presets:
-            cells += make("start", "balanced", presets["balanced"], mug, 1)[:1]
-    return tuple(cells)
+            cells += _cells(request, "start", "balanced", presets["balanced"], "shape:mug", 1)[:1]
+    return tuple(dict.fromkeys(cells))
 
 
-def sweep_suite(request: SuiteRequest) -> tuple[Cell, ...]:
+def sweep_suite(request: Request) -> tuple[Cell, ...]:
     """Each of four settings from poor to rich, one at a time."""
-    make = _Maker(request)
     base = load_preset(_SWEEP_PRESET)
-    objects = find_objects(request.objects or (_SWEEP_OBJECTS[:2] if request.quick else _SWEEP_OBJECTS))
-    count = request.count or (_QUICK_COUNT if request.quick else METHODS[base.method].benchmark_count)
-    cells: list[Cell] = []
-    for thing in objects:
-        for sweep, sweep_values in SWEEPS.items():
-            for changes in sweep_values:
-                name = sweep_name(sweep, changes)
-                cells += make("raw", name, override(base, changes), thing, count, request.trials or _SWEEP_TRIALS)
-    return tuple(cells)
+    count, trials = _count(request, base), _trials(request, _SWEEP_TRIALS)
+    return tuple(
+        cell
+        for thing in find_objects(request.objects or (_SWEEP_OBJECTS[:2] if request.quick else _SWEEP_OBJECTS))
+        for sweep, values in SWEEPS.items()
+        for changes in values
+        for cell in _cells(request, "raw", sweep_name(sweep, changes), override(base, changes), thing, count, trials)
+    )
 
 
-def hands_suite(request: SuiteRequest) -> tuple[Cell, ...]:
+def decades_suite(request: Request) -> tuple[Cell, ...]:
+    """Stiffness and friction over three decades: how far they can be wrong before a method stops working."""
+    count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
+    return tuple(
+        cell
+        for thing in find_objects(request.objects or _SWEEP_OBJECTS[:2])
+        for _, preset, setting, values in DECADES
+        for value in (values[:2] if request.quick else values)
+        for cell in _cells(
+            request,
+            "raw",
+            f"{setting}={value:g}",
+            override(load_preset(preset), {setting: value}),
+            thing,
+            count,
+            trials,
+        )
+    )
+
+
+def hands_suite(request: Request) -> tuple[Cell, ...]:
     """Every built-in hand with one preset."""
-    objects = find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
     base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
-    makers = {name: _Maker(dataclasses.replace(request, hand=name)) for name in hand_names()}
-    cells: list[Cell] = []
-    for thing in objects:
-        for name, make in makers.items():
-            cells += make("raw", hand_row(name), base, thing, count, request.trials or _SWEEP_TRIALS)
-    return tuple(cells)
-
-
-SUITES: dict[str, Callable[[SuiteRequest], tuple[Cell, ...]]] = {
-    "main": main_suite,
-    "ladder": sweep_suite,
-    "hands": hands_suite,
-}
+    trials = _trials(request, _SWEEP_TRIALS)
+    return tuple(
+        cell
+        for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
+        for hand in hand_names()
+        for cell in _cells(request, "raw", hand_row(hand), base, thing, count, trials, hand=hand)
+    )
 
 
 def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
@@ -169,67 +137,42 @@ def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
     return f"{sweep}={sum(changes.values()):g}"
 
 
-def all_shapes() -> tuple[str, ...]:
-    """The authored shapes as objects."""
-    return tuple(f"shape:{name}" for name in SHAPES)
+def cell_seconds(cell: Cell) -> float:
+    """CPU seconds of a cell, roughly; measured on one thread of a quiet core."""
+    if cell.kind != "raw":
+        return {"verified": 2.5, "pace": 8.0, "start": 6.0}[cell.kind]
+    each = _SECONDS.get(cell.settings.method, 1.0)
+    return 1.0 + cell.count * ((8.0 if _is_long(cell.settings) else each) + 0.1 * len(cell.trials))
 
 
-def find_objects(sources: Sequence[str]) -> tuple[Object, ...]:
-    """Shapes, mesh files and the meshes of folders. Raises MeshError: there is no such thing."""
-    found: list[Object] = []
-    for source in sources:
-        path = Path(source)
-        if source.startswith("shape:"):
-            found.append(Object(source, content_hash(make_shape(source.removeprefix("shape:")))))
-        elif path.is_dir():
-            files = sorted(p for p in path.iterdir() if p.suffix.lower().lstrip(".") in MESH_ENDINGS)
-            if not files:
-                raise MeshError(f"{source}: no mesh in this folder; valid endings: {', '.join(MESH_ENDINGS)}")
-            found += [_file(file) for file in files]
-        else:
-            found.append(_file(path))
-    names = [Path(thing.source).stem for thing in found]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise MeshError(f"two objects are called {twice[0]!r}: results go by that name")
-    return tuple(found)
+def _is_long(config: PlanConfig) -> bool:
+    return getattr(config.settings, "steps", 0) > _LONG
 
 
-def _file(path: Path) -> Object:
-    if not path.is_file():
-        raise MeshError(f"{path}: no such mesh file; shape:NAME is an authored shape: {', '.join(sorted(SHAPES))}")
-    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
-        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
-    return Object(str(path), hashlib.sha256(path.read_bytes()).hexdigest())
+def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
+    for name in request.trials:
+        if name not in TRIALS:
+            raise ConfigError(f"unknown trial {name!r}; valid trials: {', '.join(TRIALS)}")
+    return request.trials or usual
 
 
-def _count(request: SuiteRequest, config: PlanConfig) -> int:
-    return request.count or (_QUICK_COUNT if request.quick else METHODS[config.method].benchmark_count)
+def _count(request: Request, config: PlanConfig) -> int:
+    usual = _LONG_COUNT if _is_long(config) else METHODS[config.method].benchmark_count
+    return request.count or (_QUICK_COUNT if request.quick else usual)
 
 
-class _Maker:
-    """Makes cells of one request's hand and seeds."""
-
-    def __init__(self, request: SuiteRequest) -> None:
-        self.request = request
-        self.hand_hash = hand_hash(request.hand)
-
-    def __call__(
-        self, kind: Kind, name: str, config: PlanConfig, thing: Object, count: int, trials: tuple[str, ...] = ()
-    ) -> list[Cell]:
-        hand = self.request.hand
-        label = Path(name).stem if Path(name).suffix in (".yaml", ".yml") else name
-        return [
-            Cell(kind, label, config, thing.source, thing.sha256, hand, self.hand_hash, seed, count, trials)
-            for seed in self.request.seeds
-        ]
-
-
-def hand_hash(name: str) -> str:
-    """Hash of a hand's URDF and description. Raises HandError: there is no such hand, or it cannot be used."""
-    hand = load_hand(name, candidates=1)
-    boxed = config_dir() / "hands" / f"{name}.yaml"
-    files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
+def _cells(
+    request: Request,
+    kind: Kind,
+    name: str,
+    config: PlanConfig,
+    thing: str,
+    count: int,
+    trials: tuple[str, ...] = (),
+    *,
+    hand: str = "",
+) -> list[Cell]:
+    """Cells of a request's hand and seeds."""
+    label = Path(name).stem if Path(name).suffix in (".yaml", ".yml") else name
+    hand = hand or request.hand or "allegro_right"
+    return [Cell(kind, label, config, thing, hand, seed, count, trials) for seed in request.seeds or (0,)]

@@ -1,20 +1,24 @@
-"""Results as Markdown, and into the marked sections of documents."""
+"""Records of cells as Markdown tables, and the sections of pages that they fill."""
 
 from __future__ import annotations
 
-import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import is_hand, is_preset
-from graspd_core.bench.result_store import Record
-from graspd_core.errors import ConfigError
-from graspd_core.formats.grasps_json import save_text
+from graspd_core.bench.names import FEW, is_hand, is_preset
+from graspd_core.bench.report import markdown_table
+from graspd_core.bench.study import Picture, Record, Sections
+from graspd_core.bench.suites import DECADES
 from graspd_core.metrics.metric_registry import METRICS
 
 _PLANNED = ("first_wall", "cpu_per_verified", "rounds")
+_TITLES = {
+    "speed": "Speed against accuracy",
+    "short": "Speed against accuracy",
+    "planned": "Planned grasps",
+    "ladder": "Settings sweeps",
+}
 _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "cpu_per_grasp", "cpu_per_verified")
 
 
@@ -100,27 +104,55 @@ def pace_table(records: Sequence[Record]) -> str:
         if r["kind"] == "pace":
             cost = r["cpu"]["optimise"]
             steps = f", {cost / r['grasp_steps'] * 1e6:.0f} µs a grasp-step" if r["grasp_steps"] else ""
-            what = f"raw grasps, `{r['name']}`, {r['object']}, batch {r['asked']}"
-            body.append([what, f"{cost / r['asked']:.3f} CPU s each{steps}; {r['peak_mb']:.0f} MB at the peak"])
+            what = f"raw grasps, `{r['name']}`, {r['object']}, batch {r['count']}"
+            body.append([what, f"{cost / r['count']:.3f} CPU s each{steps}; {r['peak_mb']:.0f} MB at the peak"])
         elif r["kind"] == "start":
             what = f"first verified grasp of a fresh process without a cache, `{r['name']}`, {r['object']}"
             body.append([what, f"{r['wall']['total']:.1f} s, {r['cpu']['total']:.1f} CPU s"])
     return markdown_table(["speed and size", ""], body) if body else ""
 
 
-def sections(records: Sequence[Record], charts: Mapping[str, Path], document: Path) -> dict[str, str]:
-    """Text of every section that a document may have, by the name of its marker."""
-    planned, pace = planned_table(records), pace_table(records)
+def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The few rows of a first page, the whole table, planned runs, and every object."""
+    drawn = drawn_charts(records, chart)
+    few = [record for record in records if record["name"] in FEW]
     return {
-        "bench": "\n\n".join(
-            filter(None, (_picture(charts, "speed", document), summary_table(records), about(records)))
-        ),
-        "bench-planned": "\n\n".join(filter(None, (_picture(charts, "planned", document), planned, pace))),
-        "bench-ladder": _picture(charts, "ladder", document),
-        "bench-hands": hands_table(records),
-        "bench-objects": object_tables(records),
-        "metrics": metrics_table(),
+        "bench": [drawn.get("short"), summary_table(few)],
+        "bench-all": [drawn.get("speed"), summary_table(records), missing(records)],
+        "bench-planned": [drawn.get("planned"), planned_table(records), pace_table(records)],
+        "bench-objects": [object_tables(records)],
     }
+
+
+def ladder_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The chart of the settings sweeps."""
+    return {"bench-ladder": [drawn_charts(records, chart).get("ladder")]}
+
+
+def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """A table a setting: raw grasps held, of those asked for, all objects together."""
+    groups = by_name(rows(records))
+    blocks = []
+    for title, _, setting, values in DECADES:
+        scale = 1e3 if "[mm]" in title else 1.0
+        found = [groups.get(f"{setting}={value:g}", []) for value in values]
+        share = [f"{sum(r.held for r in group)}/{sum(r.asked for r in group)}" if group else "–" for group in found]
+        blocks.append(markdown_table([title, *(f"{v * scale:g}" for v in values)], [[f"`{setting}`", *share]]))
+    return {"decades": blocks}
+
+
+def hands_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The table of the hands."""
+    return {"bench-hands": [hands_table(records)]}
+
+
+def drawn_charts(records: Sequence[Record], chart: Path | None) -> Mapping[str, Picture]:
+    """The charts that the records have figures for, by name; none without a path."""
+    if chart is None:
+        return {}
+    from graspd_core.bench.charts.speed_chart import draw_charts
+
+    return {name: Picture(_TITLES[name], png) for name, png in draw_charts(records, chart).items()}
 
 
 def metrics_table() -> str:
@@ -131,63 +163,12 @@ def metrics_table() -> str:
     )
 
 
-def about(records: Sequence[Record]) -> str:
-    """One sentence on what was run, where."""
-    raw = [r for r in records if r["kind"] == "raw"]
-    seeds, objects = sorted({r["seed"] for r in raw}), {r["object"] for r in raw}
-    codes, machines = sorted({r["code"] for r in records}), sorted({r["machine"] for r in records})
-    seconds = sum(r.get("cell_cpu", 0.0) for r in records)
-    return (
-        f"{len(records)} cells, {len(objects)} objects, seeds {', '.join(map(str, seeds))}; hand "
-        f"{', '.join(sorted({r['hand'] for r in records}))}; {seconds / 60:.0f} CPU minutes on {'; '.join(machines)}; "
-        f"code {', '.join(codes)}.{_missing(records)}"
-    )
-
-
-def _missing(records: Sequence[Record]) -> str:
-    """What the means leave out: cells that raised, and objects that some presets have not been tried on."""
-    raised = sum(bool(r["error"]) for r in records)
+def missing(records: Sequence[Record]) -> str:
+    """What the means leave out: objects that some presets have not been tried on."""
     found = by_name(row for row in rows(records) if is_preset(row.name))
     objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
     fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]
-    return (f" {raised} cells raised and are in no figure." if raised else "") + (
-        f" Means are over {len(objects)} objects, but {', '.join(fewer)} only." if fewer else ""
-    )
-
-
-def fill(document: Path, texts: Mapping[str, str]) -> list[str]:
-    """Rewrite the marked sections of a document; sections without text stay. Returns the names of those rewritten.
-
-    A section stands between `<!-- NAME:begin -->` and `<!-- NAME:end -->`.
-
-    Raises:
-        ConfigError: the document cannot be read, or has none of the sections.
-    """
-    try:
-        text = document.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{document}: {error.strerror or error}") from None
-    filled = []
-    for name, content in texts.items():
-        # On lines of their own: a document may also speak of its markers.
-        section = re.compile(rf"^(<!-- {name}:begin -->\n).*?^(<!-- {name}:end -->)$", re.DOTALL | re.MULTILINE)
-        if content and section.search(text):
-            text = section.sub(lambda found, new=content: f"{found[1]}{new}\n{found[2]}", text, count=1)
-            filled.append(name)
-    if not filled:
-        raise ConfigError(f"{document}: has none of the sections {', '.join(texts)}; valid: <!-- bench:begin --> …")
-    save_text(document, text)
-    return filled
-
-
-_TITLES = {"speed": "Speed against accuracy", "planned": "Planned grasps", "ladder": "Settings sweeps"}
-
-
-def _picture(charts: Mapping[str, Path], name: str, document: Path) -> str:
-    if name not in charts:
-        return ""
-    link = Path(os.path.relpath(charts[name].resolve(), document.resolve().parent)).as_posix()
-    return f"![{_TITLES[name]}]({link})"
+    return f"Means are over {len(objects)} objects, but {', '.join(fewer)} only." if fewer else ""
 
 
 def _known(groups: Mapping[str, Sequence[Row]], figure: str) -> bool:
@@ -202,9 +183,3 @@ def _mean(group: Sequence[Row], figure: str, form: str) -> str:
 
 def _form(value: float | None, form: str) -> str:
     return "–" if value is None else form.format(value)
-
-
-def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; cells must not have bars of their own."""
-    lines = [headings, ["---"] * len(headings), *body]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")

@@ -12,7 +12,7 @@ from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.methods.method_registry import METHODS
 from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
-from graspd_core.types import GraspResult, Outcome, Timing, Verdict
+from graspd_core.types import GraspResult, Outcome, Timing
 
 # Metrics in the summary of a run.
 _SHOWN = ("penetration", "contact_area", "epsilon", "robustness")
@@ -70,7 +70,7 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
     from graspd_core.metrics.metric_registry import METRICS
 
     good = good_grasps(result)
-    kind = "unverified" if any(g.verdict is Verdict.UNVERIFIED for g in result.grasps) else "verified"
+    kind = "unverified" if any(not grasp.trials for grasp in result.grasps) else "verified"
     ending = result.message or result.outcome.value
     copies = f", {different} of them different" if different < good else ""
     lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.grasps)} tried): {ending}"]
@@ -89,8 +89,8 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
 
 
 def good_grasps(result: GraspResult) -> int:
-    """How many grasps have not failed; they come first."""
-    return sum(grasp.verdict is not Verdict.FAILED for grasp in result.grasps)
+    """How many grasps are as sure as was asked for; they come first."""
+    return sum(grasp.usable for grasp in result.grasps)
 
 
 def exit_status(result: GraspResult) -> int:

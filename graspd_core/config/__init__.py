@@ -5,6 +5,7 @@ from __future__ import annotations
 import typing
 from typing import Literal
 
+from graspd_core.config.certainty_config import CertaintyConfig
 from graspd_core.config.grasp_stages_config import GraspStagesConfig
 from graspd_core.config.mapping import from_mapping
 from graspd_core.config.problem_config import ProblemConfig
@@ -16,6 +17,7 @@ from graspd_core.config.segmentation_config import SegmentationConfig
 
 __all__ = [
     "VERIFICATIONS",
+    "CertaintyConfig",
     "GraspStagesConfig",
     "ObstacleConfig",
     "ProblemConfig",

@@ -33,6 +33,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
             "name": result.outcome.name,
             "message": result.message or result.outcome.value,
             "warnings": list(result.warnings),
+            "next_view": result.next_view if result.next_view is None else result.next_view.tolist(),
         },
         "hand": _hand(hand),
         "object": {
@@ -117,6 +118,7 @@ def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
         "verdict": str(grasp.verdict),
         "reason": grasp.reason,
         "score": grasp.score,
+        "probability": grasp.probability,
         "position": _list(grasp.grasp.position),
         "quaternion_wxyz": _list(grasp.grasp.quaternion_wxyz),
         "joint_positions": joints(grasp.grasp),

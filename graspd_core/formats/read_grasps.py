@@ -16,6 +16,15 @@ from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
 
 
+def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
+    """Read the grasps of a file that `save_result` wrote, in rank order.
+
+    Raises:
+        FormatError: missing, not of this format or version, or a grasp in it is malformed.
+    """
+    return grasps_of(load_document(path))
+
+
 def load_document(path: str | Path) -> dict[str, Any]:
     """Read a grasps file.
 
@@ -78,6 +87,8 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         score=float(_numbers_of(values, "score")),
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
+        # Files written before clouds were doubted have no such key.
+        probability=_scaled({"probability": None, **values}, "probability", 1.0),
     )
     if values["verdict"] != grasp.verdict:
         raise ValueError(f"verdict: {shown(values['verdict'])}; by its trials the grasp is {grasp.verdict}")

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float, Int
 
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.model import HandModel, Primitive
 
 # The most spheres of a rigid group of links, and of a hand; one of more groups than that has one for each.
@@ -40,9 +40,7 @@ def collision_spheres(
     center, radius, link = np.concatenate(centers), np.concatenate(radii), np.concatenate(links)
     groups = hand.link_group[link]
     if len(link) > MOST_OF_HAND or np.bincount(groups).max() > MOST_OF_GROUP:
-        rotations, translations = link_poses(hand, hand.open_posture)
-        placed = np.einsum("sij,sj->si", rotations[link], center) + translations[link]
-        kept = _spread(placed, radius, groups)
+        kept = _spread(in_base(link_poses(hand, hand.open_posture), center, link), radius, groups)
         return center[kept], radius[kept], link[kept]
     return center, radius, link
 

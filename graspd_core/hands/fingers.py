@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.hands.kinematics import link_poses, point_jacobian
+from graspd_core.hands.kinematics import in_base, link_poses, point_jacobian
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.primitive_surface import surface_points
 
@@ -73,12 +73,8 @@ def find_fingers(hand: HandModel) -> Fingers:
     for chain in chains:
         root = translations[chain[chain.index(palm) - 1]]
         tip = chain[0]
-        cloud = [np.zeros((0, 3))]
-        for primitive in hand.primitives:
-            if groups[primitive.link] == tip:
-                link = primitive.link
-                cloud.append(surface_points(primitive, 200, rng)[0] @ rotations[link].T + translations[link])
-        reached = np.concatenate(cloud) if len(cloud) > 1 else translations[[tip]]
+        reached = _group_surface(hand, (rotations, translations), tip, 200, rng)
+        reached = reached if len(reached) else translations[[tip]]
         points.append(_far_end(reached, root, middle))
         roots.append(root)
     links, tips = np.array([chain[0] for chain in chains]), np.array(points)
@@ -146,20 +142,28 @@ def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -
 
 def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
     """Surface points of the palm, or where the fingers join it if it has no solids, base frame [m]."""
-    rotations, translations = link_poses(hand, straight_joints(hand))
-    rng = np.random.default_rng(0)
-    parts = [
-        surface_points(p, 400, rng)[0] @ rotations[p.link].T + translations[p.link]
-        for p in hand.primitives
-        if hand.link_group[p.link] == fingers.palm
-    ]
-    return np.concatenate(parts) if parts else fingers.roots
+    poses = link_poses(hand, straight_joints(hand))
+    found = _group_surface(hand, poses, fingers.palm, 400, np.random.default_rng(0))
+    return found if len(found) else fingers.roots
+
+
+def _group_surface(
+    hand: HandModel,
+    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
+    group: int,
+    count: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "points 3"]:
+    """`count` random surface points of each solid of a rigid group, base frame [m]."""
+    rotations, translations = poses
+    solids = [solid for solid in hand.primitives if hand.link_group[solid.link] == group]
+    drawn = [surface_points(p, count, rng)[0] @ rotations[p.link].T + translations[p.link] for p in solids]
+    return np.concatenate([np.zeros((0, 3)), *drawn])
 
 
 def placed_tips(hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "tips 3"]:
     """Fingertips at a posture, base frame [m]."""
-    rotations, translations = link_poses(hand, q)
-    return np.einsum("tij,tj->ti", rotations[fingers.links], fingers.points) + translations[fingers.links]
+    return in_base(link_poses(hand, q), fingers.points, fingers.links)
 
 
 def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:

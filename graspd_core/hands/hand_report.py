@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.hands.kinematics import link_depths
 from graspd_core.hands.model import HandModel, all_joint_names
 
 
@@ -54,9 +55,7 @@ class HandReport:
 def report(hand: HandModel) -> HandReport:
     """The report on a loaded hand; `pairs` counts the pairs of links checked against each other, and all pairs."""
     names = _joint_of_link(hand)
-    depth = np.zeros(hand.num_links, dtype=int)
-    for link in range(1, hand.num_links):
-        depth[link] = depth[hand.link_parent[link]] + 1
+    depth = link_depths(hand.link_parent)
     links = tuple(
         LinkReport(
             name=name,

@@ -55,7 +55,7 @@ def make_kinematics(
 # A hand is hashed by identity: copies made by `replace` are hands of their own. Few are kept, for a hand is large.
 @lru_cache(maxsize=8)
 def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) -> Kinematics:
-    depth = _link_depths(hand.link_parent)
+    depth = link_depths(hand.link_parent)
     order = np.argsort(depth, kind="stable")
     position = np.argsort(order, kind="stable")
     sizes = tuple(int(n) for n in np.bincount(depth))
@@ -156,7 +156,7 @@ def point_jacobian(
     actuated joint by the sum over all that follow it, each times its multiplier.
     """
     rotation, translation = link_poses(hand, q)
-    x = np.einsum("pij,pj->pi", rotation[links], points) + translation[links]
+    x = in_base((rotation, translation), points, links)
     jacobian = np.zeros((len(points), 3, hand.num_joints))
     behind = _descendants(hand)
     for link in np.flatnonzero(hand.link_joint >= 0):
@@ -175,6 +175,16 @@ def link_poses(
     return links.rotation.numpy(), links.translation.numpy()
 
 
+def in_base(
+    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
+    points: Float[np.ndarray, "points 3"],
+    links: Int[np.ndarray, "points"],
+) -> Float[np.ndarray, "points 3"]:
+    """Link-frame points in the base frame [m], at the poses that `link_poses` gives."""
+    rotations, translations = poses
+    return np.einsum("pij,pj->pi", rotations[links], points) + translations[links]
+
+
 def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     """Row i: link i and all links behind it."""
     behind = np.eye(hand.num_links, dtype=bool)
@@ -183,7 +193,8 @@ def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     return behind
 
 
-def _link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
+def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
+    """The number of joints between each link and the base."""
     depth = np.zeros(len(parent), dtype=np.int64)
     for link, above in enumerate(parent):
         if above >= 0:

@@ -9,7 +9,6 @@ import numpy as np
 
 from graspd_core.errors import HandError
 from graspd_core.hands.default_postures import default_palm, default_postures
-from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.readers.description import apply_description, read_description
 from graspd_core.hands.readers.mjcf import read_mjcf
@@ -39,6 +38,8 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600) -> HandModel:
     if candidates < 1:
         raise HandError(f"candidates={candidates}: at least 1 is needed")
     if Path(name_or_path).suffix == ".pkl":
+        from graspd_core.hands.mano.mano_hand import load_mano
+
         return load_mano(name_or_path, candidates=candidates).model
     path = _find(name_or_path)
     if path.suffix in (".yaml", ".yml"):

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import HandError
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.link_distance import primitive_sdf, within_bounds
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
@@ -88,7 +88,7 @@ def candidates(
     faces = _exposed(hand, _random_pool(hand, 20 * count, rng))
     pool = _Pool(*(np.concatenate(pair) for pair in zip(vars(features).values(), vars(faces).values(), strict=True)))
     weights, facing = _weights(hand, pool)
-    placed = _placed(link_poses(hand, hand.open_posture), pool.points, pool.links)
+    placed = in_base(link_poses(hand, hand.open_posture), pool.points, pool.links)
     corners = np.flatnonzero(pool.corner & facing)
     groups = hand.link_group[pool.links]
     limit = int(_CORNER_SHARE * count)
@@ -195,7 +195,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
     # One joint lies between neighbouring groups, so that its range is covered by moving all joints together.
     for share in np.linspace(0.0, 1.0, 5):
         poses = link_poses(hand, hand.lower + share * (hand.upper - hand.lower))
-        placed = _placed(poses, pool.points, pool.links)
+        placed = in_base(poses, pool.points, pool.links)
         inside = np.zeros(len(pool.points), dtype=bool)
         for group, primitives in _by_group(hand).items():
             neighbour = (above[groups] == group) | (groups == above[group])
@@ -210,8 +210,8 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
     """Points inside another solid of their rigid group, on a face glued to one, or flush with an earlier one."""
     poses = link_poses(hand, hand.open_posture)
-    placed = _placed(poses, pool.points, pool.links)
-    raised = _placed(poses, pool.points + _CREASE * pool.normals, pool.links)
+    placed = in_base(poses, pool.points, pool.links)
+    raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)
     covered = np.zeros(len(pool.points), dtype=bool)
     groups = hand.link_group[pool.links]
     for group, primitives in _by_group(hand).items():
@@ -230,16 +230,6 @@ def _by_group(hand: HandModel) -> dict[int, list[tuple[int, Primitive]]]:
     for number, primitive in enumerate(hand.primitives):
         found.setdefault(int(hand.link_group[primitive.link]), []).append((number, primitive))
     return found
-
-
-def _placed(
-    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
-    points: Float[np.ndarray, "points 3"],
-    links: Int[np.ndarray, "points"],
-) -> Float[np.ndarray, "points 3"]:
-    """Link-frame points in the base frame [m]."""
-    rotations, translations = poses
-    return np.einsum("pij,pj->pi", rotations[links], points) + translations[links]
 
 
 def _distance(
@@ -280,9 +270,9 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
     """
     poses = rotations, origins = link_poses(hand, hand.open_posture)
     groups = hand.link_group[pool.links]
-    placed = _placed(poses, pool.points, pool.links)
+    placed = in_base(poses, pool.points, pool.links)
     closing = hand.open_posture + 0.02 * (hand.closed_posture - hand.open_posture)
-    motion = _placed(link_poses(hand, closing), pool.points, pool.links) - placed
+    motion = in_base(link_poses(hand, closing), pool.points, pool.links) - placed
     motion[groups == hand.link_group[0]] = hand.palm_normal
     motion /= np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-9)
     outward = np.einsum("pij,pj->pi", rotations[pool.links], pool.normals)

@@ -1,9 +1,9 @@
 """COLLADA (.dae) meshes: the surface only, without the libraries that read the whole format.
 
-Read are triangles, polylists and polygons of every geometry that the visual scene instances, through the scene's node
-transforms, in metres by the file's `<unit>`. Faces with more than three corners are cut into a fan, which is exact for
-the convex ones that modellers write. The file's up axis is ignored, as ROS viewers do: a URDF's origins are written to
-that. Format: COLLADA 1.4.1 specification, Khronos Group, 2008.
+Read are triangles, strips, fans, polylists and polygons of every geometry that the visual scene instances, through the
+scene's node transforms, in metres by the file's `<unit>`. Faces with more than three corners are cut into a fan, which
+is exact for the convex ones that modellers write. The file's up axis is ignored, as ROS viewers do: a URDF's origins
+are written to that. Format: COLLADA 1.4.1 specification, Khronos Group, 2008.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd_core.types import TriangleMesh
 _MOST_NODES = 4000
 # A page of nodes can show a geometry many times over.
 _MOST_FACES = 20_000_000
-_FACES = ("triangles", "polylist", "polygons")
+_FACES = ("triangles", "tristrips", "polylist", "polygons", "trifans")
 
 
 def read_dae(path: Path) -> TriangleMesh:
@@ -143,8 +143,10 @@ def _surface(
         start, available = known[shared]
         offset = int(corner.get("offset", "0"))
         loops = [np.array((p.text or "").split(), dtype=np.int64)[offset::stride] for p in element.findall("p")]
+        if element.tag == "tristrips":
+            loops = [_strip(loop) for loop in loops]
         indices = np.concatenate([np.zeros(0, dtype=np.int64), *loops])
-        if element.tag == "triangles":
+        if element.tag in ("triangles", "tristrips"):
             sides = np.full(len(indices) // 3, 3)
         elif element.tag == "polylist":
             sides = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
@@ -175,6 +177,13 @@ def _positions(vertices: ET.Element, named: dict[str, ET.Element]) -> Float[np.n
     stride = max(3, int(accessor.get("stride", "3"))) if accessor is not None else 3
     values = np.array((source.findtext("float_array") or "").split(), dtype=float)
     return values[: len(values) // stride * stride].reshape(-1, stride)[:, :3]
+
+
+def _strip(corners: Int[np.ndarray, "corners"]) -> Int[np.ndarray, "_"]:
+    """The corners of a strip's triangles: every corner and the two after it, every other triangle turned over."""
+    faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces.ravel()
 
 
 def _fans(indices: Int[np.ndarray, "corners"], sides: Int[np.ndarray, "polygons"]) -> Int[np.ndarray, "faces 3"]:

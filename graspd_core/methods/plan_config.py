@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from graspd_core.config import GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
+from graspd_core.config import CertaintyConfig, GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
 from graspd_core.config.mapping import coerced, read_yaml
 from graspd_core.errors import ConfigError, shown
 from graspd_core.methods.method_registry import METHODS
@@ -29,6 +29,7 @@ class PlanConfig:
         grasp_stages: pregrasp and squeeze.
         rounds: of optimiser and trial.
         robust: the order of the verified grasps.
+        certainty: how sure a grasp of a partly guessed object must be.
 
     Raises:
         ConfigError: the method is unknown, or the settings are another method's.
@@ -41,6 +42,7 @@ class PlanConfig:
     grasp_stages: GraspStagesConfig = field(default_factory=GraspStagesConfig)
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
     robust: RobustConfig = field(default_factory=RobustConfig)
+    certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
 
     def __post_init__(self) -> None:
         config = _row(self.method, "config").config

@@ -98,3 +98,4 @@ _ROWS = (
     ),
 )  # fmt: skip
 METRICS: dict[str, Metric] = {row.name: row for row in _ROWS}
+"""The metrics by name; a row that is added is measured too."""

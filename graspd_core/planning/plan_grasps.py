@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
 
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
@@ -24,7 +27,7 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, WatchHook
+from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
 
 
 def plan_grasps(
@@ -47,13 +50,15 @@ def plan_grasps(
     Args:
         scene: from `load_scene` or `scene_from_views`; where the preset asks for another grid, that is built.
         hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
-        count, seed: verified grasps wanted; same seed, same machine, same grasps.
+        count: verified grasps wanted.
+        seed: same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
         verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
         measure: whether grasps get their metrics, those that failed a trial excepted; it takes longer than a trial.
-        progress, watch: called from this thread with `Progress` values, and with the hands that the run works on.
+        progress: called from this thread with `Progress` values.
+        watch: called from this thread with the hands that the run works on.
         stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
 
     Raises:
@@ -61,22 +66,34 @@ def plan_grasps(
         ResourceError: the machine has too little memory for so many grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
-    asked: dict[str, Any] = {"count": count, "seed": seed, "verify": verify, "device": device}
-    check_request(deadline=deadline, **asked)
+    request: dict[str, Any] = {"count": count, "seed": seed, "verify": verify, "device": device}
+    check_request(deadline=deadline, **request)
     run = Run(time.perf_counter(), deadline, progress, stop, watch)
-    support, message, rounds = scene.support, "", []
-    if not run.over():  # else it begins nothing
-        scene, run.origin = planning_scene(scene, config.resolution)
-        hand = with_candidates(hand, config.problem.fine_candidates)
-        message = out_of_reach(scene, hand)
-        rounds = [] if message else rounds_of(scene, config, verify)
+    support = scene.support
+    scene, hand, message, rounds = _prepared(run, scene, hand, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, parts, measure=measure, **asked)
+    found = run_rounds(run, scene, hand, rounds, parts, measure=measure, **request)
     moved = tuple(moved_grasp(grasp, run.origin) for grasp in _ranked(run, found, config, seed))
-    timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
+    outcome, timing = run.outcome(bool(moved), found.good, count), _timing(run, scene, found)
+    result = GraspResult(outcome, moved, timing, seed, config.method, message)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    model = scene.object
-    return GraspResult(outcome, moved, timing, seed, config.method, message, model.warnings, support, found.audits)
+    result = replace(result, warnings=scene.object.warnings, support=support, audits=found.audits)
+    return result if found.good else _less_sure(scene, run.origin, result)
+
+
+def _prepared(
+    run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str
+) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
+    """Scene and hand as they are planned on, why the hand can hold nothing there, and the rounds to run.
+
+    A run that is over before it began begins nothing.
+    """
+    if run.over():
+        return scene, hand, "", []
+    scene, run.origin = planning_scene(scene, config.resolution)
+    hand = with_candidates(hand, config.problem.fine_candidates)
+    message = out_of_reach(scene, hand)
+    return scene, hand, message, [] if message else rounds_of(scene, config, verify)
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
@@ -84,6 +101,20 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     if found.context is None or not config.robust.rank:
         return found.grasps
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
+
+
+def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
+    """A result without a grasp that is sure enough: with the view that would show most of what is hidden."""
+    held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.grasps)
+    if scene.evidence is None or not held:
+        return result
+    from graspd_core.reconstruction.next_view import next_view
+
+    view = next_view(scene.evidence, scene.object.mesh, far)
+    told = f"{held} grasps hold on the likeliest shape, none is sure enough, since a part of the object was guessed"
+    if view is not None:
+        told += "; a view from ({:.2f}, {:.2f}, {:.2f}) m would show most of it".format(*view[:3, 3])
+    return replace(result, message=told, next_view=view)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

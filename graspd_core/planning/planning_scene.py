@@ -38,7 +38,9 @@ def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarr
         confidence = sample_confidence(confidence, moved_sdf(scene.sdf, -far), _nodes(sdf)).reshape(sdf.field.shape[1:])
     support = scene.support and moved_plane(scene.support, -far)
     obstacles = tuple(moved_obstacle(obstacle, -far) for obstacle in scene.obstacles)
-    return replace(scene, object=model, sdf=sdf, support=support, obstacles=obstacles, confidence=confidence), far
+    evidence = scene.evidence and replace(scene.evidence, origin=scene.evidence.origin - far)
+    changed = {"support": support, "obstacles": obstacles, "confidence": confidence, "evidence": evidence}
+    return replace(scene, object=model, sdf=sdf, **changed), far
 
 
 def _nodes(sdf: GridSDF) -> Float[Tensor, "x yz 3"]:

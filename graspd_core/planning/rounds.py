@@ -19,9 +19,10 @@ from graspd_core.planning.verification import (
     make_trial_context,
     measured,
     run_trials,
+    surest_first,
 )
 from graspd_core.scene.scene import Scene
-from graspd_core.types import AuditCount, Grasp, Snapshot, Stage, Verdict
+from graspd_core.types import AuditCount, Grasp, Snapshot, Stage
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
@@ -66,8 +67,8 @@ class RoundsResult:
 
     @property
     def good(self) -> int:
-        """How many grasps did not fail."""
-        return sum(grasp.verdict is not Verdict.FAILED for grasp in self.grasps)
+        """How many grasps are as sure as was asked for: verified, or found where no trial was asked for."""
+        return sum(grasp.usable for grasp in self.grasps)
 
 
 def poses_seen(poses: Poses) -> Snapshot:
@@ -116,10 +117,11 @@ def run_rounds(
             tried = TriedGrasps(measured(scene, hand, untried) if measure else untried)
         elif found.grasps:
             if state.context is None:
-                state = replace(state, context=make_trial_context(run, scene, hand, parts, verify, measure=measure))
+                context = make_trial_context(run, scene, hand, parts, verify, config.certainty, measure=measure)
+                state = replace(state, context=context)
             if state.context is not None:
                 tried = run_trials(run, state.context, found.grasps, wanted, good)
-        grasps = tuple(sorted((*state.grasps, *tried.grasps), key=lambda g: g.verdict is Verdict.FAILED))
+        grasps = surest_first((*state.grasps, *tried.grasps))
         state = replace(state, grasps=grasps, first=state.first or tried.first, audits=state.audits + tried.audits)
         if state.good >= count or run.over():
             break

@@ -14,10 +14,11 @@ from itertools import chain, repeat
 import numpy as np
 import torch
 
-from graspd_core.config import RobustConfig
+from graspd_core.config import CertaintyConfig, RobustConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_context
+from graspd_core.planning.hypotheses import Hypotheses, hypotheses_of, try_hypotheses
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.trial_threads import results_in_order
 from graspd_core.scene.scene import Scene, object_parts
@@ -48,6 +49,7 @@ class VerificationContext:
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
+    hypotheses: Hypotheses | None = None
 
 
 def parts_in_background(run: Run, scene: Scene) -> Parts:
@@ -68,7 +70,7 @@ def parts_in_background(run: Run, scene: Scene) -> Parts:
 
 
 def make_trial_context(
-    run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str, *, measure: bool
+    run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str, certainty: CertaintyConfig, *, measure: bool
 ) -> VerificationContext | None:
     """The contexts, as soon as the parts are there; None where the run ended first."""
     while not run.over() and not wait([parts], timeout=_POLL).done:
@@ -76,8 +78,10 @@ def make_trial_context(
     if run.over():
         return None
     parts.result()
-    worlds = _worlds(scene, hand, at_friction(PROTOCOLS[verify], scene.object.friction))
-    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None)
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+    worlds = _worlds(scene, hand, protocol)
+    others = hypotheses_of(run, scene, hand, worlds, certainty.probability)
+    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, others)
 
 
 # Kept for the last few scenes and hands, which are hashed by identity.
@@ -126,13 +130,12 @@ def run_trials(
     On as many threads as torch may use in the calling one; verdicts and order do not depend on their number.
     """
     verified: list[Grasp] = []
-    failed: list[Grasp] = []
+    others: list[Grasp] = []
     first, audits = None, AuditCount()
     seen = None if run.watch is None else candidates_seen(candidates)
-    trials = results_in_order(run, partial(audited_trials, context.trials), candidates, torch.get_num_threads())
+    trials = results_in_order(run, partial(_all_trials, context), candidates, torch.get_num_threads())
     with closing(trials):
-        for index, (results, audit) in enumerate(trials):
-            tried = replace(candidates[index], trials=results)
+        for index, (tried, audit) in enumerate(trials):
             passed = tried.verdict is Verdict.VERIFIED
             if run.over() and not passed:
                 # A trial that was cut short says nothing of the grasp.
@@ -146,10 +149,25 @@ def run_trials(
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
                 tried = replace(tried, metrics=measure(context.metrics(), tried.grasp))
-            (verified if passed else failed).append(tried)
+            (verified if passed else others).append(tried)
             if len(verified) == count:
                 break
-    return TriedGrasps((*verified, *failed), first, audits)
+    return TriedGrasps(surest_first((*verified, *others)), first, audits)
+
+
+def _all_trials(context: VerificationContext, grasp: Grasp, stop: StopHook) -> tuple[Grasp, AuditCount]:
+    """The grasp with the trials of the likeliest scene, and where it passes them those of what else may be true."""
+    results, audit = audited_trials(context.trials, grasp, stop)
+    if not results[-1].passed or context.hypotheses is None:
+        return replace(grasp, trials=results), audit
+    under, probability = try_hypotheses(context.hypotheses, grasp, stop)
+    return replace(grasp, trials=(*results, under), probability=probability), audit
+
+
+def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
+    """Verified grasps, then those less sure by their probability, then those that failed; else in their order."""
+    place = {Verdict.VERIFIED: 0, Verdict.UNVERIFIED: 1, Verdict.FAILED: 2}
+    return tuple(sorted(grasps, key=lambda g: (place[g.verdict], -(g.probability or 0.0))))
 
 
 def rank_by_robustness(

@@ -19,8 +19,6 @@ CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 _ROTATION_TOLERANCE = 1e-4
 # What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
 _MAX_UNPACKED_BYTES = 2**31
-# The most points that a byte of a file can hold, compressed as densely as pcd's method can.
-_MAX_POINTS_PER_BYTE = 10
 
 
 def is_cloud_file(path: str | Path) -> bool:
@@ -201,7 +199,6 @@ def _read_points(path: Path, ending: str) -> Float[np.ndarray, "n 3"]:
 def _read_open3d(path: Path) -> Float[np.ndarray, "n 3"]:
     import open3d as o3d
 
-    _refuse_empty_promise(path)
     # Open3D prints its complaints and returns nothing; the error below says it once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
@@ -209,22 +206,6 @@ def _read_open3d(path: Path) -> Float[np.ndarray, "n 3"]:
         except (MemoryError, RuntimeError) as error:
             raise CloudError(f"{path}: not a readable cloud ({_first_line(error)})") from error
     return np.array(cloud.points).reshape(-1, 3)
-
-
-def _refuse_empty_promise(path: Path) -> None:
-    """Raise CloudError where a header promises more points, or larger ones, than the file can hold.
-
-    Open3D makes room for them before it looks: of a file of a hundred bytes a machine runs out of memory.
-    """
-    with path.open("rb") as file:
-        header = file.read(4096)
-    size = path.stat().st_size
-    for line in header.replace(b"\r", b"\n").splitlines():
-        words = line.split()
-        if words[:1] in ([b"POINTS"], [b"WIDTH"], [b"HEIGHT"], [b"COUNT"], [b"SIZE"]):
-            promised = max((abs(int(word)) for word in words[1:] if word.lstrip(b"+-").isdigit()), default=0)
-            if promised > _MAX_POINTS_PER_BYTE * size:
-                raise CloudError(f"{path}: its header promises {promised} points or bytes, in a file of {size} bytes")
 
 
 def _first_line(error: BaseException) -> str:

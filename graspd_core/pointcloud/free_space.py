@@ -21,6 +21,9 @@ MAX_IMAGE_CELLS = 160
 # Points, itself among them, that a point's spacing is taken from.
 SPACING_NEIGHBOURS = 5
 
+# What is this much nearer than the object's surface beside it stands before it [m].
+OCCLUDER_GAP_M = 0.01
+
 # A point so much deeper in empty space than the slack is impossible.
 CONTRADICTION_DEPTH_M = 0.01
 
@@ -33,9 +36,10 @@ class ViewDepth:
         eye: where the camera stood [m].
         frame: columns right, down and forward.
         low: the first cell's direction; `cell`: the width of one.
-        depth: along forward [m], of the surface or, beside the outline, of the nearest cell of it.
-        nearest: the same, the smallest over the cell's neighbours.
-        beside: cells between this one and the outline, 0 within it.
+        depth: along forward [m], of the surface or, beside the outline, of the nearest cell of it; infinite where
+            something stands before it.
+        nearest: the same, the smallest over the cell's neighbours; the depth of what stands before it.
+        beside: cells between this one and the outline, 0 within it and where something hides what is behind.
     """
 
     eye: Float[np.ndarray, "3"]
@@ -67,12 +71,19 @@ class FreeSpace:
     tolerance: float = ReconstructionConfig.surface_tolerance
 
 
-def make_view_depths(views: Sequence[PointCloud]) -> tuple[ViewDepth, ...]:
-    """The depth images that views' points make, of those that make any."""
-    return tuple(view_depth for view in views if (view_depth := _make_view_depth(view)) is not None)
+def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = ()) -> tuple[ViewDepth, ...]:
+    """The depth images that views' points of the object make, of those that make any.
+
+    Args:
+        views: the object's points alone.
+        whole: all that each camera saw, in the same order; without it, nothing stood between cameras and object.
+    """
+    around = whole or [None] * len(views)
+    made = (_make_view_depth(view, all_seen) for view, all_seen in zip(views, around, strict=True))
+    return tuple(view_depth for view_depth in made if view_depth is not None)
 
 
-def _make_view_depth(view: PointCloud) -> ViewDepth | None:
+def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | None:
     """The depth image that a view's points make; holes of a few cells are missing pixels, not the object's.
 
     None where they make none: fewer than five before the camera, or all in one line of sight.
@@ -101,8 +112,39 @@ def _make_view_depth(view: PointCloud) -> ViewDepth | None:
     mask = np.asarray(binary_closing(seen, np.ones((3, 3)), iterations=2), dtype=bool)
     _, at = distance_transform_edt(~seen, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     depth = (total / np.maximum(count, 1))[tuple(at)]
+    nearest = minimum_filter(depth, 3)
+    if whole is not None:
+        before = _occluders(whole, frame, low, cell, depth)
+        hidden = np.isfinite(before) & ~mask
+        depth, nearest, mask = np.where(hidden, np.inf, depth), np.where(hidden, before, nearest), mask | hidden
     beside = np.asarray(distance_transform_edt(~mask))
-    return ViewDepth(view.viewpoint, frame, low, cell, depth, minimum_filter(depth, 3), beside)
+    return ViewDepth(view.viewpoint, frame, low, cell, depth, nearest, beside)
+
+
+def _occluders(
+    whole: PointCloud,
+    frame: Float[np.ndarray, "3 3"],
+    low: Float[np.ndarray, "2"],
+    cell: float,
+    depth: Float[np.ndarray, "x y"],
+) -> Float[np.ndarray, "x y"]:
+    """Depth of what stands before the object in each cell [m]: what is behind it nobody saw. Infinite: nothing does."""
+    from scipy.ndimage import binary_closing, distance_transform_edt
+
+    local = (whole.points - whole.viewpoint) @ frame
+    local = local[np.isfinite(local).all(1) & (local[:, 2] > 1e-3)]
+    index = np.floor((local[:, :2] / local[:, 2:] - low) / cell)
+    inside = ((index >= 0) & (index < depth.shape)).all(1)
+    index, forward = tuple(index[inside].astype(int).T), local[inside, 2]
+    near = forward < depth[index] - OCCLUDER_GAP_M
+    before = np.full(depth.shape, np.inf)
+    np.minimum.at(before, tuple(axis[near] for axis in index), forward[near])
+    known = np.isfinite(before)
+    if not known.any():
+        return before
+    # Holes of a few cells are missing pixels of it.
+    _, at = distance_transform_edt(~known, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    return np.where(binary_closing(known, np.ones((3, 3)), iterations=2), before[tuple(at)], np.inf)
 
 
 def empty_depth(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
@@ -168,7 +210,8 @@ def _look(
     beside = (view_depth.beside[index] + np.abs(place - inner).sum(-1)) * view_depth.cell * forward
     before = np.maximum(view_depth.nearest[index] - local[..., 2], 0.0)
     within = view_depth.beside[index] == 0
-    return np.where(within, before, beside), np.where(within, local[..., 2] - view_depth.depth[index], np.inf)
+    depth = view_depth.depth[index]
+    return np.where(within, before, beside), np.where(within & np.isfinite(depth), local[..., 2] - depth, np.inf)
 
 
 def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:

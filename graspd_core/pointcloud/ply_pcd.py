@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+# The most that a byte of LZF, the method of compressed pcd, can stand for: 264 bytes by three.
+_DENSEST = 88
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
@@ -94,11 +96,26 @@ def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
     if header["DATA"][0] == "ascii":
         columns = [sum(counts[:place]) for place in places]
         return _numbers_of_text(data[at:], 0, points, sum(counts))[:, columns]
-    if header["DATA"][0] != "binary":
-        return None
+    if header["DATA"][0] not in ("binary", "binary_compressed"):
+        raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is none of ascii, binary and binary_compressed")
+    # Whatever else numpy would take for a type, or for a page of Python.
+    odd = [kind for kind in header["TYPE"] if kind.upper() not in ("F", "I", "U")]
+    if odd:
+        raise ValueError(f"its TYPE {odd[0][:40]!r} is none of F, I and U")
     sizes = [int(word) * count for word, count in zip(header["SIZE"], counts, strict=True)]
+    if header["DATA"][0] == "binary_compressed":
+        _refuse_false_sizes(data[at:], points * sum(sizes))
+        return None
     codes = ["<" + header["TYPE"][place].lower() + header["SIZE"][place] for place in places]
     return _rows(data, _packed(codes, places, sizes), points, at)
+
+
+def _refuse_false_sizes(packed: bytes, needed: int) -> None:
+    """Raise ValueError where compressed points are not what the header says: Open3D would read past their end."""
+    size, unpacked = np.frombuffer(packed[:8].ljust(8, b"\0"), "<u4").tolist()
+    if unpacked != needed or size > len(packed) - 8 or unpacked > _DENSEST * size:
+        there = f"{size} bytes that unpack to {unpacked}, {max(len(packed) - 8, 0)} are there"
+        raise ValueError(f"its header promises points of {needed} bytes, its data {there}")
 
 
 def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:

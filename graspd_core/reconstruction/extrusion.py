@@ -16,6 +16,8 @@ MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
 MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
 # The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
 MAX_FOOT_HEIGHT_M = 0.015
+# Share of an upright line of a guessed wall that the cameras may contradict.
+MAX_CONTRADICTED_WALL = 0.15
 # Share of the base's outline that walls must stand on.
 MIN_ENCLOSED_SHARE = 0.6
 
@@ -53,7 +55,7 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
     points = np.column_stack([place[row, :2], levels[level]])
     wrong = empty_depth(free_space, points) > free_space.slack
-    bad = np.bincount(row, wrong, len(place)) > 0.15 * np.bincount(row, minlength=len(place))
+    bad = np.bincount(row, wrong, len(place)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(place))
     return take(Surfels(points, outward[row]), ~bad[row])
 
 
@@ -62,7 +64,9 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
-    if lowest > MAX_FOOT_HEIGHT_M or wall.mean() < MIN_WALL_SHARE or wall.sum() < 10:
+    if lowest > MAX_FOOT_HEIGHT_M:
+        return _column(surfels, free_space, step)
+    if wall.mean() < MIN_WALL_SHARE or wall.sum() < 10:
         return nothing()
     feet = take(band, wall)
     # Down along the wall, for each metre of height.
@@ -73,6 +77,32 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     skirt = Surfels(points, np.repeat(feet.normals, len(fall), 0))
     skirt = thin(take(skirt, (points[:, 2] > 0) & (points[:, 2] < lowest)), step)
     return join(skirt, _base((feet.points + down * feet.points[:, 2:])[:, :2], free_space, step))
+
+
+def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
+    """Walls beneath the outline of what was seen high above the support, where something hides what it rests on."""
+    from scipy.spatial import ConvexHull, KDTree, QhullError
+
+    try:
+        hull = ConvexHull(surfels.points[:, :2])
+    except QhullError:
+        return nothing()
+    corners = surfels.points[hull.vertices, :2]
+    edges = np.roll(corners, -1, 0) - corners
+    length = np.linalg.norm(edges, axis=1)
+    edge = np.repeat(np.arange(len(corners)), np.maximum((length / step).astype(int), 1))
+    along = np.concatenate([np.arange(n) / n for n in np.bincount(edge)])
+    rim = corners[edge] + along[:, None] * edges[edge]
+    # Counter-clockwise corners: outwards is to the right.
+    outward = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])[edge] / length[edge, None]
+    top = surfels.points[KDTree(surfels.points[:, :2]).query(rim)[1], 2]
+    levels = np.arange(0.5 * step, max(float(top.max()), step), step)
+    row, level = np.nonzero(levels[None] < top[:, None] - 0.5 * step)
+    points = np.column_stack([rim[row], levels[level]])
+    wrong = empty_depth(free_space, points) > free_space.slack
+    bad = np.bincount(row, wrong, len(rim)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(rim))
+    walls = take(Surfels(points, outward[row]), ~bad[row])
+    return join(walls, _base(rim[~bad], free_space, step)) if (~bad).sum() > 3 else nothing()
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:

@@ -53,9 +53,9 @@ def _fit(
     return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
 
 
-def grid_cell(surfels: Surfels, least: float) -> float:
+def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
     """Width of the cells that a surface through these points is closed on, at least `least` [m]."""
-    return max(float(np.ptp(surfels.points, axis=0).max()) / GRID_CELLS, least)
+    return max(float(np.ptp(surfels.points, axis=0).max()) / cells, least)
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:

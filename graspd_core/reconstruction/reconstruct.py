@@ -19,10 +19,11 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
-from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, point_step
-from graspd_core.reconstruction.poisson import close_surface, fit_poisson, grid_cell, part_walls
-from graspd_core.reconstruction.shape_completion import complete_shape
+from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, nothing, point_step
+from graspd_core.reconstruction.poisson import GRID_CELLS, close_surface, fit_poisson, grid_cell, part_walls
+from graspd_core.reconstruction.shape_completion import Completion, complete_shape
 from graspd_core.reconstruction.unposed_cloud import is_unposed, orient_unposed
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
@@ -40,16 +41,21 @@ class Reconstruction:
         confidence: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
         method: "poisson", and what completed it, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
+        evidence: what else the hidden side may be; None where next to nothing was hidden.
     """
 
     mesh: TriangleMesh
     confidence: Float[np.ndarray, "vertices"]
     method: str
     warnings: tuple[str, ...]
+    evidence: Evidence | None
 
 
 def reconstruct(
-    views: Sequence[PointCloud], *, support: Plane | None = None, settings: ReconstructionConfig | None = None
+    views: Sequence[PointCloud],
+    support: Plane | None = None,
+    settings: ReconstructionConfig | None = None,
+    whole: Sequence[PointCloud] = (),
 ) -> Reconstruction:
     """The closed surface of the object that the views show.
 
@@ -58,6 +64,7 @@ def reconstruct(
             cloud that shows it from all round may stand for many views.
         support: what the object stands on, in the same frame.
         settings: precision of the cameras, and sizes.
+        whole: all that the same cameras saw: what stands before the object hides what is behind it.
 
     Raises:
         CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
@@ -65,34 +72,57 @@ def reconstruct(
     settings = settings or ReconstructionConfig()
     views = _clean(views, settings)
     rotation, origin = _frame(views, support)
-    local = [PointCloud((v.points - origin) @ rotation, (v.viewpoint - origin) @ rotation) for v in views]
+    local = [_in_frame(view, rotation, origin) for view in views]
+    by_eye = {tuple(view.viewpoint.astype(float)): view for view in whole}
+    around = [_in_frame(by_eye[tuple(view.viewpoint)], rotation, origin) for view in views] if whole else ()
     step = point_step(local)
     standing = support is not None
-    method, warnings = "poisson", ()
+    method, warnings, evidence = "poisson", (), None
     if len(local) == 1 and is_unposed(local[0]):
         seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing, 0.0, settings.outline_slack)
-        known = seen
+        guess = Completion("", nothing(), 0.0)
     else:
         seen = merge_views(local, step, settings)
         lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, MAX_FOOT_HEIGHT_M)) if standing else 0.0
         free_space = FreeSpace(
-            make_view_depths(local), standing, lowest, settings.outline_slack, settings.surface_tolerance
+            make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
-        known = join(seen, guess.surfels)
-        known = join(known, stand(known, free_space, step)) if standing else known
         method += f", {guess.method}" if guess.method else ""
         if guess.method or guess.openness > settings.open_share:
             warnings = (_sentence(len(views), guess.method),)
-    mesh = _finished(_surface(known, free_space, settings), seen, settings)
+            evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings)
+    mesh = closed_mesh(seen, guess.surfels, free_space, step, settings)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
-    return Reconstruction(TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces), confidence, method, warnings)
+    mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
+    return Reconstruction(mesh, confidence, method, warnings, evidence)
 
 
-def _surface(known: Surfels, free_space: FreeSpace, settings: ReconstructionConfig) -> TriangleMesh:
-    known = part_walls(known, grid_cell(known, settings.min_cell))
-    cell = grid_cell(known, settings.min_cell)
-    return close_surface(fit_poisson(known, settings.poisson_cell), known, free_space, cell)
+def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> PointCloud:
+    return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
+
+
+def closed_mesh(
+    seen: Surfels,
+    guess: Surfels,
+    free_space: FreeSpace,
+    step: float,
+    settings: ReconstructionConfig,
+    cells: int = GRID_CELLS,
+) -> TriangleMesh:
+    """The closed surface through what was seen and what is guessed, standing on the support where there is one.
+
+    Args:
+        cells: of the grid that it is closed on, along the object's longest side.
+
+    Raises:
+        CloudError: none fits what was seen.
+    """
+    known = join(seen, guess)
+    known = join(known, stand(known, free_space, step)) if free_space.standing else known
+    known = part_walls(known, grid_cell(known, settings.min_cell, cells))
+    cell = grid_cell(known, settings.min_cell, cells)
+    return _finished(close_surface(fit_poisson(known, settings.poisson_cell), known, free_space, cell), seen, settings)
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:

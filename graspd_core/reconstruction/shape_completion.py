@@ -16,8 +16,10 @@ from graspd_core.pointcloud.free_space import FreeSpace, empty_depth
 from graspd_core.reconstruction.extrusion import extrude, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, nothing, take, thin
 from graspd_core.reconstruction.revolution import find_revolution
-from graspd_core.reconstruction.symmetry import find_centre, find_mirrors, image
+from graspd_core.reconstruction.symmetry import Symmetry, find_centre, find_mirrors, image
 
+REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION = "revolution", "mirror", "point symmetry", "extrusion"
+RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
 # Share of a body of revolution's surface that a contradicted share of it takes away.
 FAULT_WEIGHT = 5.0
 # Symmetries of which the cameras contradict more than this share are chance.
@@ -51,13 +53,13 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: 
     if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > settings.revolution_share:
         guess = plausible(turned.surfels, seen, free_space, step)
         # What a handle hides of itself, and the like, is left to Poisson.
-        return Completion("revolution" if _counts(guess, seen) else "", guess, missing)
+        return Completion(REVOLUTION if _counts(guess, seen) else "", guess, missing)
     methods, guess = [], nothing()
     if missing < settings.open_share:
         return Completion("", guess, missing)
     if free_space.standing:
         guess = plausible(extrude(seen, free_space, step), seen, free_space, step)
-        methods = ["extrusion"] if _counts(guess, seen) else []
+        methods = [EXTRUSION] if _counts(guess, seen) else []
     known = join(seen, guess)
     if (
         openness(join(known, stand(known, free_space, step)) if free_space.standing else known, step)
@@ -95,17 +97,40 @@ def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float
 
 def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str, Surfels]:
     mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
-    value = {"mirror": 0.0, "point symmetry": 0.0}
+    value = {MIRROR: 0.0, POINT_SYMMETRY: 0.0}
     if mirrors and mirrors[0].wrong < MAX_SYMMETRY_FAULTS:
-        value["mirror"] = mirrors[0].worth
+        value[MIRROR] = mirrors[0].worth
     if centre.wrong < MAX_SYMMETRY_FAULTS:
-        value["point symmetry"] = centre.worth
+        value[POINT_SYMMETRY] = centre.worth
     best = max(value, key=lambda name: value[name])
     if value[best] < least:
         return "", nothing()
-    if best == "point symmetry":
-        return best, image(centre, seen)
+    return best, image(centre, seen) if best == POINT_SYMMETRY else _mirrored(mirrors, seen)
+
+
+def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
+    """The images in one plane, or in two and in both."""
     images = [image(m, seen) for m in mirrors]
     if len(mirrors) == 2:
         images.append(image(mirrors[1], images[0]))
-    return best, join(*images)
+    return join(*images)
+
+
+def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
+    """What one of `RULES` says of the unseen side, whether or not it is the likeliest; None where it says nothing.
+
+    "" says that nothing is hidden but what the surface closes over.
+    """
+    if rule == REVOLUTION:
+        turned = find_revolution(seen, free_space, step)
+        raw = None if turned is None else turned.surfels
+    elif rule == MIRROR:
+        raw = _mirrored(find_mirrors(seen, free_space), seen)
+    elif rule == POINT_SYMMETRY:
+        raw = image(find_centre(seen, free_space), seen)
+    elif rule == EXTRUSION:
+        raw = extrude(seen, free_space, step) if free_space.standing else None
+    else:
+        return nothing()
+    guess = None if raw is None else plausible(raw, seen, free_space, step)
+    return guess if guess is not None and _counts(guess, seen) else None

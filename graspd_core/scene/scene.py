@@ -16,6 +16,7 @@ from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
 from graspd_core.mesh.separate_bodies import bodies_apart
 from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.confidence import confidence_grid
@@ -84,6 +85,7 @@ class Scene:
         support: what the object stands on, if anything; gravity points against its normal.
         obstacles: other things, only those that the hand could reach.
         confidence: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it known.
+        evidence: of what else the object's hidden side may be; None: next to nothing was hidden.
     """
 
     object: ObjectModel
@@ -92,6 +94,7 @@ class Scene:
     support: Plane | None = None
     obstacles: tuple[Obstacle, ...] = ()
     confidence: Float[torch.Tensor, "x y z"] | None = None
+    evidence: Evidence | None = None
 
 
 def build_scene(

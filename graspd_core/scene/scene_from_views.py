@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -11,9 +12,10 @@ from graspd_core.config import SceneConfig
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.reconstruction.reconstruct import reconstruct
 from graspd_core.scene.obstacles import make_obstacles
-from graspd_core.scene.scene import Scene, build_scene, refuse_numbers
+from graspd_core.scene.scene import Obstacle, Scene, build_scene, refuse_numbers
 from graspd_core.segmentation.segment import Segmentation, segment
 from graspd_core.segmentation.target_selection import Target
+from graspd_core.types import TriangleMesh
 
 
 def scene_from_views(
@@ -51,9 +53,8 @@ def scene_from_views(
         seen = Segmentation(tuple(views), None, (), ())
     else:
         seen = segment(views, target=target, settings=settings.segmentation)
-    whole = reconstruct(seen.views, support=seen.support, settings=settings.reconstruction)
-    reach = settings.segmentation.obstacle_range
-    return build_scene(
+    whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
+    scene = build_scene(
         whole.mesh,
         source=source,
         mass=mass,
@@ -63,6 +64,12 @@ def scene_from_views(
         warnings=seen.warnings + whole.warnings,
         started=started,
         support=seen.support,
-        obstacles=make_obstacles(seen.obstacles, seen.support, whole.mesh, reach, settings.obstacles),
+        obstacles=_obstacles(seen, whole.mesh, settings),
         confidence=whole.confidence,
     )
+    return replace(scene, evidence=whole.evidence)
+
+
+def _obstacles(seen: Segmentation, mesh: TriangleMesh, settings: SceneConfig) -> tuple[Obstacle, ...]:
+    reach = settings.segmentation.obstacle_range
+    return make_obstacles(seen.obstacles, seen.support, mesh, reach, settings.obstacles)

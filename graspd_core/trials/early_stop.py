@@ -3,7 +3,7 @@
 A trial that stops early goes through the same states as one of full length, so it can verify what that would not, never
 the reverse. What slides slowly may come to an edge and snap away, and what jitters on its contacts may be thrown off
 them much later: hence the large safety, and the demand for rest. Numbers are from trajectories of pulls of four hands;
-benchmarks/early_stop.py measures what they come to.
+`graspd bench early` measures what they come to.
 """
 
 from __future__ import annotations

@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.bench.charts.speed_chart import PANELS, Point, points_of
-from graspd_core.bench.figures import by_name, rows
+from graspd_core.bench.figures import Row, by_name, per_verified, rows
 from graspd_core.bench.names import is_preset
-from graspd_core.bench.result_store import Record, read_results
+from graspd_core.bench.result_store import read_results
+from graspd_core.bench.study import Record
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.formats.grasps_json import save_text
 from graspd_core.mesh.shapes import SHAPES
@@ -46,7 +47,7 @@ def save_bench_page(folder: Path, page: Path) -> None:
     try:
         data = page_data(records)
     except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{folder / 'results.json'}: a cell lacks or mistakes {error}") from None
+        raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
     if not data["panels"]:
         raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
     # Within a script only this sequence could end it.
@@ -60,30 +61,33 @@ def page_data(records: Sequence[Record]) -> dict[str, Any]:
     panels = [
         {
             "time": label, "label": panel.label, "log": panel.log,
-            "points": [_point(point) for point in points_of(presets, time, panel)],
+            "points": [_point(point, time, presets[point.name]) for point in points_of(presets, time, panel)],
         }
         for time, label in _TIMES.items()
         for panel in PANELS
     ]  # fmt: skip
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in presets}
     for record in records:
-        if record["kind"] == "raw" and not record["error"] and record["name"] in runs:
+        if record.get("kind") == "raw" and not record["error"] and record["name"] in runs:
             runs[record["name"]].append(_run(record))
     return {"panels": [panel for panel in panels if panel["points"]], "runs": runs}
 
 
-def _point(point: Point) -> dict[str, Any]:
-    method = METHODS[point.method]
-    return {"name": point.name, "colour": method.colour, "method": method.label, "x": point.x, "y": point.y}
+def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
+    method, (low, middle, high) = METHODS[point.method], point.x
+    if time == "cpu_per_verified":  # as the tables have it, all objects together
+        middle = per_verified(group)
+    x = (low, middle, high)
+    return {"name": point.name, "colour": method.colour, "method": method.label, "x": x, "y": point.y}
 
 
 def _run(record: Record) -> dict[str, Any]:
     # Of a file only the name is kept.
     source = f"{SHAPE_PREFIX}{record['object']}" if record["object"] in SHAPES else record["object"]
     words = ["graspd", "synthesize", source, "--hand", record["hand"], "--preset", record["name"]]
-    words += ["--seed", str(record["seed"]), "-n", str(record["asked"]), "--view"]
+    words += ["--seed", str(record["seed"]), "-n", str(record["count"]), "--view"]
     return {
-        "object": record["object"], "seed": record["seed"], "asked": record["asked"], "held": record["held"],
+        "object": record["object"], "seed": record["seed"], "asked": record["count"], "held": record["held"],
         "command": shlex.join(words), "grasps": [_grasp(grasp) for grasp in record["grasps"]],
     }  # fmt: skip
 

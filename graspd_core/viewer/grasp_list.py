@@ -14,18 +14,26 @@ from graspd_core.types import Grasp, Verdict
 from graspd_core.viewer.drawing import VERDICTS
 
 ALL = "all"
-FILTERS = (ALL, *(str(verdict) for verdict in Verdict))
+# What is unverified although it was tried: it holds on the likeliest shape, and is not as sure as was asked for.
+LESS_SURE = "less sure"
+FILTERS = (ALL, "verified", LESS_SURE, "unverified", "failed")
 # Metrics of which less is better; of all others more is.
 _LESS = ("penetration", "self_penetration", "intersection_volume")
-ORDERS = ("rank", "score", "displacement", *METRICS)
+ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
 # Columns of the table, and how many rows are shown about the chosen one.
 _COLUMNS, _AROUND = ("epsilon", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _OTHER_FIGURES = {
     "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",
+    "probability": "of holding on the true object, where a part of its shape was guessed",
     "displacement": "farthest that the object's centre of mass moved in the trial, until the answer was known",
     "rotation": "farthest that the object turned in the trial",
 }
+
+
+def standing(grasp: Grasp) -> str:
+    """What is known of a grasp, for people: its verdict, or that it is less sure; one of the filters."""
+    return LESS_SURE if grasp.verdict is Verdict.UNVERIFIED and grasp.trials else str(grasp.verdict)
 
 
 def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
@@ -33,7 +41,7 @@ def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
 
     An unknown filter or order, which only a forged message can hold, counts as the first.
     """
-    ranks = [rank for rank, grasp in enumerate(grasps) if which not in FILTERS[1:] or grasp.verdict == which]
+    ranks = [rank for rank, grasp in enumerate(grasps) if which not in FILTERS[1:] or standing(grasp) == which]
 
     def place(rank: int) -> tuple[bool, float]:
         value = _value(grasps[rank], rank, by)
@@ -46,6 +54,8 @@ def _value(grasp: Grasp, rank: int, by: str) -> float | None:
     """What a grasp is sorted by, less first; None where it has no such figure."""
     if by == "score":
         return -grasp.score
+    if by == "probability":
+        return None if grasp.probability is None else -grasp.probability
     if by == "displacement":
         return max((t.displacement for t in grasp.trials if math.isfinite(t.displacement)), default=None)
     value = (grasp.metrics or {}).get(by) if by in METRICS else float(rank)
@@ -54,8 +64,13 @@ def _value(grasp: Grasp, rank: int, by: str) -> float | None:
 
 def label(grasp: Grasp, rank: int) -> str:
     """One line for the list of choices."""
-    mark = {Verdict.VERIFIED: "✓", Verdict.FAILED: "✗"}.get(grasp.verdict, "·")
-    return f"{mark} #{rank} {grasp.verdict}, {len(grasp.contacts)} contacts"
+    said = standing(grasp)
+    mark = {"verified": "✓", LESS_SURE: "~", "failed": "✗"}.get(said, "·")
+    return f"{mark} #{rank} {said}{_likely(grasp, ', ')}, {len(grasp.contacts)} contacts"
+
+
+def _likely(grasp: Grasp, before: str) -> str:
+    return "" if grasp.probability is None else f"{before}{100 * grasp.probability:.0f} %"
 
 
 def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:
@@ -66,9 +81,8 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
     first = max(0, min(middle - _AROUND, len(ranks) - 2 * _AROUND - 1))
     head = "".join(f"<th>{html.escape(METRICS[name].title)}</th>" for name in _COLUMNS)
     rows = [_row(grasps[rank], rank, rank == chosen) for rank in ranks[first : first + 2 * _AROUND + 1]]
-    counts = ", ".join(
-        f"{sum(g.verdict is v for g in grasps)} {v}" for v in Verdict if any(g.verdict is v for g in grasps)
-    )
+    said = [standing(grasp) for grasp in grasps]
+    counts = ", ".join(f"{said.count(word)} {word}" for word in FILTERS[1:] if word in said)
     return (
         f"{BLOCK}{middle + 1} of {len(ranks)} shown ({counts})"
         f"<table style='width:100%;text-align:right'><tr><th>#</th><th></th>{head}</tr>{''.join(rows)}</table></div>"
@@ -79,8 +93,10 @@ def figures_html(grasp: Grasp, rank: int) -> str:
     """All that is known of one grasp, each figure with what it means."""
     r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
     reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
-    head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{grasp.verdict}</span></b>{reason}"
+    head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"
     figures = []
+    if grasp.probability is not None:
+        figures.append(_figure("probability", _likely(grasp, ""), _OTHER_FIGURES["probability"]))
     for trial in grasp.trials:
         if math.isfinite(trial.displacement) and math.isfinite(trial.rotation):
             name = html.escape(trial.name)
@@ -110,4 +126,6 @@ def _row(grasp: Grasp, rank: int, chosen: bool) -> str:
     values = [(METRICS[name], (grasp.metrics or {}).get(name)) for name in _COLUMNS]
     cells = "".join(f"<td>{'–' if v is None else format(v * row.scale, f'.{row.digits}f')}</td>" for row, v in values)
     back = "background:rgba(130,150,190,0.3)" if chosen else ""
-    return f"<tr style='{back}'><td>{rank}</td><td style='color:rgb({r},{g},{b})'>●</td>{cells}</tr>"
+    return (
+        f"<tr style='{back}'><td>{rank}</td><td style='color:rgb({r},{g},{b})'>●{_likely(grasp, ' ')}</td>{cells}</tr>"
+    )

@@ -10,9 +10,11 @@ from builtin_interfaces.msg import Time
 from jaxtyping import Float
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from graspd_core import PointCloud, Scene, Target, cloud_from_depth, run_isolated, scene_from_views, transform_cloud
+from graspd_core import PointCloud, Scene, Target, cloud_from_depth, scene_from_views
 from graspd_core.bags.messages import points_from_message
 from graspd_core.config import load_scene_config
+from graspd_core.pointcloud.point_cloud import transform_cloud
+from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.inputs.depth_stream import frame_of
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError

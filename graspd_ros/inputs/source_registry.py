@@ -11,7 +11,8 @@ from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 from jaxtyping import Float
 
-from graspd_core import Scene, load_scene, run_isolated
+from graspd_core import Scene, load_scene
+from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.inputs.mesh_path import resolve_mesh
 from graspd_ros.inputs.requests import point_of, pose_matrix
 from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, scene_of_views, trimmed

@@ -15,7 +15,8 @@ from jaxtyping import Float
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from graspd_core import HandModel, link_poses
+from graspd_core import HandModel
+from graspd_core.hands.kinematics import link_poses
 from graspd_core.types import Contact, Grasp, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
 from graspd_ros.outputs.status_json import pose_of

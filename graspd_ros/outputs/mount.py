@@ -6,7 +6,7 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, Quaternion
 from jaxtyping import Float
 
-from graspd_core import Mount
+from graspd_core.hands.model import Mount
 from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
 
 

@@ -33,7 +33,10 @@ class Publishers:
         self._lock = threading.Lock()
         self._closed = False
         self._publishers: dict[type, Any] = {
-            String: node.create_publisher(String, "~/status", 50),
+            # Latched: who is discovered after the start, or after a restart, still hears that the node is ready.
+            String: node.create_publisher(
+                String, "~/status", QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            ),
             GraspProgress: node.create_publisher(GraspProgress, "~/progress", 50),
         }
         self._publishers |= {kind: self._latched(kind) for kind in LATCHED}

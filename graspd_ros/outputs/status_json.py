@@ -16,7 +16,8 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from graspd_core import HandModel, all_joint_names, all_joint_positions, grasp_figures
+from graspd_core.formats.grasps_json import grasp_figures
+from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.types import Grasp, GraspResult, Posture, Progress, Verdict
 
 
@@ -42,9 +43,9 @@ def joint_message(posture: Posture, hand: HandModel, stamp: Time) -> JointState:
 
 
 def presentable(result: GraspResult) -> Grasp | None:
-    """The best grasp, unless it failed its trial: a grasp known to be bad is never published as one."""
+    """The best grasp, if it is as sure as was asked for: one known to be bad or less sure is never published as one."""
     best = result.grasps[0] if result.grasps else None
-    return None if best is None or best.verdict is Verdict.FAILED else best
+    return best if best is not None and best.usable else None
 
 
 def progress_event(progress: Progress) -> dict[str, Any]:
@@ -77,6 +78,7 @@ def _summary(grasp: Grasp) -> dict[str, Any]:
     return {
         "verdict": grasp.verdict,
         "score": grasp.score,
+        "probability": grasp.probability,
         "position": [float(value) for value in pose.position],
         "quaternion_wxyz": [float(value) for value in pose.quaternion_wxyz],
         "links": [contact.link for contact in grasp.contacts],

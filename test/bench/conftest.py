@@ -28,16 +28,20 @@ def _record(name: str = "balanced", thing: str = "box", **changes: Any) -> dict[
         "object": thing,
         "hand": "allegro_right",
         "seed": 0,
-        "asked": 4,
+        "count": 4,
         "given": 3,
         "held": 2,
         "error": "",
+        "study": "main",
+        "label": f"raw {name} {thing} seed {changes.get('seed', 0)}",
+        "made": "2026-11-22",
+        "commit": "1234567",
         "code": "0.1.0+abc",
         "machine": "2 cores",
         "cpu": {"scene": 1.0, "optimise": 2.0, "standard": 3.0, "hard": 4.0},
         "wall": {"scene": 2.0, "optimise": 4.0, "standard": 6.0, "hard": 8.0},
         "first_verified": {"cpu": 4.0, "wall": 8.0},
-        "cell_cpu": 12.0,
+        "case_cpu": 12.0,
         "peak_mb": 600.0,
         "grasps": grasps,
     }
@@ -46,7 +50,7 @@ def _record(name: str = "balanced", thing: str = "box", **changes: Any) -> dict[
 
 def _planned(name: str = "balanced", thing: str = "box", **changes: Any) -> dict[str, Any]:
     """A planned record: eight verified grasps in two rounds."""
-    own = {"kind": "verified", "asked": 8, "given": 10, "held": 8, "rounds": 2, "cpu": {"total": 16.0}, "grasps": []}
+    own = {"kind": "verified", "count": 8, "given": 10, "held": 8, "rounds": 2, "cpu": {"total": 16.0}, "grasps": []}
     return _record(name, thing, **{**own, **changes})
 
 

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from graspd_core.bench import benchmark_workers as workers
-from graspd_core.bench.measurements.measurement import Cell
+from graspd_core.bench import run_studies
 from graspd_core.bench.result_store import read_results
+from graspd_core.bench.run_cases import Job
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
-from graspd_core.methods.plan_config import PlanConfig
 
 GRASPD = [sys.executable, "-m", "graspd_core.cli", "bench"]
 # Two cells of a few seconds, whose method does next to nothing.
 SMALL = ["--presets", "random_closure", "--objects", "shape:sphere", "--count", "2", "--trials", "standard"]
-CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "f00", "allegro_right", "f11", 0, 4, ("standard",))
 
 BAD: list[tuple[list[str], str]] = [
     (["--presets", "best"], "unknown preset 'best'; valid presets: accurate, "),
@@ -65,38 +63,24 @@ def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(
 def test_cells_that_raise_are_named_at_the_end_and_the_others_kept(
     tmp_path: Path, record, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def run(cells: list[Cell], folder: Path, code: str, processes: int, stop: Any):
-        for cell in cells:
-            error = "ValueError: odd" if cell.seed else ""
-            yield cell, record(cell.name, cell.object, seed=cell.seed, kind=cell.kind, error=error)
+    def run(jobs: Sequence[Job], folder: Path, processes: int, stop: Any):
+        for job in jobs:
+            case: Any = job.case
+            error = "ValueError: odd" if case.seed else ""
+            yield job, record(case.name, "sphere", seed=case.seed, kind=case.kind, error=error)
 
-    monkeypatch.setattr(workers, "run_cells", run)
+    monkeypatch.setattr(run_studies, "run_cases", run)
     assert main(["bench", *SMALL, "--seeds", "0", "1", "--out", str(tmp_path)]) == 1
     out, err = capsys.readouterr()
-    assert "graspd: failed: raw random_closure sphere seed 1: ValueError: odd" in err
+    assert "graspd: failed: main raw random_closure sphere seed 1: ValueError: odd" in err
+    assert "graspd: 2 cases, about 0 minutes on 1 quiet cores" in err
     assert "| `random_closure` | 50% |" in out
     assert len(read_results(tmp_path / "results.json")) == 2
 
 
-def test_a_worker_that_dies_costs_its_cell_only(tmp_path: Path):
-    # A spawned worker unpickles its cell first: one that cannot be is the end of it.
-    fatal = Cell(**{**vars(CELL), "settings": _Fatal()})
-    ((cell, record),) = workers.run_cells([fatal], tmp_path, "1+a", 1)
-    assert cell is fatal
-    assert record["error"] == "RuntimeError: its process died with exit code 7"
-    assert json.loads(next(tmp_path.iterdir()).read_text())["error"] == record["error"]
-
-
-class _Fatal(PlanConfig):
-    """Settings that kill whoever unpickles them."""
-
-    def __reduce__(self) -> Any:
-        return os._exit, (7,)
-
-
 def finished(folder: Path) -> dict[str, float]:
     """Cells on disk and when they were written."""
-    return {path.name: path.stat().st_mtime for path in folder.glob("raw-*.json")}
+    return {path.name: path.stat().st_mtime for path in folder.glob("main-raw*.json")}
 
 
 def lives(process: str) -> bool:
@@ -130,12 +114,12 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
     assert not (tmp_path / "results.json").exists()
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == EXIT_OK, done.stderr
-    assert f"{len(before)} of 3 cells had finished before" in done.stderr
+    assert f"{len(before)} of 3 cases had finished before" in done.stderr
     assert {name: finished(tmp_path)[name] for name in before} == before
     cells = read_results(tmp_path / "results.json")
     assert sorted(cell["seed"] for cell in cells) == [0, 1, 2]
     again = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert "3 of 3 cells had finished before" in again.stderr
+    assert "3 of 3 cases had finished before" in again.stderr
     assert again.stdout == done.stdout
 
 
@@ -150,4 +134,4 @@ def test_ctrl_c_keeps_finished_cells(tmp_path: Path):
     assert process.returncode == EXIT_INTERRUPTED, errors
     assert "Traceback" not in errors
     kept = len(finished(tmp_path))
-    assert f"interrupted; {kept} of 40 cells are kept" in errors
+    assert f"interrupted; {kept} of 40 cases are kept" in errors

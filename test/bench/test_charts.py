@@ -14,7 +14,7 @@ from graspd_core.bench.charts import speed_chart as charts
 from graspd_core.bench.charts.robustness_chart import draw_robust
 from graspd_core.bench.figures import by_name, rows
 
-ENDS = ("_verified", "_planned", "_ladder")
+ENDS = ("_short", "_planned", "_ladder")
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_charts_are_written_and_not_blank(tmp_path: Path, records, planned):
 def test_the_same_figures_draw_the_same_chart(tmp_path: Path, records):
     presets = by_name(rows(records[:9]))
     for name in ("one", "two"):
-        charts.draw_speed(presets, tmp_path / name, "cpu_per_grasp", "CPU seconds")
+        charts.draw_speed(presets, tmp_path / name)
     for ending in ("png", "svg"):
         assert (tmp_path / f"one.{ending}").read_bytes() == (tmp_path / f"two.{ending}").read_bytes()
 
@@ -64,7 +64,7 @@ def test_nothing_to_draw_is_no_chart(tmp_path: Path, record):
 @pytest.mark.parametrize("shapes", [["mug"], ["mug", "box", "mug"]])
 def test_the_chart_of_the_ranking_has_a_bar_for_each_shape_and_a_curve_for_each_order(tmp_path: Path, shapes):
     costs = {"plan_cpu_s": 2.0, "ranked_plan_cpu_s": 3.0}
-    found = [{"shape": shape, "held": [0.5, 1.0], "ranked_by": [0.25, 0.75], **costs} for shape in shapes]
+    found = [{"shape": shape, "shares": [0.5, 1.0], "ranked_by": [0.25, 0.75], **costs} for shape in shapes]
     assert draw_robust(found, tmp_path / "robust") == tmp_path / "robust.png"
     drawing = (tmp_path / "robust.svg").read_text()
     for text in ("ranked by score", "ranked by noisy trials", "CPU seconds for 2 verified grasps"):

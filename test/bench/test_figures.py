@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from graspd_core.bench import tables
+from graspd_core.bench import report, tables
 from graspd_core.bench.comparison import comparison, moves
-from graspd_core.bench.figures import by_name, per_verified, rows, spread
+from graspd_core.bench.figures import by_name, pareto_front, per_verified, rows, spread
 from graspd_core.bench.names import parent_of, short_name
-from graspd_core.bench.pareto import pareto_front
 from graspd_core.errors import ConfigError
 from graspd_core.metrics.metric_registry import METRICS, Metric
 
@@ -62,17 +61,17 @@ def test_only_trials_that_were_run_have_been_failed(record):
 
 def test_without_the_standard_trial_nothing_is_said_of_it(record):
     hard = [{"hard": {"passed": True}}, {"hard": {"passed": False}}]
-    objects = tables.object_tables([record(asked=2, given=2, held=0, grasps=hard)])
+    objects = tables.object_tables([record(count=2, given=2, held=0, grasps=hard)])
     assert "| object | held, hard | CPU s per grasp |" in objects
     assert "| box | 50% | 1 |" in objects
 
 
 def test_what_the_means_leave_out_is_said(record):
     full = [record(), record(thing="mug"), record("fast"), record("fast", thing="mug")]
-    assert tables.about(full).endswith("code 0.1.0+abc.")
-    assert "`fast` of 1 only" in tables.about(full[:3])
-    raised = tables.about([*full[:3], record("fast", thing="mug", error="died")])
-    assert raised.endswith("1 cells raised and are in no figure. Means are over 2 objects, but `fast` of 1 only.")
+    assert tables.missing(full) == ""
+    assert tables.missing(full[:3]) == "Means are over 2 objects, but `fast` of 1 only."
+    raised = report.provenance("graspd bench main", [*full[:3], record("fast", thing="mug", error="died")])
+    assert raised.endswith("1 cases failed and are in no figure.")
 
 
 def test_seeds_are_pooled_and_cells_that_raised_left_out(record):
@@ -119,7 +118,7 @@ def test_area_over_volume_is_none_where_nothing_is_shared(record):
 def test_a_metric_of_the_registry_has_a_column(record, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(METRICS, "height", Metric("height", "mm", 1e3, None, "z of the base link", 1))
     grasps = [{"standard": {"passed": True}, "metrics": {"height": 0.25}}]
-    table = tables.object_tables([record(asked=1, given=1, held=1, grasps=grasps)])
+    table = tables.object_tables([record(count=1, given=1, held=1, grasps=grasps)])
     assert "| object | held | height mm | CPU s per grasp |" in table
     assert "| box | 1/1 | 250.0 |" in table
 
@@ -149,19 +148,42 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     document.write_text(
         f"{spoken_of}\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
     )
-    chart = tmp_path / "figures" / "bench.png"
-    assert tables.fill(document, tables.sections([record()], {"speed": chart}, document)) == ["bench"]
+    sections = report.sourced(
+        "graspd bench main", [record()], tables.main_sections([record()], tmp_path / "figures" / "bench")
+    )
+    assert list(sections) == ["bench", "bench-all", "bench-objects"], "what has no figures has no section"
+    assert report.fill(document, sections) == ["bench"]
     text = document.read_text()
-    picture = "![Speed against accuracy](figures/bench.png)"
+    picture = "![Speed against accuracy](figures/bench_short.png)"
     assert text.startswith(f"{spoken_of}\n<!-- bench:begin -->\n{picture}\n\n| preset |")
-    assert "\n\n1 cells, 1 objects, seeds 0; hand allegro_right; 0 CPU minutes on 2 cores; code 0.1.0+abc.\n" in text
+    source = (
+        "Made 2026-11-22 by `graspd bench main` at commit 1234567 (code 0.1.0+abc): 1 cases, 0 CPU minutes on 2 cores."
+    )
+    assert f"\n\n{source}\n<!-- bench:end -->" in text
     assert text.endswith("\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n")
     assert "old" not in text
     document.write_text("no sections")
-    with pytest.raises(ConfigError, match="none of the sections bench, bench-planned"):
-        tables.fill(document, tables.sections([record()], {}, document))
+    with pytest.raises(ConfigError, match="none of the sections bench, bench-all"):
+        report.fill(document, sections)
     with pytest.raises(ConfigError, match="No such file"):
-        tables.fill(tmp_path / "nowhere.md", {})
+        report.fill(tmp_path / "nowhere.md", {})
+
+
+def test_the_first_page_has_a_few_rows(record):
+    names = ("fast", "balanced", "accurate", "annealing", "graspd2022", "graspd2022_short", "random_closure")
+    (_, table) = tables.main_sections([record(name) for name in names], None)["bench"]
+    assert isinstance(table, str)
+    assert table.count("\n") - 1 == 5
+    assert "annealing" not in table
+
+
+def test_decades_are_shares_over_all_objects(record):
+    names = [f"problem.friction={value}" for value in ("0.2", "0.4")]
+    blocks = tables.decades_sections([record(name, thing) for name in names for thing in ("box", "mug")], None)[
+        "decades"
+    ]
+    assert "| closed form, friction | 0.02 | 0.06 | 0.2 | 0.4 | 2 | 6 | 20 |" in str(blocks[-1])
+    assert "| `problem.friction` | – | – | 4/8 | 4/8 | – | – | – |" in str(blocks[-1])
 
 
 def test_a_comparison_shows_what_moved_and_only_that(record, planned):

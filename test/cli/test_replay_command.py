@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from graspd_core.bags.writer import (
+from bag_writer import (
     Record,
     camera_info_message,
     cloud_message,
@@ -17,6 +16,7 @@ from graspd_core.bags.writer import (
     transforms_message,
     write_bag,
 )
+
 from graspd_core.cli import cloud_options as clouds
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -41,6 +43,8 @@ def spoilt() -> Callable[[bytes], st.SearchStrategy[bytes]]:
 
 @st.composite
 def _spoilt(draw: st.DrawFn, data: bytes) -> bytes:
+    if draw(st.booleans()):
+        data = draw(_regrown(data))
     for _ in range(draw(st.integers(1, 4))):
         words = [found.span() for found in re.finditer(rb"[\w.+-]+", data)]
         action = draw(st.sampled_from(["word", "word", "word", "flip", "cut", "repeat", "drop"]))
@@ -59,3 +63,29 @@ def _spoilt(draw: st.DrawFn, data: bytes) -> bytes:
         elif action == "drop":
             data = data[:first] + data[last:]
     return data
+
+
+@st.composite
+def _regrown(draw: st.DrawFn, data: bytes) -> bytes:
+    """An XML file of which up to three elements were removed, moved, repeated, renamed or given another attribute."""
+    try:
+        root = ET.fromstring(data)
+    except ET.ParseError:
+        return data
+    for _ in range(draw(st.integers(1, 3))):
+        elements = list(root.iter())
+        above = {child: parent for parent in elements for child in parent}
+        element, other = draw(st.sampled_from(elements)), draw(st.sampled_from(elements))
+        action = draw(st.sampled_from(["set", "drop", "rename", "remove", "move", "repeat"]))
+        if action in ("set", "drop") and element.attrib:
+            key = draw(st.sampled_from(sorted(element.attrib)))
+            element.attrib.update({key: draw(st.sampled_from(sorted(other.attrib.values()) or [""]))})
+            if action == "drop":
+                del element.attrib[key]
+        elif action == "rename":
+            element.tag = other.tag
+        elif action in ("remove", "move") and element in above:
+            above[element].remove(element)
+        if action in ("move", "repeat"):
+            draw(st.sampled_from(list(root.iter()))).append(copy.deepcopy(element))
+    return ET.tostring(root)

@@ -1,10 +1,7 @@
-"""Hands that nobody has built: random trees of links and joints as URDF texts, an MJCF file, ways to break them."""
+"""Hands that nobody has built: random trees of links and joints as URDF texts, an MJCF file."""
 
 from __future__ import annotations
 
-import copy
-import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -48,12 +45,7 @@ GEOMETRIES = (
     '<mesh filename="package://zoo/wedge.stl" scale="-1 1 0.5"/>',
     '<mesh filename="wedge.dae" scale="2 2 2"/>',
 )
-# What attributes are set to when something goes wrong.
-NASTY = (
-    *("", " ", "nan", "inf", "-inf", "1e400", "1e300", "-1", "0", "0 0 0", "1 2", "a b c", "1,0,0", "1_0", "0x10", "٣"),
-    *("${width}", "$(arg x)", "../../../etc/passwd", "package://", "http://x/y.stl", "x" * 5000, "\u0000".strip("\0")),
-    *("revolute", "fixed", "floating", "planar", "ball", "free", "world", "palm", "link_0", "link_1", "joint_1"),
-)
+
 
 _numbers = st.floats(-0.08, 0.08).map(lambda x: round(x, 4))
 _angles = st.floats(-3.1, 3.1).map(lambda x: round(x, 3))
@@ -105,35 +97,6 @@ def _link(draw: st.DrawFn, number: int) -> str:
     return f'<link name="link_{number}">{body}</link>'
 
 
-@st.composite
-def mutated(draw: st.DrawFn, text: str) -> bytes:
-    """An XML text with one to four things wrong with it: in its tree, and sometimes in its letters."""
-    root = ET.fromstring(text)
-    for _ in range(draw(st.integers(1, 4))):
-        elements = list(root.iter())
-        parents = {child: parent for parent in elements for child in parent}
-        element = draw(st.sampled_from(elements))
-        action = draw(st.sampled_from(["set", "drop", "remove", "repeat", "move", "rename"]))
-        if action == "set" and element.attrib:
-            element.set(draw(st.sampled_from(sorted(element.attrib))), draw(st.sampled_from(NASTY)))
-        elif action == "drop" and element.attrib:
-            del element.attrib[draw(st.sampled_from(sorted(element.attrib)))]
-        elif action == "rename":
-            element.tag = draw(st.sampled_from(["link", "joint", "mesh", "mimic", "geom", "body", "xacro:if", "x:y"]))
-        elif element in parents:
-            if action in ("remove", "move"):
-                parents[element].remove(element)
-            if action in ("repeat", "move"):
-                host = draw(st.sampled_from([e for e in root.iter()]))
-                host.append(copy.deepcopy(element))
-    data = ET.tostring(root)
-    if draw(st.integers(0, 4)) == 0:
-        at = draw(st.integers(0, len(data)))
-        junk = draw(st.sampled_from([b"", b"<!DOCTYPE a>", b"&x;", b"\xff\xfe", b"<!--", b"]]>", b"\x00", b"<a:b/>"]))
-        data = data[:at] + junk + data[at + draw(st.integers(0, 8)) :]
-    return data
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A package with the wedge as obj, stl and dae."""
@@ -163,9 +126,3 @@ def mjcf() -> str:
 def trees() -> st.SearchStrategy[tuple[str, dict[str, tuple[str, float, float]]]]:
     """URDFs with at least one actuated joint, and their couplings."""
     return urdfs()
-
-
-@pytest.fixture(scope="session")
-def broken() -> Callable[[str], st.SearchStrategy[bytes]]:
-    """Mutations of an XML text."""
-    return mutated

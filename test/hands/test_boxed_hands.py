@@ -25,6 +25,28 @@ def hand(request: pytest.FixtureRequest) -> HandModel:
     return load_hand(request.param)
 
 
+# Fingertip origins in the base frame at mid-range [m], of the published descriptions through pytorch-kinematics and,
+# for the Allegro, MuJoCo. The left hand's are the right's, mirrored: its abduction joints are at zero.
+ALLEGRO_TIPS = [
+    [0.09535, 0.04752, 0.04437],
+    [0.09535, 0, 0.04679],
+    [0.09535, -0.04752, 0.04437],
+    [0.08403, 0.05714, -0.0102],
+]
+LEAP_TIPS = [
+    [0.02002, 0.02266, -0.09861],
+    [0.02002, -0.02279, -0.09861],
+    [0.02002, -0.06824, -0.09861],
+    [-0.06132, 0.04303, -0.08248],
+]
+ALLEGRO_ENDS = tuple(f"link_{number}.0_tip" for number in (3, 7, 11, 15))
+GOLDEN = {
+    "allegro_right": (ALLEGRO_ENDS, np.array(ALLEGRO_TIPS)),
+    "allegro_left": (ALLEGRO_ENDS, np.array(ALLEGRO_TIPS) * [1.0, -1.0, 1.0]),
+    "leap_right": (("fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip"), np.array(LEAP_TIPS)),
+}
+
+
 def tips(hand: HandModel, q: np.ndarray) -> np.ndarray:
     """Places of the links that carry no other."""
     ends = np.setdiff1d(np.arange(1, hand.num_links), hand.link_parent)
@@ -47,8 +69,15 @@ def test_forward_kinematics_agree_with_mujocos(hand: HandModel) -> None:
         # MuJoCo makes the root link one with the world.
         for link in range(1, hand.num_links):
             body = data.body(hand.link_names[link])
-            np.testing.assert_allclose(translations[link], body.xpos, atol=1e-5)
-            np.testing.assert_allclose(rotations[link], body.xmat.reshape(3, 3), atol=1e-5)
+            np.testing.assert_allclose(translations[link], body.xpos, atol=1e-9)
+            np.testing.assert_allclose(rotations[link], body.xmat.reshape(3, 3), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_fingertips(name: str) -> None:
+    hand, (ends, golden) = load_hand(name, candidates=8), GOLDEN[name]
+    found = link_poses(hand, 0.5 * (hand.lower + hand.upper))[1][[hand.link_index[end] for end in ends]]
+    np.testing.assert_allclose(found, golden, atol=1e-5)  # the golden values have five decimals
 
 
 def test_joints_have_room_force_and_postures_within_their_limits(hand: HandModel) -> None:

@@ -7,7 +7,7 @@ the shipped hand here: every link is a shell of thin plates, each a fine mesh fi
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,24 +19,13 @@ from graspd_core.hands.collision_spheres import MOST_OF_GROUP, MOST_OF_HAND, col
 from graspd_core.hands.collision_tensors import make_collision_tensors, solid_distance
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand, read_hand_file
-from graspd_core.hands.model import HandModel
+from graspd_core.hands.link_distance import bounds
+from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import surface_points
 from graspd_core.hands.readers.xml_values import rotation_from_rpy
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3
 
-# Least and greatest coordinates of the links' meshes [m], by names without the finger's number.
-LEAP = {
-    "palm_lower": ((-0.1, -0.0987, -0.0347), (0.003, 0.0257, 0.0113)),
-    "mcp_joint": ((-0.043, -0.008, -0.0028), (0.01, 0.0625, 0.033)),
-    "pip": ((-0.0095, -0.0146, -0.0231), (0.0245, 0.015, -0.0001)),
-    "dip": ((-0.01, -0.0461, -0.0029), (0.0245, 0.008, 0.0317)),
-    "fingertip": ((-0.0112, -0.0495, -0.0029), (0.0099, 0.008, 0.0317)),
-    "pip_4": ((-0.0244, -0.0145, -0.023), (0.0096, 0.0151, 0.0)),
-    "thumb_pip": ((-0.01, -0.0173, -0.0249), (0.01, 0.0173, 0.0001)),
-    "thumb_dip": ((-0.0186, -0.0096, -0.0316), (0.0099, 0.0545, 0.003)),
-    "thumb_fingertip": ((-0.0112, -0.0622, -0.0309), (0.0184, 0.0094, 0.0021)),
-}
 PLATE = 0.0015
 # One moving joint, so that a hand is a hand.
 ONE = (
@@ -53,11 +42,18 @@ def rounded(half: np.ndarray, fineness: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners / np.abs(corners).max(0) * half, ball.faces, process=False)
 
 
+def extent(solids: Sequence[Primitive]) -> np.ndarray:
+    """Least and greatest coordinates in the link's frame [m]."""
+    ends = np.array([bounds(solid) for solid in solids])
+    return np.stack([ends[:, 0].min(0), ends[:, 1].max(0)])
+
+
 def fine_leap(folder: Path, fineness: int) -> Path:
     """The stand-in, 102 meshes of 20 · 4ⁿ faces."""
     text = (config_dir() / "hands" / "leap_right.urdf").read_text()
-    for name in re.findall(r'<link name="([^"]*)"', text):
-        low, high = (np.array(end) for end in LEAP.get(name) or LEAP[re.sub(r"_\d$", "", name)])
+    shipped = load_hand("leap_right", candidates=1)
+    for name, solids in zip(shipped.link_names, shipped.primitives_of, strict=True):
+        low, high = extent(solids)
         shapes = ""
         for side in range(6):
             axis, sign = side // 2, 2 * (side % 2) - 1
@@ -170,9 +166,9 @@ def test_many_meshes_share_a_bounded_number_of_corners(tmp_path: Path) -> None:
     assert len(hand.primitives) == 102
     assert sum(len(p.vertices) for p in hand.primitives) < 13_000
     # Fewer corners, and yet the plates' size: the rounded edges lose a tenth of a millimetre.
-    plates = [p for p in hand.primitives if hand.link_names[p.link] == "pip"]
-    corners = np.concatenate([p.vertices for p in plates])
-    np.testing.assert_allclose([corners.min(0), corners.max(0)], LEAP["pip"], atol=2e-4)
+    shipped = load_hand("leap_right", candidates=1)
+    whole = extent(shipped.primitives_of[shipped.link_index["pip"]])
+    np.testing.assert_allclose(extent(hand.primitives_of[hand.link_index["pip"]]), whole, atol=2e-4)
 
 
 @pytest.mark.parametrize("squash", [1.0, 1e-2, 1e-4])

@@ -1,13 +1,10 @@
-"""Forward kinematics against MuJoCo and finite differences."""
+"""Forward kinematics against finite differences; against MuJoCo in test_boxed_hands and readers/test_hands_in_use."""
 
 from __future__ import annotations
 
 import gc
-import importlib
 import weakref
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,6 @@ from hypothesis import strategies as st
 from graspd_core.hands.collision_tensors import make_collision_tensors
 from graspd_core.hands.kinematics import (
     forward,
-    link_poses,
     make_kinematics,
     place_points,
     placement,
@@ -31,6 +27,7 @@ from graspd_core.hands.readers.urdf import read_urdf
 
 SLIDER = """<robot name="slider">
   <link name="rail"/><link name="cart"/><link name="plate"/><link name="arm"/><link name="second"/>
+  <link name="third"/>
   <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/>
     <origin xyz="0.1 0 0" rpy="0.3 -0.2 0.5"/><axis xyz="0 1 1"/>
     <limit lower="-0.1" upper="0.2" effort="5" velocity="1"/></joint>
@@ -38,6 +35,8 @@ SLIDER = """<robot name="slider">
   <joint name="turn" type="continuous"><parent link="plate"/><child link="arm"/><axis xyz="1 2 2"/></joint>
   <joint name="other" type="revolute"><parent link="rail"/><child link="second"/><origin xyz="0 0.2 0"/>
     <axis xyz="0 0 -1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="follows" type="revolute"><parent link="arm"/><child link="third"/><origin xyz="0.03 0 0" rpy="1 0 0"/>
+    <axis xyz="0 1 0"/><limit lower="-9" upper="9"/><mimic joint="other" multiplier="-0.7" offset="0.2"/></joint>
 </robot>"""
 
 
@@ -60,26 +59,6 @@ def hand(request: pytest.FixtureRequest) -> HandModel:
 
 def _random_q(hand: HandModel, count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(hand.lower, hand.upper, (count, hand.num_joints))
-
-
-def test_agrees_with_mujoco(hand: HandModel) -> None:
-    mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
-
-    name = f'<robot name="{hand.name}">'
-    # Links without a mass get one, which moves nothing here.
-    keep = '<mujoco><compiler fusestatic="false" boundmass="1" boundinertia="1"/></mujoco>'
-    model = mujoco.MjModel.from_xml_string(Path(hand.urdf).read_text().replace(name, name + keep))
-    data = mujoco.MjData(model)
-    base = hand.link_group == hand.link_group[0]
-    for q in _random_q(hand, 5, 1):
-        for name, value in zip(hand.joint_names, q, strict=True):
-            data.joint(name).qpos[0] = value
-        mujoco.mj_kinematics(model, data)
-        rotations, translations = link_poses(hand, q)
-        for link in np.flatnonzero(~base):
-            body = data.body(hand.link_names[link])
-            np.testing.assert_allclose(translations[link], body.xpos, atol=1e-9)
-            np.testing.assert_allclose(rotations[link], body.xmat.reshape(3, 3), atol=1e-9)
 
 
 def test_gradients_by_finite_differences(hand: HandModel) -> None:

@@ -41,13 +41,33 @@ def test_nodes_units_and_polygons(tmp_path: Path) -> None:
     np.testing.assert_allclose(load_mesh(tmp_path / "part.dae").vertices, mesh.vertices)
 
 
-def test_triangles_and_polygons_say_the_same(tmp_path: Path) -> None:
+def test_all_kinds_of_faces_say_the_same(tmp_path: Path) -> None:
     start, end = FILE.index("<vcount>"), FILE.index("</polylist>")
     polygons = FILE[:start] + "<p>0 9 1 9 2 9 3 9</p><p>0 9 1 9 4 9</p>" + FILE[end:]
     triangles = FILE[:start] + "<p>0 9 1 9 2 9 0 9 2 9 3 9 0 9 1 9 4 9</p>" + FILE[end:]
-    for tag, text in (("polygons", polygons), ("triangles", triangles)):
+    strips = FILE[:start] + "<p>1 9 2 9 0 9 3 9</p><p>0 9 1 9 4 9</p>" + FILE[end:]
+    for tag, text in (("polygons", polygons), ("trifans", polygons), ("triangles", triangles), ("tristrips", strips)):
         mesh = read_dae(_write(tmp_path, text.replace("polylist", tag)))
-        assert sorted(map(tuple, mesh.faces.tolist())) == [(2, 1, 0), (3, 2, 0), (4, 1, 0)]
+        turned = [tuple(np.roll(face, 2 - int(np.argmin(face)))) for face in mesh.faces]
+        assert sorted(turned) == [(2, 1, 0), (3, 2, 0), (4, 1, 0)]
+
+
+@pytest.mark.parametrize(
+    ("before", "beside"),
+    [
+        ("<library_geometries>", '<library_cameras><camera id="c"><optics/></camera></library_cameras>'),
+        ("<library_geometries>", '<library_lights><light id="l"><technique_common/></light></library_lights>'),
+        ("<library_geometries>", '<library_images><image id="i"/></library_images>'),
+        ("<polylist", '<lines count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p></lines>'),
+        ("<vcount>", '<input semantic="TEXCOORD" source="#gone" offset="1"/>'),
+    ],
+    ids=["camera", "light", "image", "lines", "texture"],
+)
+def test_what_is_no_surface_may_be_broken(tmp_path: Path, before: str, beside: str) -> None:
+    """pycollada refuses each of these files, or drops the surface too where it is told to pass over what is broken."""
+    whole = read_dae(_write(tmp_path, FILE))
+    mesh = read_dae(_write(tmp_path, FILE.replace(before, beside + before, 1)))
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], whole.vertices[whole.faces])
 
 
 @pytest.mark.parametrize(

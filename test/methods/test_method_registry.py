@@ -10,7 +10,8 @@ from types import ModuleType
 import pytest
 
 from graspd_core.bench.charts.speed_chart import draw_charts
-from graspd_core.bench.suites import SUITES, SuiteRequest
+from graspd_core.bench.study import Request
+from graspd_core.bench.suites import main_suite
 from graspd_core.cli import build_parser
 from graspd_core.errors import ConfigError
 from graspd_core.methods.method_registry import METHODS, Method
@@ -25,7 +26,7 @@ RECORD = {
     "object": "box",
     "hand": "allegro_right",
     "seed": 0,
-    "asked": 2,
+    "count": 2,
     "given": 2,
     "held": 1,
     "error": "",
@@ -81,7 +82,7 @@ def test_the_command_line_and_the_benchmark_know_a_new_method(dummy: str, tmp_pa
     assert options.method == dummy
     path = tmp_path / "mine.yaml"
     path.write_text("method: dummy\n")
-    cells = SUITES["main"](SuiteRequest(presets=(str(path),), objects=("shape:box",)))
+    cells = main_suite(Request(presets=(str(path),), objects=("shape:box",)))
     assert {cell.count for cell in cells if cell.kind == "raw"} == {2}
 
 

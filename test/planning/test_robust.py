@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.bench.robustness import correlation, orders
+from graspd_core.bench.studies.robust_ranking import correlation, orders
 from graspd_core.config import RobustConfig
 from graspd_core.formats.grasps_json import result_document
 from graspd_core.hands.library import load_hand
@@ -69,8 +69,8 @@ def test_the_preset_and_only_it_ranks():
 
 def test_figures_of_the_benchmark():
     rows = [
-        {"held": [0.5, 1.0, 0.0], "ranked_by": [0.5, 1.0, 0.25], "score": [3.0, 2.0, 1.0]},
-        {"held": [1.0, 0.0], "ranked_by": [0.0, 1.0], "score": [2.0, 1.0]},
+        {"shares": [0.5, 1.0, 0.0], "ranked_by": [0.5, 1.0, 0.25], "score": [3.0, 2.0, 1.0]},
+        {"shares": [1.0, 0.0], "ranked_by": [0.0, 1.0], "score": [2.0, 1.0]},
     ]
     by_score, by_noise, best = orders(rows)
     assert by_score.tolist() == [0.75, 0.5]

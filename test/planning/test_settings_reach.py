@@ -22,8 +22,10 @@ from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.planning_scene import planning_scene
+from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.scene.scene import Scene, build_scene
-from graspd_core.types import Plane, Progress, Stage
+from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.types import Grasp, Plane, Posture, Progress, Stage
 
 # As short as a run can be that still does everything once.
 SETTINGS: dict[str, Any] = {
@@ -122,6 +124,7 @@ CASES = {
     "rounds.first_budget": Case(1.0, verify="standard", brief=True),
     "robust.rank": held(),
     "robust.trials": held(),
+    "certainty.probability": Case(0.0, HOLDING, "one view", "parallel_gripper", 1, "standard"),
     "robust.hold_time": Case(0.4, HOLDING, hand="parallel_gripper", count=1, verify="full"),
 }
 
@@ -180,6 +183,8 @@ def scene(name: str) -> Scene:
     box = make_shape("box")
     if name == "box":
         return build_scene(box, resolution=12)
+    if name == "one view":
+        return scene_from_views(views_of(tabletop("box"), CAMERA, ring_poses(1, elevation=0.8)))
     # No hand is clear of a table in the middle of the box.
     guessed = np.random.default_rng(0).random(len(box.vertices))
     return build_scene(box, resolution=12, confidence=guessed, support=Plane(np.array([0.0, 0.0, 1.0]), 0.0))
@@ -188,6 +193,10 @@ def scene(name: str) -> Scene:
 @cache
 def hand(name: str) -> HandModel:
     return load_hand(name, candidates=60)
+
+
+def postures(grasp: Grasp) -> tuple[Posture, ...]:
+    return grasp.pregrasp, grasp.grasp, grasp.squeeze
 
 
 @cache
@@ -209,7 +218,7 @@ def trace(config: PlanConfig, case: Case) -> str:
     things = scene(case.scene), hand(case.hand)
     result = plan_grasps(*things, count=case.count, seed=1, preset=config, verify=case.verify, progress=hear, stop=stop)
     grasps = [
-        (g.score, g.contacts, [v.tolist() for p in (g.pregrasp, g.grasp, g.squeeze) for v in vars(p).values()])
+        (g.score, g.probability, g.contacts, [v.tolist() for p in postures(g) for v in vars(p).values()])
         for g in result.grasps
     ]
     return repr((result.outcome, result.method, told, polls, grasps))

@@ -59,7 +59,8 @@ class Client:
         self.events: list[Event] = []
         self.joints: list[JointState] = []
         self.poses: list[PoseStamped] = []
-        self.node.create_subscription(String, "/graspd/status", self._on_status, 100)
+        told = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(String, "/graspd/status", self._on_status, told)
         self.node.create_subscription(JointState, "/graspd/joint_states", self.joints.append, latched)
         self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self.poses.append, latched)
         self.progress: list[GraspProgress] = []

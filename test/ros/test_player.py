@@ -12,11 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-
-from graspd_core.bags.messages import cloud_from_depth_message, points_from_message
-from graspd_core.bags.writer import (
+from bag_writer import (
     Record,
     camera_info_message,
     cloud_message,
@@ -24,6 +20,10 @@ from graspd_core.bags.writer import (
     transforms_message,
     write_bag,
 )
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from graspd_core.bags.messages import cloud_from_depth_message, points_from_message
 from graspd_core.errors import BagError
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bag_writer import Record, camera_info_message, depth_message, transforms_message, write_bag
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Pose, TransformStamped
@@ -28,7 +29,6 @@ from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
 
-from graspd_core.bags.writer import Record, camera_info_message, depth_message, transforms_message, write_bag
 from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.rendering.depth_noise import DEFAULT

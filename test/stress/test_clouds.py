@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd_core.errors import CloudError, NoObjectError
+from graspd_core.errors import NoObjectError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
@@ -60,41 +60,6 @@ def layout_of(points: np.ndarray, dtype: str, number: int, *, big: bool = False)
     step = 3 * packed.itemsize
     fields = {name: (axis * packed.itemsize, number) for axis, name in enumerate("xyz")}
     return CloudLayout(len(points), 1, step, step * len(points), big, fields, memoryview(packed.tobytes()))
-
-
-def scene_of(points: np.ndarray):
-    return scene_from_views([PointCloud(points, np.array([0.5, 0.0, 0.5]), np.array([-0.7071, 0.0, -0.7071]))])
-
-
-def test_empty():
-    with pytest.raises(CloudError, match="empty"):
-        scene_of(np.empty((0, 3)))
-
-
-def test_no_view_at_all():
-    with pytest.raises(CloudError, match="cloud"):
-        scene_from_views([])
-
-
-def test_all_nan():
-    with pytest.raises(CloudError, match="all 1000 points are NaN"):
-        scene_of(np.full((1000, 3), np.nan))
-
-
-def test_ten_points():
-    with pytest.raises(CloudError, match="only 10"):
-        scene_of(np.random.default_rng(0).normal(0, 0.02, (10, 3)))
-
-
-def test_zero_width():
-    fields = {"x": (0, 7), "y": (4, 7), "z": (8, 7)}
-    with pytest.raises(CloudError, match="width=0"):
-        points_from_layout(CloudLayout(0, 1, 12, 0, False, fields, memoryview(b"")))
-
-
-def test_fields_that_are_no_floats():
-    with pytest.raises(CloudError, match="field 'x' is INT16; it must be FLOAT32 or FLOAT64"):
-        points_from_layout(layout_of(np.ones((100, 3)), "i2", 3))
 
 
 @pytest.mark.parametrize(("dtype", "number"), [("f4", 7), ("f8", 8)])
@@ -166,22 +131,6 @@ def test_two_touching_objects_without_a_hint_are_at_worst_one_thing(hand):
     assert result.outcome in ((Outcome.SUCCEEDED,) if verified else (Outcome.TOO_FEW, Outcome.NO_CANDIDATES))
 
 
-def test_a_table_with_nothing_on_it_is_no_object():
-    stage = tabletop("box", yaw=0.3)
-    bare = replace(stage, truth=replace(stage.truth, vertices=stage.truth.vertices - [0.0, 0.0, 1.0]))
-    with pytest.raises(NoObjectError, match="no object"):
-        scene_from_views(views_of(bare, CAMERA, POSES[:1], DEFAULT))
-
-
 def test_a_target_where_nothing_is_names_what_there_is(box_view):
     with pytest.raises(NoObjectError, match=r"target: .*\(0\."):
         scene_from_views([box_view], target=Target(point=np.array([0.25, 0.25, 0.05])))
-
-
-@pytest.mark.slow
-def test_ten_million_points(hand, box_view):
-    rng = np.random.default_rng(0)
-    many = box_view.points[rng.integers(0, len(box_view.points), 10_000_000)]
-    many += rng.normal(0, 3e-4, many.shape)
-    scene, _ = grasp_of([replace(box_view, points=many)], hand)
-    assert stray(scene, tabletop("box", yaw=0.3)) < 0.02

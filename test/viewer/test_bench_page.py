@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -22,7 +21,7 @@ def a_record(name: str, seconds: float, *, held: bool = True, thing: str = "box"
     }
     return {
         "kind": "raw", "name": name, "method": "closed_form", "object": thing, "hand": "allegro_right", "seed": 3,
-        "asked": 1, "given": 1, "held": int(held), "error": "", "code": "0.1.0+abc", "machine": "2 cores",
+        "count": 1, "given": 1, "held": int(held), "error": "", "code": "0.1.0+abc", "machine": "2 cores",
         "cpu": {"scene": 1.0, "optimise": seconds, "standard": 0.1}, "peak_mb": 600.0, "grasps": [grasp],
     }  # fmt: skip
 
@@ -33,6 +32,7 @@ def folder(tmp_path: Path) -> Path:
         a_record("fast", 1.0, held=False),
         a_record("balanced", 3.0),
         a_record("</script><b>x", 2.0, thing="a b"),
+        {"study": "rgbd", "error": ""},  # of a study without raw grasps
     ]
     write_results(tmp_path / "results.json", records)
     return tmp_path
@@ -66,9 +66,8 @@ def test_the_page_is_served_and_nothing_else(folder):
         pass
 
 
-@pytest.mark.parametrize("cells", [[], [{"kind": "raw"}]])
-def test_results_that_hold_nothing_are_refused(tmp_path: Path, cells: list):
-    whole = {"format": "graspd/bench", "version": 1, "cells": cells}
-    (tmp_path / "results.json").write_text(json.dumps(whole))
+@pytest.mark.parametrize("records", [[], [{"kind": "raw"}], [{"study": "rgbd", "error": ""}]])
+def test_results_that_hold_nothing_are_refused(tmp_path: Path, records: list):
+    write_results(tmp_path / "results.json", records)
     with pytest.raises(FormatError, match=str(tmp_path)):
         save_bench_page(tmp_path, tmp_path / "page.html")

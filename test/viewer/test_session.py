@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from graspd_core.errors import FormatError, HandError, MeshError
 from graspd_core.runtime.latest_jobs import LatestJobs
-from graspd_core.types import Snapshot, Verdict
+from graspd_core.types import HYPOTHESES, Snapshot, TrialResult, Verdict
 from graspd_core.viewer.drawing import sdf_slice, slice_axes
-from graspd_core.viewer.grasp_list import figures_html, listed, table_html
+from graspd_core.viewer.grasp_list import figures_html, label, listed, table_html
 from graspd_core.viewer.live_view import LiveView
 from graspd_core.viewer.mechanics import Mechanics
 from graspd_core.viewer.motion import placed_links, posture_at, skeletons
@@ -72,6 +73,27 @@ def test_the_list_is_filtered_and_sorted_and_escaped(result):
     shown = figures_html(type(bad)(**{**vars(bad), "trials": (trial,)}), 3)
     assert "<img" not in shown
     assert "<script" not in shown
+
+
+def test_a_grasp_that_is_less_sure_is_said_with_its_probability(result):
+    held = result.grasps[0]
+    under = TrialResult(HYPOTHESES, False, 0.1, 0.1, "fails under 2 of the 5 hypotheses tried")
+    less = replace(held, trials=(*held.trials, under), probability=0.75)
+    sure, untried = replace(held, probability=0.97), replace(held, trials=())
+    grasps = (less, sure, untried, result.grasps[3])
+    assert label(less, 0).startswith("~ #0 less sure, 75 %, ")
+    assert label(sure, 1).startswith("✓ #1 verified, 97 %, ")
+    assert "%" not in label(untried, 2)
+    assert "unverified" in label(untried, 2)
+    assert [listed(grasps, which, "rank") for which in ("less sure", "unverified", "verified")] == [[0], [2], [1]]
+    assert listed(grasps, "all", "probability") == [1, 0, 2, 3]
+    table = table_html(grasps, [0, 1, 2, 3], 0)
+    assert "1 verified, 1 less sure, 1 unverified, 1 failed" in table
+    assert table.count(" %</td>") == 2
+    figures = figures_html(less, 0)
+    assert "probability <b>75 %</b>" in figures
+    assert "fails under 2 of the 5" in figures
+    assert "probability" not in figures_html(untried, 2)
 
 
 def test_the_way_goes_through_its_stages(result, grasps_file):

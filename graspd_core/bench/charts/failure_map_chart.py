@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.bench.charts.chart_style import figure, save
-from graspd_core.bench.failure_maps.map_job import Place
+from graspd_core.bench.failure_maps.map_case import Place
 from graspd_core.bench.failure_maps.map_registry import Map
 
 Shares = Mapping[tuple[Place, Place], float]

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from graspd_core.bench.charts.chart_style import figure, save
-from graspd_core.bench.robustness import Row, orders
+from graspd_core.bench.studies.robust_ranking import orders
+from graspd_core.bench.study import Record
 from graspd_core.methods.method_registry import METHODS
 
 _SCORE, _NOISE, _BEST = (METHODS[name].colour for name in ("graspd2022", "closed_form", "random_closure"))
 
 
-def draw_robust(rows: Sequence[Row], path: Path) -> Path:
+def draw_robust(rows: Sequence[Record], path: Path) -> Path:
     """Share held by place on the left, CPU seconds by shape on the right. Returns the PNG's path."""
     with figure(8.0, 3.0, ncols=2) as (made, (gain, cost)):
         by_score, by_noise, best = (100.0 * order for order in orders(rows))

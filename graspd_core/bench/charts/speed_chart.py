@@ -11,10 +11,9 @@ import numpy as np
 
 from graspd_core.bench.charts.chart_style import FRONT, figure, place_labels, save
 from graspd_core.bench.charts.sweep_chart import draw_sweeps
-from graspd_core.bench.figures import Row, by_name, per_verified, rows, spread
-from graspd_core.bench.names import is_preset, is_sweep_value, parent_of, short_name
-from graspd_core.bench.pareto import pareto_front
-from graspd_core.bench.result_store import Record
+from graspd_core.bench.figures import Row, by_name, pareto_front, rows, spread
+from graspd_core.bench.names import FEW, is_preset, is_sweep_value, parent_of, short_name
+from graspd_core.bench.study import Record
 from graspd_core.methods.method_registry import METHODS
 
 
@@ -60,21 +59,17 @@ class Point:
 
 
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
-    """Draw what the records have figures for: PATH.png and .svg, PATH_verified, PATH_planned, PATH_ladder.
+    """Draw what the records have figures for: PATH.png and .svg, PATH_short, PATH_planned, PATH_ladder.
 
-    Returns the PNGs drawn, by "speed", "verified", "planned" and "ladder".
+    Returns the PNGs drawn, by "speed", "short", "planned" and "ladder".
     """
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]
     presets = by_name(row for row in found if is_preset(row.name))
+    few = {name: group for name, group in presets.items() if name in FEW}
     drawn = {
-        "speed": draw_speed(presets, path, "cpu_per_grasp", "CPU seconds per raw grasp (one thread, log scale)"),
-        "verified": draw_speed(
-            presets,
-            path.with_name(f"{path.name}_verified"),
-            "cpu_per_verified",
-            "CPU seconds per verified grasp, trials included (one thread, log scale)",
-        ),
+        "speed": draw_speed(presets, path),
+        "short": draw_speed(few, path.with_name(f"{path.name}_short")),
         "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned")),
         "ladder": draw_sweeps(swept, path.with_name(f"{path.name}_ladder")) if swept else None,
     }
@@ -98,15 +93,15 @@ def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
         return save(made, path)
 
 
-def draw_speed(presets: dict[str, list[Row]], path: Path, time: str, label: str) -> Path | None:
-    """A panel for every figure of accuracy, against time. None where there is nothing to draw."""
-    panels = [(panel, points) for panel in PANELS if (points := points_of(presets, time, panel))]
+def draw_speed(presets: dict[str, list[Row]], path: Path) -> Path | None:
+    """A panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw."""
+    panels = [(panel, points) for panel in PANELS if (points := points_of(presets, "cpu_per_grasp", panel))]
     if not panels:
         return None
     with figure(4.6 * len(panels), 4.4, ncols=len(panels), squeeze=False) as (made, axes):
         for axis, (panel, points) in zip(axes[0], panels, strict=True):
             _draw_panel(axis, points, panel)
-        made.supxlabel(label, fontsize=9)
+        made.supxlabel("CPU seconds per raw grasp (one thread, log scale)", fontsize=9)
         _legend(made, list(dict.fromkeys(row.method for group in presets.values() for row in group)))
         for axis, (_, points) in zip(axes[0], panels, strict=True):
             names, colours = [short_name(p.name) for p in points], [METHODS[p.method].colour for p in points]
@@ -119,12 +114,11 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)
-        middle = per_verified(group) if time == "cpu_per_verified" else x and x.median
-        if x and y and middle is not None:
+        if x and y:
             heights = (y.low, y.mean if panel.mean else y.median, y.high)
             low, mid, high = (max(height * panel.factor, _LEAST if panel.log else 0.0) for height in heights)
             held = any(row.held for row in group)
-            points.append(Point(name, group[0].method, (x.low, middle, x.high), (low, mid, high), held))
+            points.append(Point(name, group[0].method, (x.low, x.median, x.high), (low, mid, high), held))
     return points
 
 

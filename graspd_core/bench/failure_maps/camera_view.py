@@ -7,32 +7,25 @@ from functools import lru_cache
 
 import numpy as np
 
-from graspd_core.bench.failure_maps.map_job import Done, Job, plan, settings, try_grasps
-from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.surface_queries import make_surface, surface_distance
+from graspd_core.bench.failure_maps.map_case import MapCase, MapCell, plan, settings, try_grasps
 from graspd_core.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.scene.scene import ObjectModel, Scene, build_scene
 from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.trials.world import PROTOCOLS
-from graspd_core.types import TriangleMesh
 
 ELEVATIONS = (15.0, 30.0, 50.0, 80.0)
 NOISES = (0.0, 1.0, 2.0, 4.0)
 THINGS = ("mug",)
 _YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
-_SAMPLES = 4000
-# True surface nearer than this to the reconstruction counts as found [m].
-_FOUND = 0.005
 
 
-def run(job: Job) -> Done:
+def run(case: MapCase) -> tuple[MapCell, ...]:
     """Plan on the reconstruction of one view at that elevation [deg]; try on the true object in its place."""
-    (noise,) = job.up
-    truth, scene = _seen(job.thing, float(job.across), float(noise), job.seed, settings(job.preset).resolution)
-    hand, grasps = plan(job, scene)
-    cell = try_grasps(job, noise, hand, truth, grasps, PROTOCOLS["standard"])
-    return Done((cell,), _errors(truth.mesh, scene.object.mesh))
+    (noise,) = case.up
+    truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
+    hand, grasps = plan(case, scene)
+    return (try_grasps(case, noise, hand, truth, grasps, PROTOCOLS["standard"]),)
 
 
 def noise_at(times: float) -> DepthNoise:
@@ -59,10 +52,3 @@ def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int
     views = views_of(stage, CAMERA, poses, noise_at(noise), seed)
     scene = scene_from_views(views, resolution=resolution)
     return build_scene(stage.truth, source=thing, resolution=resolution).object, scene
-
-
-def _errors(truth: TriangleMesh, found: TriangleMesh) -> dict[str, float]:
-    """Share of the true surface that was found, and how far the reconstruction's strays from it, 90th percentile."""
-    missing = surface_distance(make_surface(found), surface_samples(truth, _SAMPLES, 0)[0])
-    stray = surface_distance(make_surface(truth), surface_samples(found, _SAMPLES, 0)[0])
-    return {"complete": float((missing < _FOUND).mean()), "stray_mm": 1e3 * float(np.quantile(stray, 0.9))}

@@ -1,15 +1,17 @@
-"""All maps: their axes, their objects, and the jobs that they are made of. `MAPS` is the registry."""
+"""All maps: their axes, their objects, and the cases that they are made of. `MAPS` is the registry."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from graspd_core.bench.failure_maps import camera_view as view
 from graspd_core.bench.failure_maps import friction_mass
 from graspd_core.bench.failure_maps import object_size as size
 from graspd_core.bench.failure_maps import wall_thickness as wall
-from graspd_core.bench.failure_maps.map_job import Job, Place, Run
+from graspd_core.bench.failure_maps.map_case import MapCase, Place, Run, run_on
+from graspd_core.bench.study import Record, Request
+from graspd_core.errors import ConfigError
 
 # Methods side by side, each by the preset that stands for it. The published settings hold nothing anywhere, and the
 # repaired ones take seven times as long as their short form.
@@ -34,7 +36,7 @@ class Map:
         title: what it shows.
         across, up: its axes.
         things: objects; a cell is of all of them, unless they are what an axis shows.
-        run: what is done for a job.
+        run: what is done for a case.
         together: whether one planning serves all cells of a column.
     """
 
@@ -84,13 +86,35 @@ MAPS: Mapping[str, Map] = {
 }
 
 
-def jobs_of(name: str, method: str, *, seed: int = 0) -> tuple[Job, ...]:
-    """All jobs of a map with one method; those on the same object lie next to each other."""
+def map_cases(request: Request) -> tuple[MapCase, ...]:
+    """The cases of the maps that are asked for. Raises ConfigError: there is no such map."""
+    if unknown := [name for name in request.cases if name not in MAPS]:
+        raise ConfigError(f"unknown map {unknown[0]!r}; valid: {', '.join(MAPS)}")
+    names = request.cases or (tuple(MAPS)[1:2] if request.quick else tuple(MAPS))
+    # Both methods on one object after the other: what is built of it is remembered.
+    pairs = (zip(*(cases_of(name, method) for method in METHODS), strict=True) for name in names)
+    return tuple(case for pair in pairs for cases in pair for case in cases)
+
+
+def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
+    """All cases of a map with one method; those on the same object lie next to each other."""
     drawn = MAPS[name]
     count = COUNT if drawn.rows else COUNT // len(drawn.things)
-    jobs = []
+    cases = []
     for thing in drawn.things:
         rows = (thing,) if drawn.rows else drawn.up.places
         for up in (rows,) if drawn.together else ((row,) for row in rows):
-            jobs += [Job(name, METHODS[method], thing, across, up, count, seed) for across in drawn.across.places]
-    return tuple(jobs)
+            cases += [MapCase(name, METHODS[method], thing, across, up, count, 0) for across in drawn.across.places]
+    return tuple(cases)
+
+
+def run_map(case: MapCase) -> Record:
+    """The figures of one case."""
+    cells = [asdict(cell) for cell in run_on(MAPS[case.map].run, case)]
+    return {"cells": cells, "held": max(cell["held"] for cell in cells)}
+
+
+def map_seconds(case: MapCase) -> float:
+    """CPU seconds of a case, roughly."""
+    each = {"balanced": 0.05, "graspd2022_short": 0.7}.get(case.preset, 1.0)
+    return 0.5 + case.count * (each + 0.05 * len(case.up))

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from graspd_core.bench.failure_maps.map_job import Done, Job, hand_for, plan, settings, try_grasps
+from graspd_core.bench.failure_maps.map_case import MapCase, MapCell, hand_for, plan, settings, try_grasps
 from graspd_core.hands.fingers import find_fingers
 from graspd_core.hands.kinematics import make_kinematics, points_in_base
 from graspd_core.hands.model import HandModel
@@ -21,16 +21,14 @@ THINGS = ("sphere", "box", "cylinder")
 _POSTURES = 4096
 
 
-def run(job: Job) -> Done:
+def run(case: MapCase) -> tuple[MapCell, ...]:
     """Plan and try on the shape scaled so that its least width is that share of the hand's span; 0.1 kg throughout."""
-    config = settings(job.preset)
-    width = float(job.across) * _span(config.problem.fine_candidates)
-    scale = width / least_width(make_shape(job.thing))
-    scene = load_scene(f"shape:{job.thing}", scale=scale, resolution=config.resolution)
-    hand, grasps = plan(job, scene)
-    cells = tuple(try_grasps(job, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in job.up)
-    links = [len(grasp.contacts) for grasp in grasps]
-    return Done(cells, {"width_mm": 1e3 * width, "links": float(np.mean(links)) if links else None})
+    config = settings(case.preset)
+    width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
+    scale = width / least_width(make_shape(case.thing))
+    scene = load_scene(f"shape:{case.thing}", scale=scale, resolution=config.resolution)
+    hand, grasps = plan(case, scene)
+    return tuple(try_grasps(case, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in case.up)
 
 
 def least_width(mesh: TriangleMesh) -> float:
@@ -57,5 +55,5 @@ def hand_span(hand: HandModel) -> float:
 
 
 @lru_cache(maxsize=4)
-def _span(candidates: int) -> float:
-    return hand_span(hand_for(candidates))
+def _span(hand: str, candidates: int) -> float:
+    return hand_span(hand_for(hand, candidates))

@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 from graspd_core.bench.measurements.measurement import Cell
-from graspd_core.bench.measurements.stopwatch import Stopwatch
+from graspd_core.bench.stopwatch import Stopwatch
 from graspd_core.hands.library import load_hand
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
@@ -38,7 +38,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
     A grasp-step is one step of one start: what the optimiser does most of.
     """
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
-    scene = load_scene(cell.source, resolution=cell.settings.resolution)
+    scene = load_scene(cell.object, resolution=cell.settings.resolution)
     runs: list[Stopwatch] = []
     for run in range(_RUNS + 1):
         stopwatch = Stopwatch()
@@ -61,7 +61,7 @@ def grasp_steps(cell: Cell) -> int | None:
 def run_start(cell: Cell) -> dict[str, Any]:
     """Seconds from the start of a process to its first verified grasp, with nothing remembered on disk."""
     environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", _FRESH, cell.source, cell.hand, str(cell.seed)]
+    command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
     began = time.perf_counter()
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     wall = time.perf_counter() - began

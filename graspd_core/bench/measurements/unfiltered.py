@@ -6,10 +6,9 @@ from typing import Any
 
 from graspd_core.bench.measurements.benchmark_trials import TRIALS, Tried
 from graspd_core.bench.measurements.measurement import Cell
-from graspd_core.bench.measurements.stopwatch import Stopwatch
+from graspd_core.bench.object_case import raw_grasps
+from graspd_core.bench.stopwatch import Stopwatch
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.scene.load_scene import load_scene
@@ -21,10 +20,9 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
-        scene = load_scene(cell.source, resolution=cell.settings.resolution)
+        scene = load_scene(cell.object, resolution=cell.settings.resolution)
     with stopwatch("optimise"):
-        found = find_candidates(scene, hand, count=cell.count, seed=cell.seed, config=cell.settings, hooks=Hooks())
-    grasps = found.grasps[: cell.count]
+        grasps = raw_grasps(scene, hand, cell.settings, cell.count, cell.seed)
     with stopwatch("parts"):
         tried = Tried(hand, scene.object, object_parts(scene.object))
     results: list[dict[str, Any]] = [{"score": grasp.score, "links": len(grasp.contacts)} for grasp in grasps]

@@ -32,7 +32,7 @@ def run_verified(cell: Cell) -> dict[str, Any]:
     hand = load_hand(cell.hand)
     began = _now()
     told = _First(began)
-    scene = load_scene(cell.source)
+    scene = load_scene(cell.object)
     result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=told)
     taken = {name: value - began[name] for name, value in _now().items()}
     return {

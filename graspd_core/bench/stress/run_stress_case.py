@@ -1,6 +1,4 @@
-"""One case in a process of its own: what it ended in, how long that took, how much memory, what the user saw.
-
-    python -m graspd_core.bench.stress.run_stress_case NAME [--preset balanced]     prints one JSON object
+"""One case: what it ended in, how long that took, how much memory, what the user saw.
 
 A grasp counts as verified only if it holds in a second trial too: from the file that a user would keep, with the
 object loaded anew and a world built anew.
@@ -8,10 +6,6 @@ object loaded anew and a world built anew.
 
 from __future__ import annotations
 
-import argparse
-import json
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -21,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from graspd_core.bench.stopwatch import peak_mb
 from graspd_core.bench.stress.stress_case import GRASP, Case
 from graspd_core.errors import GraspdError
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
@@ -98,7 +93,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
         except GraspdError as error:
             told = str(error).replace(f"{folder}/", "")
             loading = (loaded if loaded > began else time.perf_counter()) - began
-            return StressEnding(case.name, type(error).__name__, told, loading, memory=_peak())
+            return StressEnding(case.name, type(error).__name__, told, loading, memory=peak_mb())
         planned = time.perf_counter()
         verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
         return StressEnding(
@@ -107,7 +102,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             _told(result, folder),
             loaded - began,
             planned - loaded,
-            _peak(),
+            peak_mb(),
             len(result.grasps),
             len(verified),
             _hold_again(case, result, scene, hand, Path(folder), preset) if verified else 0,
@@ -173,25 +168,3 @@ def _finite(result: GraspResult) -> bool:
     good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
     postures = [(g.pregrasp, g.grasp, g.squeeze) for g in result.grasps]
     return bool(np.isfinite([*numbers(good), *numbers([asdict(p) for trio in postures for p in trio])]).all())
-
-
-def _peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def main() -> int:
-    import torch
-
-    from graspd_core.bench.stress.stress_cases import CASES
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("name", choices=sorted(CASES))
-    parser.add_argument("--preset", default="balanced")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    print(json.dumps(asdict(run_case(CASES[options.name], options.preset))))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

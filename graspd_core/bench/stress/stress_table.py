@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+from graspd_core.bench.report import markdown_table
 from graspd_core.bench.stress.run_stress_case import StressEnding, faults
 from graspd_core.bench.stress.stress_case import GRASP, Case
-from graspd_core.bench.tables import markdown_table
+from graspd_core.bench.stress.stress_cases import CASES, ending_of
+from graspd_core.bench.study import Record, Sections
 from graspd_core.types import Outcome
 
 # Longer messages end in dots [characters].
 _MESSAGE = 110
 _HEADINGS = ("case", "what is wrong", "ending", "load s", "plan s", "peak MB", "held/tried", "again", "true", "told")
+
+
+def stress_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """What held and every fault; and the table."""
+    endings = {CASES[record["name"]]: ending_of(record) for record in records}
+    return {"stress-summary": [summary(endings)], "stress": [stress_table(endings)]}
 
 
 def stress_table(endings: Mapping[Case, StressEnding]) -> str:

@@ -26,6 +26,7 @@ from graspd_core.hands.mano.mano_skin import Skin, close_wrist, closed_faces, ma
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
+from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
@@ -176,20 +177,10 @@ def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]
 
 def _hull(data: ManoData, name: str, link: int, points: Float[np.ndarray, "points 3"]) -> Primitive:
     """Convex hull of a body's vertices, in the body's frame."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError) as error:
-        raise HandError(f"{data.path}: weights: the vertices of {name} span no solid") from error
-    used, faces = np.unique(hull.simplices, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    corners = points[used][faces]
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # Qhull leaves the winding to chance; its equations point outwards.
-    inward = (outward * hull.equations[:, :3]).sum(-1) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return Primitive(link, "hull", np.eye(3), np.zeros(3), (), points[used], faces.astype(np.int64))
+    if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(0)) < 3:
+        raise HandError(f"{data.path}: weights: the vertices of {name} span no solid")
+    hull = limited_hull(points, len(points))
+    return Primitive(link, "hull", np.eye(3), np.zeros(3), (), hull.vertices, hull.faces)
 
 
 def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:

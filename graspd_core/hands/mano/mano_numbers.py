@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from graspd_core.hands.mano.mano_pickle import Array, Dtype, Encoded, Inert, Leaf, Select, Sparse, SparseRows
+from graspd_core.hands.mano.mano_pickle import Inert
 
 # The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
 _MAX_DENSE, _MAX_DEPTH = 2**22, 8
@@ -26,17 +27,18 @@ def numbers(value: Any, depth: int = 0) -> np.ndarray:
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
-    if isinstance(value, Array):
+    kind = value.kind if isinstance(value, Inert) else ""
+    if kind == "array":
         return _array(value)
-    if isinstance(value, Sparse):
+    if kind.startswith("sparse"):
         return _dense(value, depth + 1)
-    if isinstance(value, Leaf):
+    if kind == "leaf":
         return numbers(_entry(value, "x"), depth + 1)
-    if isinstance(value, Select):
+    if kind == "selection":
         return _selected(value, depth + 1)
     if _is_number(value) or (isinstance(value, (list, tuple)) and all(map(_is_number, value))):
         return np.asarray(value)
-    raise ValueError(f"holds {type(value).__name__} where numbers are expected")
+    raise ValueError(f"holds {kind or type(value).__name__} where numbers are expected")
 
 
 def _is_number(value: object) -> bool:
@@ -55,29 +57,26 @@ def _is_shape(value: object) -> bool:
     )
 
 
-def _array(value: Array) -> np.ndarray:
+def _array(value: Inert) -> np.ndarray:
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5:
         raise ValueError("holds an array without content")
     _, shape, dtype, fortran, raw = state
     kind = _dtype(dtype)
-    if isinstance(raw, Encoded) and raw.arguments[1:] in ((), ("latin1",), ("latin-1",)):
+    if isinstance(raw, Inert) and raw.kind == "encoded" and raw.arguments[1:] in ((), ("latin1",), ("latin-1",)):
         raw = raw.arguments[0] if raw.arguments else None
     raw = raw.encode("latin1") if isinstance(raw, str) else raw
     if not isinstance(raw, bytes) or not _is_shape(shape):
         raise ValueError("holds an array whose content is no block of numbers")
     flat = np.frombuffer(raw, dtype=kind)
-    # Checked in Python's integers, which cannot overflow.
-    count = 1
-    for n in shape:
-        count *= n
-    if count != len(flat):
+    # Of Python's integers, which cannot overflow.
+    if math.prod(shape) != len(flat):
         raise ValueError(f"holds {len(flat)} numbers for an array of shape {shape}")
     return flat.astype(kind.newbyteorder("=")).reshape(shape, order="F" if fortran else "C")
 
 
 def _dtype(value: Any) -> np.dtype:
-    code = value.arguments[0] if isinstance(value, Dtype) and value.arguments else None
+    code = value.arguments[0] if isinstance(value, Inert) and value.kind == "dtype" and value.arguments else None
     if not isinstance(code, str) or code not in _NUMERIC:
         raise ValueError(f"holds an array of {_shown(code)}, which is no type of numbers")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
@@ -86,7 +85,7 @@ def _dtype(value: Any) -> np.dtype:
     return np.dtype(("<" if order in ("|", "=") else order) + code)
 
 
-def _dense(value: Sparse, depth: int) -> np.ndarray:
+def _dense(value: Inert, depth: int) -> np.ndarray:
     data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
     if indices.dtype.kind not in "iu" or starts.dtype.kind not in "iu":
         raise ValueError("holds a sparse matrix whose indices are no integers")
@@ -97,7 +96,7 @@ def _dense(value: Sparse, depth: int) -> np.ndarray:
         raise ValueError("holds a sparse matrix of shape other than two numbers")
     if shape[0] * shape[1] > _MAX_DENSE:
         raise ValueError(f"holds a sparse matrix of shape {shape!r}, larger than any of MANO's")
-    major, minor = shape if isinstance(value, SparseRows) else shape[::-1]
+    major, minor = shape if value.kind == "sparse rows" else shape[::-1]
     consistent = len(starts) == major + 1 and starts[0] == 0 and starts[-1] == len(data) == len(indices)
     if (
         not consistent
@@ -107,10 +106,10 @@ def _dense(value: Sparse, depth: int) -> np.ndarray:
         raise ValueError("holds a sparse matrix that does not fit together")
     dense = np.zeros((major, minor))
     np.add.at(dense, (np.repeat(np.arange(major), np.diff(starts)), indices), data)
-    return dense if isinstance(value, SparseRows) else dense.T
+    return dense if value.kind == "sparse rows" else dense.T
 
 
-def _selected(value: Select, depth: int) -> np.ndarray:
+def _selected(value: Inert, depth: int) -> np.ndarray:
     source, index = (numbers(_entry(value, key), depth).ravel() for key in ("a", "idxs"))
     if index.dtype.kind not in "iu" or (len(index) and not 0 <= index.min() <= index.max() < len(source)):
         raise ValueError("holds a selection outside its array")
@@ -121,5 +120,5 @@ def _selected(value: Select, depth: int) -> np.ndarray:
 
 def _entry(value: Inert, key: str) -> Any:
     if not isinstance(value.state, dict) or key not in value.state:
-        raise ValueError(f"holds a {type(value).__name__} without {key!r}")
+        raise ValueError(f"holds a {value.kind} without {key!r}")
     return value.state[key]

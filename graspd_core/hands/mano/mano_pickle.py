@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import io
 import pickle
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,115 +32,80 @@ _REFUSED_OPCODES = (
 )  # fmt: skip
 
 
+@dataclass(eq=False)
 class Inert:
-    """An object of the file that is only kept: the arguments and the state that the file gives it.
+    """An object of the file that is only kept.
 
     Attributes:
-        arguments: what it was called with.
+        kind: what it stands for, of those in `ADMITTED`.
+        arguments: what it was made with.
         state: what it was told to become, None where nothing.
     """
 
-    arguments: tuple[Any, ...]
-    state: Any
-
-    def __new__(cls, *arguments: Any) -> Any:
-        """Take anything."""
-        made = super().__new__(cls)
-        made.arguments = arguments
-        made.state = None
-        return made
+    kind: str
+    arguments: tuple[Any, ...] = ()
+    state: Any = None
 
     def __setstate__(self, state: Any) -> None:
-        """Keep anything."""
         self.state = state
 
 
-class Dtype(Inert):
-    """`numpy.dtype`: called with a code such as "f8"; its state's second entry is the byte order."""
-
-
-class Array(Inert):
-    """`numpy.ndarray`; its state is version, shape, dtype, whether in Fortran's order, and the raw bytes."""
-
-
-class Scalar(Inert):
-    """A numpy number: called with a dtype and the raw bytes."""
-
-
-class Sparse(Inert):
-    """A compressed scipy.sparse matrix; its state holds `data`, `indices`, `indptr` and the shape."""
-
-
-class SparseRows(Sparse):
-    """`csr_matrix`."""
-
-
-class Leaf(Inert):
-    """`chumpy.ch.Ch`: its value is `x`."""
-
-
-class Select(Inert):
-    """`chumpy.reordering.Select`: `a` flattened, taken at `idxs`, in `preferred_shape`."""
-
-
-class Encoded(Inert):
-    """`_codecs.encode`, by which Python 3 writes bytes into old protocols: called with text and "latin1"."""
-
-
-class Ignored(Inert):
-    """Something that carries no number."""
-
-
-def _rebuild(made: object, *_: object) -> object:
-    """`copy_reg._reconstructor`, by which protocol 0 makes objects."""
-    if not (isinstance(made, type) and issubclass(made, Inert)):
-        raise pickle.UnpicklingError("an object of no known class")
-    return made()
-
-
-def _empty_array(*_: object) -> Array:
-    """`numpy.core.multiarray._reconstruct`, which makes an empty array for the state to fill."""
-    return Array()
-
-
 @dataclass(frozen=True)
-class _Function:
-    """A function that a file may call, and can do nothing else with."""
+class Maker:
+    """What stands for a class or function that a file names: it makes an `Inert`, and can do nothing else."""
 
-    name: str
-    call: Any = field(repr=False)
+    kind: str
 
-    def __call__(self, *arguments: Any) -> Any:
-        return self.call(*arguments)
+    def __call__(self, *arguments: Any) -> Inert:
+        # `copy_reg._reconstructor`, by which protocol 0 makes an object of the class that it is given.
+        if self.kind == "rebuilt":
+            if not arguments or not isinstance(arguments[0], Maker):
+                raise pickle.UnpicklingError("an object of no known class")
+            return arguments[0]()
+        return Inert(self.kind, arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError(f"{self.name} has no state")
+        raise pickle.UnpicklingError(f"{self.kind} has no state")
 
 
-_SPARSE = ("scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse.csr", "scipy.sparse._csr")
-# Everything that a file may name. Python 2 and 3, and old and new numpy and scipy, have different names for the same.
-ADMITTED: dict[tuple[str, str], Any] = {
-    **{
-        (f"numpy.{core}.multiarray", name): made
-        for core in ("core", "_core")
-        for name, made in (("_reconstruct", _Function("_reconstruct", _empty_array)), ("scalar", Scalar))
-    },
-    ("numpy", "ndarray"): Array,
-    ("numpy", "dtype"): Dtype,
-    **{(module, "csc_matrix"): Sparse for module in _SPARSE[:2]},
-    **{(module, "csr_matrix"): SparseRows for module in _SPARSE[2:]},
-    ("chumpy.ch", "Ch"): Leaf,
-    ("chumpy", "Ch"): Leaf,
-    ("chumpy.reordering", "Select"): Select,
-    **{(module, "_reconstructor"): _Function("_reconstructor", _rebuild) for module in ("copy_reg", "copyreg")},
-    ("_codecs", "encode"): Encoded,
-    **{(module, name): Ignored for module in ("__builtin__", "builtins") for name in ("object", "set", "frozenset")},
+# Everything that a file may name, and what it stands for. An array's state is version, shape, type, whether it is in
+# Fortran's order, and the raw bytes; a sparse matrix's holds data, indices, indptr and the shape. A leaf of chumpy's
+# has the value `x`; a selection is `a` flattened, taken at `idxs`, in `preferred_shape`. As "encoded" text Python 3
+# writes bytes into old protocols. Python 2 and 3, old and new numpy and scipy have different names for the same.
+ADMITTED = {
+    (module, name): Maker(kind)
+    for kind, modules, names in (
+        ("array", ("numpy.core.multiarray", "numpy._core.multiarray"), ("_reconstruct",)),
+        ("array", ("numpy",), ("ndarray",)),
+        ("dtype", ("numpy",), ("dtype",)),
+        ("scalar", ("numpy.core.multiarray", "numpy._core.multiarray"), ("scalar",)),
+        ("sparse columns", ("scipy.sparse.csc", "scipy.sparse._csc"), ("csc_matrix",)),
+        ("sparse rows", ("scipy.sparse.csr", "scipy.sparse._csr"), ("csr_matrix",)),
+        ("leaf", ("chumpy.ch", "chumpy"), ("Ch",)),
+        ("selection", ("chumpy.reordering",), ("Select",)),
+        ("rebuilt", ("copy_reg", "copyreg"), ("_reconstructor",)),
+        ("encoded", ("_codecs",), ("encode",)),
+        ("object", ("__builtin__", "builtins"), ("object", "set", "frozenset")),
+    )
+    for module in modules
+    for name in names
 }
 
 
 def _is_plain(key: object) -> bool:
     """Whether a dictionary may have this key: hashed in a step, and no collisions by choice."""
     return isinstance(key, (str, bytes)) or (isinstance(key, int) and 0 <= key < 2**32)
+
+
+def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
+    """The base class's act, after a look at the keys, which lie in its stack at `keys`."""
+
+    def act(reader: Any) -> None:
+        if not all(map(_is_plain, reader.stack[keys])):
+            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
+        getattr(pickle._Unpickler, name)(reader)
+
+    return act
 
 
 class _Reader(pickle._Unpickler):
@@ -157,29 +123,12 @@ class _Reader(pickle._Unpickler):
             raise pickle.UnpicklingError(f"a call with other than at most {_MOST_ARGUMENTS} arguments")
         self.stack[-1] = self.stack[-1](*arguments)
 
-    def _check_key(self) -> None:
-        if not _is_plain(self.stack[-2]):
-            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
-        pickle._Unpickler.load_setitem(self)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _check_keys(self) -> None:
-        if not all(map(_is_plain, self.stack[::2])):
-            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
-
-    def _set_items(self) -> None:
-        self._check_keys()
-        pickle._Unpickler.load_setitems(self)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _dictionary(self) -> None:
-        self._check_keys()
-        pickle._Unpickler.load_dict(self)  # pyright: ignore[reportAttributeAccessIssue]
-
     def _put(self) -> None:
         """PUT: the one opcode that names a place in the memo by a number of any length."""
-        place_points = int(self.readline()[:-1])
-        if not _is_plain(place_points):
+        place = int(self.readline()[:-1])
+        if not _is_plain(place):
             raise pickle.UnpicklingError("a place in the memo that no file needs")
-        self.memo[place_points] = self.stack[-1]
+        self.memo[place] = self.stack[-1]
 
     dispatch: ClassVar[dict[int, Any]] = {
         code: act for code, act in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
@@ -187,9 +136,9 @@ class _Reader(pickle._Unpickler):
     dispatch |= {
         pickle.REDUCE[0]: _call,
         pickle.NEWOBJ[0]: _call,
-        pickle.SETITEM[0]: _check_key,
-        pickle.SETITEMS[0]: _set_items,
-        pickle.DICT[0]: _dictionary,
+        pickle.SETITEM[0]: _with_plain_keys("load_setitem", slice(-2, None, 2)),
+        pickle.SETITEMS[0]: _with_plain_keys("load_setitems", slice(0, None, 2)),
+        pickle.DICT[0]: _with_plain_keys("load_dict", slice(0, None, 2)),
         pickle.PUT[0]: _put,
         # Sets carry no numbers: kept as lists, nothing in them is hashed.
         pickle.EMPTY_SET[0]: dispatch[pickle.EMPTY_LIST[0]],

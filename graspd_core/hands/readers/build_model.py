@@ -14,15 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import HandError
-from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
-from graspd_core.hands.readers.joint_limits import (
-    finite_limits,
-    refuse_long_slides,
-    welded_groups,
-    with_still_joints_welded,
-)
-from graspd_core.hands.readers.mimic import Coupling, narrowed
+from graspd_core.errors import HandError, shown
+from graspd_core.hands.model import HandModel, Mimic, Primitive
+from graspd_core.hands.readers.joint_limits import Coupling, JointSpec, settled
 
 # More than this is no hand, and would take minutes to check against itself.
 _MOST_LINKS, _MOST_SOLIDS, _LONGEST_CHAIN = 300, 2000, 100
@@ -37,34 +31,6 @@ class LinkSpec:
     com: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     inertia: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     primitives: tuple[Primitive, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class JointSpec:
-    """One joint as a file gives it: where its child sits in the parent, and how it moves; infinite where unset.
-
-    Attributes:
-        name: unique among joints.
-        parent, child: link names.
-        kind: how it moves.
-        rotation, translation: `T_parent_child` at joint value zero [m].
-        axis: unit, in the child's frame; zero where fixed.
-        lower, upper: limits [rad] or [m].
-        effort: greatest torque [N·m] or force [N].
-        velocity: greatest speed [rad/s] or [m/s].
-    """
-
-    name: str
-    parent: str
-    child: str
-    kind: JointKind
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    lower: float = -np.inf
-    upper: float = np.inf
-    effort: float = np.inf
-    velocity: float = np.inf
 
 
 def refuse_crowds(path: Path, links: int, joints: int, solids: int) -> None:
@@ -99,21 +65,20 @@ def assemble(
     """
     order = _depth_first(path, links, joints)
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
-    moving = [into[link] for link in order[1:] if into[link].kind != "fixed"]
-    specs, tree = [by_name[link] for link in order], _linked(order, into, moving, couplings)
-    limits, mended = _limits(path, moving, tree["mimics"], tree["joint_kind"])
-    middle = 0.5 * (limits["lower"] + limits["upper"])
-    hand = HandModel(
+    specs = [by_name[link] for link in order]
+    chain, couplings, mended = settled(path, [into[link] for link in order[1:]], couplings)
+    joint_fields = _actuated([joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings])
+    if not joint_fields["joint_names"]:
+        raise HandError(f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp")
+    return HandModel(
         name=name,
         urdf=str(path),
         link_names=tuple(order),
-        **limits,
-        open_posture=middle,
-        closed_posture=middle,
+        **joint_fields,
         palm_center=np.zeros(3),
         palm_normal=np.array([1.0, 0.0, 0.0]),
         approach=np.array([1.0, 0.0, 0.0]),
-        **tree,
+        **_linked(order, chain, couplings),
         link_mass=np.array([spec.mass for spec in specs]),
         link_com=np.stack([spec.com for spec in specs]),
         link_inertia=np.stack([spec.inertia for spec in specs]),
@@ -124,71 +89,43 @@ def assemble(
         candidate_link=np.zeros(0, dtype=np.int64),
         warnings=(*warnings, *mended),
     )
-    hand = with_still_joints_welded(hand)
-    if not hand.joint_names:
-        raise HandError(f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp")
-    return hand
 
 
-def _linked(
-    order: Sequence[str],
-    into: Mapping[str, JointSpec],
-    moving: Sequence[JointSpec],
-    couplings: Mapping[str, Coupling],
-) -> dict[str, Any]:
-    """The fields of a hand that say how its links hang from each other; `into` is each link's own joint."""
+def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
+    """The fields of a hand that have an entry for each actuated joint."""
+    keys = ("lower", "upper", "effort", "velocity")
+    limits = {key: np.array([getattr(joint, key) for joint in joints], dtype=float) for key in keys}
+    middle = 0.5 * (limits["lower"] + limits["upper"])
+    names = tuple(joint.name for joint in joints)
+    return {"joint_names": names, **limits, "open_posture": middle, "closed_posture": middle}
+
+
+def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
+    """The fields of a hand that say how its links hang from each other; `chain` are the joints of all but the first."""
     index = {link: i for i, link in enumerate(order)}
-    actuated = [joint.name for joint in moving if joint.name not in couplings]
+    actuated = [joint.name for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     number = {joint: i for i, joint in enumerate(actuated)}
-    count = len(order)
-    parent, link_joint = np.full(count, -1), np.full(count, -1)
-    rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
-    axes = np.zeros((count, 3))
-    kinds: list[JointKind] = ["fixed"] * count
+    link_joint, group = np.full(len(order), -1), np.arange(len(order))
     mimics: list[Mimic] = []
-    for link in range(1, count):
-        joint = into[order[link]]
-        parent[link], kinds[link] = index[joint.parent], joint.kind
-        rotations[link], translations[link] = joint.rotation, joint.translation
+    for link, joint in enumerate(chain, start=1):
         if joint.kind == "fixed":
+            # Links welded to each other have the number of the first of them.
+            group[link] = group[index[joint.parent]]
             continue
-        axes[link] = joint.axis
-        coupling = couplings.get(joint.name)
-        link_joint[link] = number[joint.name if coupling is None else coupling.leader]
-        if coupling is not None:
-            mimics.append(Mimic(joint.name, link, int(link_joint[link]), coupling.multiplier, coupling.offset))
+        leader, multiplier, offset = couplings.get(joint.name, Coupling(joint.name, 1.0, 0.0))
+        link_joint[link] = number[leader]
+        if joint.name in couplings:
+            mimics.append(Mimic(joint.name, link, number[leader], multiplier, offset))
     return {
-        "joint_names": tuple(actuated),
-        "link_parent": parent,
+        "link_parent": np.array([-1, *(index[joint.parent] for joint in chain)]),
         "link_joint": link_joint,
-        "link_offset_rotation": rotations,
-        "link_offset_translation": translations,
-        "joint_axis": axes,
-        "joint_kind": tuple(kinds),
-        "link_group": welded_groups(parent, link_joint),
+        "link_offset_rotation": np.stack([np.eye(3), *(joint.rotation for joint in chain)]),
+        "link_offset_translation": np.stack([np.zeros(3), *(joint.translation for joint in chain)]),
+        "joint_axis": np.stack([np.zeros(3), *(joint.axis for joint in chain)]),
+        "joint_kind": ("fixed", *(joint.kind for joint in chain)),
+        "link_group": group,
         "mimics": tuple(mimics),
     }
-
-
-def _limits(
-    path: Path, moving: Sequence[JointSpec], mimics: Sequence[Mimic], kinds: Sequence[JointKind]
-) -> tuple[dict[str, Float[np.ndarray, "joints"]], tuple[str, ...]]:
-    """The actuated joints' limits, by the names of a hand's fields, and what was done to them.
-
-    `moving` are all movable joints, `kinds` those of every link's joint.
-    """
-    followers = {mimic.name for mimic in mimics}
-    actuated = [joint for joint in moving if joint.name not in followers]
-    coupled = {joint.name: (joint.lower, joint.upper, joint.velocity) for joint in moving if joint.name in followers}
-    lower, upper, effort, velocity = (
-        np.array([getattr(joint, key) for joint in actuated], dtype=float)
-        for key in ("lower", "upper", "effort", "velocity")
-    )
-    lower, upper, velocity, given_up = narrowed(lower, upper, velocity, mimics, coupled)
-    names = [joint.name for joint in actuated]
-    lower, upper, made_finite = finite_limits(path, names, [joint.kind for joint in actuated], lower, upper)
-    refuse_long_slides(path, mimics, kinds, lower, upper)
-    return {"lower": lower, "upper": upper, "effort": effort, "velocity": velocity}, (*given_up, *made_finite)
 
 
 def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSpec]) -> list[str]:
@@ -203,7 +140,7 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
         for end, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in names:
                 raise HandError(
-                    f"{path}: joint {joint.name!r} has the {end} link {link!r}, which the file does not define"
+                    f"{path}: joint {joint.name!r} has the {end} link {shown(link)}, which the file does not define"
                 )
         if joint.child in above:
             raise HandError(f"{path}: link {joint.child!r} is the child of two joints; a hand is a tree")

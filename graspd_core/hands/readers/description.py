@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,90 @@ from graspd_core.errors import HandError, shown
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
-from graspd_core.hands.readers.mount import is_number, read_mount
 
 _KEYS = ("name", "urdf", "palm", "approach", "effort", "open", "closed", "mount")
-_REQUIRED = ("urdf",)
-_PALM_KEYS = ("link", "center", "normal")
+_PALM_KEYS, _MOUNT_KEYS = ("link", "center", "normal"), ("parent", "position", "quaternion_wxyz")
+# No length, angle or torque of a hand is larger, in any unit.
+_LARGEST = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A file, and in which line of it each key is, `palm.center` for a nested one; the values of keys, checked."""
+
+    path: Path
+    lines: Mapping[str, int]
+
+    def error(self, key: str, message: str) -> HandError:
+        """The error to raise about a key: names file, line and key."""
+        line = self.lines.get(key, self.lines.get(key.partition(".")[0], 1))
+        return HandError(f"{self.path}:{line}: {key}: {message}")
+
+    def mapping(self, key: str, value: Any) -> dict[str, Any]:
+        """A mapping; some hands' joints have bare numbers for names."""
+        if not isinstance(value, dict):
+            raise self.error(key, f"expected a mapping of keys to values, got {shown(value)}")
+        return {name if isinstance(name, str) else shown(name): entry for name, entry in value.items()}
+
+    def section(self, key: str, value: Any, known: tuple[str, ...], required: tuple[str, ...]) -> dict[str, Any]:
+        """A mapping of some of the known keys to values; the whole file has no key."""
+        data, prefix = self.mapping(key or "the file", value), f"{key}." if key else ""
+        for name in data:
+            if name not in known:
+                line = self.lines.get(f"{prefix}{name}", 1)
+                raise HandError(f"{self.path}:{line}: unknown key {name!r}; known: {', '.join(known)}")
+        for name in required:
+            if name not in data:
+                raise HandError(f"{self.path}:{self.lines.get(key, 1)}: {prefix}{name} is missing")
+        return data
+
+    def text(self, key: str, value: Any) -> str:
+        """Some text."""
+        if not isinstance(value, str):
+            raise self.error(key, f"expected text, got {shown(value)}")
+        return value
+
+    def numbers(self, key: str, value: Any, count: int) -> Float[np.ndarray, "count"]:
+        """A list of so many numbers."""
+        if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
+            raise self.error(key, f"expected {count} numbers, got {shown(value)}")
+        return np.array(value, dtype=np.float64)
+
+    def direction(self, key: str, value: Any) -> Float[np.ndarray, "3"]:
+        """Three numbers as a unit vector."""
+        vector = self.numbers(key, value, 3)
+        length = float(np.linalg.norm(vector))
+        if length < 1e-9:
+            raise self.error(key, "a direction cannot be zero")
+        return vector / length
+
+    def by_joint(self, key: str, value: Any) -> dict[str, float]:
+        """Numbers by joint name."""
+        values = self.mapping(key, value)
+        for joint, number in values.items():
+            if not _is_number(number):
+                raise self.error(f"{key}.{joint}", f"expected a number, got {shown(number)}")
+        return {joint: float(number) for joint, number in values.items()}
+
+    def effort(self, value: Any) -> float | dict[str, float]:
+        """One greatest torque for all joints, or some by name."""
+        efforts = self.by_joint("effort", value) if isinstance(value, dict) else value
+        values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
+        if not all(_is_number(number) and number > 0 for number in values):
+            raise self.error("effort", f"expected positive numbers, got {shown(value)}")
+        return efforts if isinstance(efforts, dict) else float(efforts)
+
+    def mount(self, value: Any) -> Mount:
+        """The `mount` entry: the arm's link, and the pose of the base link in it, zero unless given."""
+        given = self.section("mount", value, _MOUNT_KEYS, ("parent",))
+        parent = self.text("mount.parent", given["parent"])
+        x, y, z = self.numbers("mount.position", given.get("position", [0, 0, 0]), 3).tolist()
+        quaternion = self.numbers("mount.quaternion_wxyz", given.get("quaternion_wxyz", [1, 0, 0, 0]), 4)
+        length = float(np.linalg.norm(quaternion))
+        if abs(length - 1.0) > 1e-2:
+            raise self.error("mount.quaternion_wxyz", f"a unit quaternion, w first, has length 1, not {length:.3g}")
+        w, i, j, k = (quaternion / length).tolist()
+        return Mount(parent, (x, y, z), (w, i, j, k))
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,20 +107,19 @@ class HandDescription:
     """A checked YAML file.
 
     Attributes:
-        path: the file.
+        source: the file, and in which line of it each key is.
         name: the hand's name, the file's stem unless given.
         urdf: path of the URDF or MJCF file.
         palm_link: the link that palm_center and palm_normal are given in; None for the base link.
         palm_center: the point of the palm that grasps centre on [m]; None where the palm is to be guessed.
         palm_normal: direction out of the palm, unit; None likewise.
         approach: direction of approach in the base frame, unit; None for the palm's normal.
-        effort: one greatest torque for all joints, some by name, or None for the URDF's [N·m].
+        effort: one greatest torque for all joints, or some by name, or None for the URDF's [N·m].
         open, closed: joint values by joint name [rad] or [m]; None where they are to be guessed.
-        lines: line of each key in the file, `palm.center` for a nested one.
         mount: where the base link sits on an arm; None where the file does not say.
     """
 
-    path: Path
+    source: Source
     name: str
     urdf: Path
     palm_link: str | None
@@ -52,12 +129,12 @@ class HandDescription:
     effort: float | dict[str, float] | None
     open: dict[str, float] | None
     closed: dict[str, float] | None
-    lines: dict[str, int]
     mount: Mount | None = None
 
-    def error(self, key: str, message: str) -> HandError:
-        """The error to raise about a key: names file, line and key."""
-        return HandError(f"{self.path}:{self.lines.get(key, 1)}: {key}: {message}")
+
+def _is_number(value: object) -> bool:
+    """Whether a value of YAML is a number that a hand can have."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST <= value <= _LARGEST
 
 
 def read_description(path: Path) -> HandDescription:
@@ -67,73 +144,34 @@ def read_description(path: Path) -> HandDescription:
         HandError: not YAML, an unknown or missing key, or a value of the wrong type; names file, line and key.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        node, data = parse_yaml(text)
+        node, data = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise HandError(f"{path}: cannot be read: {error.strerror or error}") from error
     except YamlError as error:
         raise HandError(f"{path}:{error.line}: not well-formed YAML: {error.problem}") from error
     except UnicodeDecodeError as error:
         raise HandError(f"{path}:1: not well-formed YAML: {type(error).__name__}") from error
-    # Keys that YAML reads as something else than what is written, or that it merges, are looked for in vain.
-    lines: dict[str, int] = defaultdict(lambda: 1, _key_lines(node))
-    root = _mapping(path, 1, "the file", data)
-    _check_keys(path, lines, root, "", _KEYS, _REQUIRED)
-    palm = _mapping(path, lines["palm"], "palm", root["palm"]) if "palm" in root else {}
-    _check_keys(path, lines, palm, "palm.", _PALM_KEYS, ("center", "normal") if "palm" in root else ())
+    source = Source(path, _key_lines(node))
+    root = source.section("", data, _KEYS, ("urdf",))
+    palm = source.section("palm", root["palm"], _PALM_KEYS, _PALM_KEYS[1:]) if "palm" in root else {}
 
-    for key, value in (("name", root.get("name", "")), ("urdf", root["urdf"]), ("palm.link", palm.get("link", ""))):
-        if not isinstance(value, str):
-            raise HandError(f"{path}:{lines[key]}: {key}: expected text, got {shown(value)}")
+    def checked(key: str, check: Callable[[str, Any], Any], values: dict[str, Any] = root) -> Any:
+        return check(key, values[key.rpartition(".")[2]]) if key.rpartition(".")[2] in values else None
+
     # In this order, which decides what is told of a file with several mistakes.
-    effort = _effort(path, lines, root["effort"]) if root.get("effort") is not None else None
     return HandDescription(
-        path=path,
-        name=root.get("name", path.stem),
-        urdf=path.parent / root["urdf"],
-        palm_link=palm.get("link"),
-        palm_center=_vector(path, lines, "palm.center", palm["center"]) if palm else None,
-        palm_normal=_direction(path, lines, "palm.normal", palm["normal"]) if palm else None,
-        approach=_direction(path, lines, "approach", root["approach"]) if "approach" in root else None,
-        effort=effort,
-        open=_numbers(path, lines, "open", root["open"]) if "open" in root else None,
-        closed=_numbers(path, lines, "closed", root["closed"]) if "closed" in root else None,
-        lines=lines,
-        mount=read_mount(path, lines, root["mount"]) if "mount" in root else None,
+        source=source,
+        name=checked("name", source.text) or path.stem,
+        urdf=path.parent / source.text("urdf", root["urdf"]),
+        palm_link=checked("palm.link", source.text, palm),
+        effort=source.effort(root["effort"]) if root.get("effort") is not None else None,
+        palm_center=checked("palm.center", lambda key, value: source.numbers(key, value, 3), palm),
+        palm_normal=checked("palm.normal", source.direction, palm),
+        approach=checked("approach", source.direction),
+        open=checked("open", source.by_joint),
+        closed=checked("closed", source.by_joint),
+        mount=source.mount(root["mount"]) if "mount" in root else None,
     )
-
-
-def _vector(path: Path, lines: Mapping[str, int], key: str, value: Any) -> Float[np.ndarray, "3"]:
-    if not isinstance(value, list) or len(value) != 3 or not all(is_number(x) for x in value):
-        raise HandError(f"{path}:{lines[key]}: {key}: expected three numbers, got {shown(value)}")
-    return np.array(value, dtype=np.float64)
-
-
-def _direction(path: Path, lines: Mapping[str, int], key: str, value: Any) -> Float[np.ndarray, "3"]:
-    vector = _vector(path, lines, key, value)
-    length = float(np.linalg.norm(vector))
-    if length < 1e-9:
-        raise HandError(f"{path}:{lines[key]}: {key}: a direction cannot be zero")
-    return vector / length
-
-
-def _numbers(path: Path, lines: Mapping[str, int], key: str, value: Any) -> dict[str, float]:
-    """Numbers by joint name."""
-    values = _mapping(path, lines[key], key, value)
-    for joint, number in values.items():
-        if not is_number(number):
-            line = lines[f"{key}.{joint}"]
-            raise HandError(f"{path}:{line}: {key}.{joint}: expected a number, got {shown(number)}")
-    return {joint: float(number) for joint, number in values.items()}
-
-
-def _effort(path: Path, lines: Mapping[str, int], value: Any) -> float | dict[str, float]:
-    """One greatest torque for all joints, or some by name."""
-    efforts = _numbers(path, lines, "effort", value) if isinstance(value, dict) else value
-    values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
-    if not all(is_number(number) and number > 0 for number in values):
-        raise HandError(f"{path}:{lines['effort']}: effort: expected positive numbers, got {shown(value)}")
-    return efforts if isinstance(efforts, dict) else float(efforts)
 
 
 def apply_description(hand: HandModel, description: HandDescription) -> HandModel:
@@ -159,7 +197,9 @@ def _with_palm(hand: HandModel, description: HandDescription) -> HandModel:
     link = description.palm_link or hand.base_link
     fixed = [name for name, group in zip(hand.link_names, hand.link_group, strict=True) if group == 0]
     if link not in fixed:
-        raise description.error("palm.link", f"{link!r} is not fixed to the base; choose from {', '.join(fixed)}")
+        raise description.source.error(
+            "palm.link", f"{link!r} is not fixed to the base; choose from {', '.join(fixed)}"
+        )
     rotations, translations = link_poses(hand, hand.open_posture)
     number = hand.link_index[link]
     normal = rotations[number] @ normal
@@ -177,10 +217,12 @@ def _posture(
     _check_joints(hand, description, key, values)
     missing = [name for name in hand.joint_names if name not in values]
     if missing:
-        raise description.error(key, f"no value for {', '.join(missing)}")
+        raise description.source.error(key, f"no value for {', '.join(missing)}")
     for name, lower, upper in zip(hand.joint_names, hand.lower, hand.upper, strict=True):
         if not lower <= values[name] <= upper:
-            raise description.error(f"{key}.{name}", f"{values[name]:g} is outside the limits [{lower:g}, {upper:g}]")
+            raise description.source.error(
+                f"{key}.{name}", f"{values[name]:g} is outside the limits [{lower:g}, {upper:g}]"
+            )
     return np.array([values[name] for name in hand.joint_names])
 
 
@@ -197,7 +239,7 @@ def _efforts(hand: HandModel, description: HandDescription) -> Float[np.ndarray,
 def _check_joints(hand: HandModel, description: HandDescription, key: str, values: Mapping[str, float]) -> None:
     for name in values:
         if name not in hand.joint_names:
-            raise description.error(f"{key}.{name}", f"no such joint; joints: {', '.join(hand.joint_names)}")
+            raise description.source.error(f"{key}.{name}", f"no such joint; joints: {', '.join(hand.joint_names)}")
 
 
 def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
@@ -210,26 +252,3 @@ def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
             # No deeper: by its aliases a mapping may hold itself.
             lines |= {} if prefix else _key_lines(value, f"{name}.")
     return lines
-
-
-def _mapping(path: Path, line: int, what: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise HandError(f"{path}:{line}: {what}: expected a mapping of keys to values, got {shown(value)}")
-    # Some hands' joints have bare numbers for names.
-    return {key if isinstance(key, str) else shown(key): entry for key, entry in value.items()}
-
-
-def _check_keys(
-    path: Path,
-    lines: dict[str, int],
-    data: dict[str, Any],
-    prefix: str,
-    known: tuple[str, ...],
-    required: tuple[str, ...],
-) -> None:
-    for key in data:
-        if key not in known:
-            raise HandError(f"{path}:{lines.get(f'{prefix}{key}', 1)}: unknown key {key!r}; known: {', '.join(known)}")
-    for key in required:
-        if key not in data:
-            raise HandError(f"{path}:{lines.get(prefix.rstrip('.'), 1)}: {prefix}{key} is missing")

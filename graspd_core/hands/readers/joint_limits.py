@@ -1,16 +1,17 @@
-"""Limits of joints that mean something, and joints without room to move, welded where they are."""
+"""Limits of joints that mean something: those of coupled joints kept too, none without end, and none without room."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from graspd_core.errors import HandError
-from graspd_core.hands.model import HandModel, JointKind, Mimic
+from graspd_core.hands.model import JointKind
 from graspd_core.se3 import axis_rotation
 
 # A joint that moves less than this is welded [rad] or [m].
@@ -19,90 +20,120 @@ _STILL = 1e-6
 _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 
-def finite_limits(
-    path: Path,
-    names: Sequence[str],
-    kinds: Sequence[JointKind],
-    lower: Float[np.ndarray, "joints"],
-    upper: Float[np.ndarray, "joints"],
-) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"], tuple[str, ...]]:
-    """Limits [rad] or [m] with joints that turn without end kept within ±π, and a warning for each of them.
+class Coupling(NamedTuple):
+    """A coupled joint's value is `multiplier` times that of joint `leader` plus `offset` [rad] or [m]."""
+
+    leader: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class JointSpec:
+    """One joint as a file gives it: where its child sits in the parent, and how it moves; infinite where unset.
+
+    Attributes:
+        name: unique among joints.
+        parent, child: link names.
+        kind: how it moves.
+        rotation, translation: `T_parent_child` at joint value zero [m].
+        axis: unit, in the child's frame; zero where fixed.
+        lower, upper: limits [rad] or [m].
+        effort: greatest torque [N·m] or force [N].
+        velocity: greatest speed [rad/s] or [m/s].
+    """
+
+    name: str
+    parent: str
+    child: str
+    kind: JointKind
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    lower: float = -np.inf
+    upper: float = np.inf
+    effort: float = np.inf
+    velocity: float = np.inf
+
+
+def settled(
+    path: Path, joints: Sequence[JointSpec], couplings: Mapping[str, Coupling]
+) -> tuple[list[JointSpec], dict[str, Coupling], tuple[str, ...]]:
+    """The joints with limits that can be moved within, the couplings that are left, and a warning for what was done.
+
+    Actuated joints are kept within what their followers allow, those that turn without end within one turn; what
+    cannot move is welded where it is, with its followers.
 
     Raises:
         HandError: a joint slides farther than anything in a hand does.
     """
-    lower, upper, warnings = lower.copy(), upper.copy(), []
-    # Limits in use go up to the largest float.
-    with np.errstate(over="ignore"):
-        ranges = upper - lower
-    for i, (name, kind) in enumerate(zip(names, kinds, strict=True)):
-        if kind == "prismatic" and not ranges[i] <= _LONGEST_SLIDE:
-            raise _too_long(path, name, float(ranges[i]))
-        if kind == "revolute" and not ranges[i] <= _WIDEST:
-            # One turn: the one from -π to π, moved no farther than the limits ask for.
-            lower[i] = min(max(-np.pi, lower[i]), upper[i] - 2 * np.pi)
-            upper[i] = lower[i] + 2 * np.pi
-            warnings.append(f"joint {name!r} turns without end: kept to [{lower[i]:.3g}, {upper[i]:.3g}] rad")
-    return lower, upper, tuple(warnings)
+    moving = [joint for joint in joints if joint.kind != "fixed"]
+    followers = [joint for joint in moving if joint.name in couplings]
+    leaders = {joint.name: joint for joint in moving if joint.name not in couplings}
+    warnings: list[str] = []
+    for follower in followers:
+        coupling = couplings[follower.name]
+        narrow = _narrowed(leaders[coupling.leader], follower, coupling)
+        if narrow.lower < narrow.upper or coupling.multiplier == 0:
+            leaders[coupling.leader] = narrow
+        else:
+            leaders[coupling.leader] = replace(leaders[coupling.leader], velocity=narrow.velocity)
+            warnings.append(f"coupled joint {follower.name!r}: its limits leave no room to move, and were not kept")
+    for name, joint in leaders.items():
+        leaders[name] = _finite(path, joint)
+        if leaders[name] is not joint:
+            turn = f"[{leaders[name].lower:.3g}, {leaders[name].upper:.3g}]"
+            warnings.append(f"joint {name!r} turns without end: kept to {turn} rad")
+    for follower in followers:
+        leader, multiplier, _ = couplings[follower.name]
+        slide = abs(multiplier) * (leaders[leader].upper - leaders[leader].lower)
+        if follower.kind == "prismatic" and slide > _LONGEST_SLIDE:
+            raise _too_long(path, follower.name, slide)
+    still = {name: joint.lower for name, joint in leaders.items() if joint.upper - joint.lower < _STILL}
+    warnings += [f"joint {name!r} cannot move: its limits coincide; welded" for name in still]
+    left = {name: coupling for name, coupling in couplings.items() if coupling.leader not in still}
+    for name in couplings.keys() - left.keys():
+        leader, multiplier, offset = couplings[name]
+        still[name] = multiplier * still[leader] + offset
+    settled = [leaders.get(joint.name, joint) for joint in joints]
+    return (
+        [_welded(joint, still[joint.name]) if joint.name in still else joint for joint in settled],
+        left,
+        (*warnings,),
+    )
 
 
-def refuse_long_slides(
-    path: Path,
-    mimics: Sequence[Mimic],
-    kinds: Sequence[JointKind],
-    lower: Float[np.ndarray, "joints"],
-    upper: Float[np.ndarray, "joints"],
-) -> None:
-    """Raise HandError for a coupled joint that slides too far; `kinds` are those of all links, limits the leaders'."""
-    for mimic in mimics:
-        slide = abs(mimic.multiplier) * float(upper[mimic.joint] - lower[mimic.joint])
-        if kinds[mimic.link] == "prismatic" and slide > _LONGEST_SLIDE:
-            raise _too_long(path, mimic.name, slide)
+def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> JointSpec:
+    """The leader within limits and speed that keep its follower within its own too."""
+    _, multiplier, offset = coupling
+    if multiplier == 0:
+        return leader
+    low, high = sorted(((follower.lower - offset) / multiplier, (follower.upper - offset) / multiplier))
+    velocity = min(leader.velocity, follower.velocity / abs(multiplier))
+    return replace(leader, lower=max(leader.lower, low), upper=min(leader.upper, high), velocity=velocity)
+
+
+def _finite(path: Path, joint: JointSpec) -> JointSpec:
+    """The joint, or one that turns without end kept to one turn."""
+    reach = joint.upper - joint.lower
+    if joint.kind == "prismatic" and not reach <= _LONGEST_SLIDE:
+        raise _too_long(path, joint.name, reach)
+    if joint.kind == "prismatic" or reach <= _WIDEST:
+        return joint
+    # The turn from -π to π, moved no farther than the limits ask for.
+    lower = min(max(-np.pi, joint.lower), joint.upper - 2 * np.pi)
+    return replace(joint, lower=lower, upper=lower + 2 * np.pi)
+
+
+def _welded(joint: JointSpec, value: float) -> JointSpec:
+    """The joint fixed at a value."""
+    fixed = replace(joint, kind="fixed", axis=np.zeros(3))
+    if joint.kind == "prismatic":
+        return replace(fixed, translation=joint.translation + joint.rotation @ joint.axis * value)
+    return replace(fixed, rotation=joint.rotation @ axis_rotation(joint.axis, value))
 
 
 def _too_long(path: Path, joint: str, slide: float) -> HandError:
     return HandError(
         f"{path}: joint {joint!r} slides by {slide:g} m; a hand's slides are limited, to {_LONGEST_SLIDE:g} m at most"
-    )
-
-
-def welded_groups(parent: Int[np.ndarray, "links"], link_joint: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
-    """Links welded to their parent take its number; numbers are those of each group's first link."""
-    groups = np.arange(len(parent))
-    for link in range(1, len(parent)):
-        if link_joint[link] < 0:
-            groups[link] = groups[parent[link]]
-    return groups
-
-
-def with_still_joints_welded(hand: HandModel) -> HandModel:
-    """The hand with joints that cannot move, because their limits coincide, fixed where they are."""
-    still = hand.upper - hand.lower < _STILL
-    if not still.any():
-        return hand
-    rotations, translations = hand.link_offset_rotation.copy(), hand.link_offset_translation.copy()
-    kinds, axes, link_joint = list(hand.joint_kind), hand.joint_axis.copy(), hand.link_joint.copy()
-    for link in np.flatnonzero((hand.link_joint >= 0) & still[np.maximum(hand.link_joint, 0)]):
-        value = hand.link_multiplier[link] * hand.lower[hand.link_joint[link]] + hand.link_shift[link]
-        if kinds[link] == "prismatic":
-            translations[link] = translations[link] + rotations[link] @ axes[link] * value
-        else:
-            rotations[link] = rotations[link] @ axis_rotation(axes[link], value)
-        kinds[link], axes[link], link_joint[link] = "fixed", 0.0, -1
-    renumbered = np.where(link_joint >= 0, (np.cumsum(~still) - 1)[np.maximum(link_joint, 0)], -1)
-    welded = [name for name, stays in zip(hand.joint_names, still, strict=True) if stays]
-    return replace(
-        hand,
-        joint_names=tuple(name for name, stays in zip(hand.joint_names, still, strict=True) if not stays),
-        **{key: getattr(hand, key)[~still] for key in ("lower", "upper", "effort", "velocity")},
-        open_posture=hand.open_posture[~still],
-        closed_posture=hand.closed_posture[~still],
-        link_joint=renumbered,
-        link_offset_rotation=rotations,
-        link_offset_translation=translations,
-        joint_axis=axes,
-        joint_kind=tuple(kinds),
-        link_group=welded_groups(hand.link_parent, renumbered),
-        mimics=tuple(replace(m, joint=int(renumbered[m.link])) for m in hand.mimics if renumbered[m.link] >= 0),
-        warnings=(*hand.warnings, *(f"joint {name!r} cannot move: its limits coincide; welded" for name in welded)),
     )

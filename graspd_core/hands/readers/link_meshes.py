@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import MeshError
-from graspd_core.hands.primitive_surface import outermost
 from graspd_core.hands.readers.xml_io import wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import load_mesh
@@ -23,8 +22,6 @@ from graspd_core.types import TriangleMesh
 _CORNERS = 200
 # The most corners that all hulls of a hand have between them, and the fewest that each may have, however many they are.
 _ALL_CORNERS, _FEWEST_CORNERS = 12_800, 48
-# A fine rounded mesh, whose hull has more corners than this, is first thinned to a few for each that will be left.
-_MANY_CORNERS, _CHOICE = 1000, 3
 # Nothing of a hand is larger [m].
 LARGEST_SIZE = 2.0
 
@@ -100,21 +97,7 @@ def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners:
     mesh = load_mesh(path)
     # Scaled first and hulled then: a mirrored hull would be inside out.
     points = mesh.vertices[np.unique(mesh.faces)] * np.array(scale)
-    return limited_hull(_fewer(points, _CHOICE * corners), corners)
-
-
-def _fewer(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
-    """The points, or the outermost `count` at most where they have a hull of very many corners."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    if len(points) <= _MANY_CORNERS:
-        return points
-    try:
-        outer = ConvexHull(points).vertices
-    except QhullError:
-        # Flat: `limited_hull` makes a plate of them.
-        return points
-    return outermost(points[outer], count) if len(outer) > _MANY_CORNERS else points
+    return limited_hull(points, corners)
 
 
 def _package_folders(package: str, parents) -> list[Path]:

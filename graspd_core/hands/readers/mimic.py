@@ -5,26 +5,14 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Float
 
 from graspd_core.errors import HandError
-from graspd_core.hands.model import Mimic
+from graspd_core.hands.readers.joint_limits import Coupling
 from graspd_core.hands.readers.xml_values import read_numbers
 
 _DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 # No joint of a hand moves so much farther than another, nor starts so far off.
 _LARGEST = 1e6
-
-
-class Coupling(NamedTuple):
-    """A coupled joint's value is `multiplier` times that of joint `leader` plus `offset` [rad] or [m]."""
-
-    leader: str
-    multiplier: float
-    offset: float
 
 
 def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupling]:
@@ -79,37 +67,3 @@ def _resolved(path: Path, name: str, direct: Mapping[str, Coupling]) -> Coupling
             f"{coupling.offset:g}; the largest that is taken is {_LARGEST:g}"
         )
     return coupling
-
-
-def narrowed(
-    lower: Float[np.ndarray, "joints"],
-    upper: Float[np.ndarray, "joints"],
-    velocity: Float[np.ndarray, "joints"],
-    mimics: Sequence[Mimic],
-    limits: Mapping[str, tuple[float, float, float]],
-) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"], Float[np.ndarray, "joints"], tuple[str, ...]]:
-    """Limits of the actuated joints that keep the coupled ones within theirs too, and what had to be given up for it.
-
-    Args:
-        lower, upper, velocity: of the actuated joints by themselves.
-        mimics: the coupled joints.
-        limits: lower, upper and velocity of each coupled joint by name; infinite where it has none.
-
-    Returns:
-        lower, upper, velocity; and a warning for every coupled joint whose limits would leave its leader no room to
-        move: they are not kept, because descriptions in use give them with the wrong sign.
-    """
-    lower, upper, velocity, warnings = lower.copy(), upper.copy(), velocity.copy(), []
-    for mimic in mimics:
-        low, high, speed = limits[mimic.name]
-        if mimic.multiplier == 0:
-            continue
-        ends = sorted(((low - mimic.offset) / mimic.multiplier, (high - mimic.offset) / mimic.multiplier))
-        joint = mimic.joint
-        velocity[joint] = min(velocity[joint], speed / abs(mimic.multiplier))
-        narrow = max(lower[joint], ends[0]), min(upper[joint], ends[1])
-        if narrow[0] >= narrow[1]:
-            warnings.append(f"coupled joint {mimic.name!r}: its limits leave no room to move, and were not kept")
-            continue
-        lower[joint], upper[joint] = narrow
-    return lower, upper, velocity, tuple(warnings)

@@ -1,49 +1,65 @@
-"""MJCF to `HandModel`: the part of MuJoCo's format that hands are written in, read without MuJoCo.
+"""MJCF to `HandModel`: MuJoCo reads and compiles the file, and what its model says of a hand is taken over.
 
-Read are bodies, hinges and slides (several to a body, with `pos` and `ref`), boxes, spheres, ellipsoids, capsules,
-cylinders and meshes, default classes, and joints coupled by a straight line. What would change how the hand moves and
-is not read is refused by name. Reference: MuJoCo's XML reference, 3.x.
+MuJoCo is given what `read_xml` took, of the sections that say how a hand moves. It opens no file: meshes are read by
+graspd, in more formats, as convex hulls. What would change how the hand moves and is not read is refused by name.
 """
 
 from __future__ import annotations
 
+import importlib
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import HandModel, JointKind, Primitive
-from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.joint_limits import Coupling, JointSpec
 from graspd_core.hands.readers.link_meshes import corners_each
-from graspd_core.hands.readers.mimic import Coupling, resolved_couplings
-from graspd_core.hands.readers.mjcf_geoms import read_geom
-from graspd_core.hands.readers.mjcf_values import (
-    MjcfSettings,
-    read_axis,
-    read_pose,
-    read_range,
-    read_settings,
-    with_defaults,
+from graspd_core.hands.readers.mimic import resolved_couplings
+from graspd_core.hands.readers.mjcf_geoms import (
+    MeshAsset,
+    asset_hull,
+    check_type,
+    fault,
+    pose,
+    read_assets,
+    read_geom,
+    type_name,
 )
-from graspd_core.hands.readers.xml_io import read_xml, wrong
-from graspd_core.hands.readers.xml_values import read_numbers, read_position
+from graspd_core.hands.readers.xml_io import Element, as_text, read_xml, wrong
+from graspd_core.hands.readers.xml_values import FARTHEST
 from graspd_core.se3 import axis_rotation
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}
-_REFUSED = ("include", "frame", "replicate", "attach", "composite", "flexcomp", "plugin")
+_REFUSED = ("include", "replicate", "attach", "composite", "flexcomp", "plugin")
+# What MuJoCo is shown: other sections and assets name files, ask for memory, or say nothing that counts here.
+_SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", "actuator")
+# Words whose text may look like a number.
+_NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
+_HEAVIEST, _MOST_CLASSES = 1e3, 300
 
 
 @dataclass(eq=False)
 class _Parts:
-    """What has been read so far."""
+    """A file as MuJoCo has parsed and compiled it, and what has been made of it so far.
 
-    settings: MjcfSettings
-    meshes: dict[str, ET.Element]
+    Attributes:
+        meshes: the asset of each geom that is a mesh, by the geom's number.
+    """
+
+    path: Path
+    spec: Any
+    model: Any
+    meshes: dict[int, MeshAsset]
     links: list[LinkSpec] = field(default_factory=list)
     joints: list[JointSpec] = field(default_factory=list)
-    references: dict[str, float] = field(default_factory=dict)
+    labels: dict[int, str] = field(default_factory=dict)
     shown: list[str] = field(default_factory=list)
 
 
@@ -51,182 +67,204 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     """The hand that an MJCF file describes, as `read_urdf` gives one; the base is the one body of the world.
 
     Raises:
-        HandError: the file is malformed, has several bodies in the world, or uses what is not read.
+        HandError: MuJoCo refuses the file, it has several bodies in the world, or uses what is not read.
     """
     root = read_xml(path) if root is None else root
-    for element in root.iter():
-        if element.tag in _REFUSED:
-            raise wrong(path, element, f"<{element.tag}> is not read; save the compiled model as one plain MJCF file")
-    refuse_crowds(path, *(len(root.findall(f"worldbody//{tag}")) for tag in ("body", "joint", "geom")))
-    meshes = sum("mesh" in geom.attrib for geom in root.findall("worldbody//geom"))
-    settings = replace(read_settings(path, root), corners=corners_each(meshes))
-    parts = _Parts(settings, _mesh_assets(settings, root))
-    bodies = root.findall("worldbody/body")
-    if len(bodies) != 1:
-        names = ", ".join(str(body.get("name")) for body in bodies)
-        raise wrong(path, root, f"the world has {len(bodies)} bodies, a hand has one: {names or 'none'}")
-    warnings: list[str] = []
-    if root.find("worldbody/geom") is not None:
+    _refuse(path, root)
+    parts = _compiled(path, root)
+    world = parts.spec.worldbody
+    if len(world.bodies) != 1:
+        names = ", ".join(body.name for body in world.bodies)
+        raise wrong(path, root, f"the world has {len(world.bodies)} bodies, a hand has one: {names or 'none'}")
+    base, warnings = world.bodies[0], []
+    if world.geoms:
         warnings.append("geoms of the world itself were dropped")
-    if _is_free(settings, bodies[0]):
-        warnings.append(f"the free joint of the base {bodies[0].get('name')!r} was dropped")
-    fixed = _is_free(settings, bodies[0]) or not bodies[0].findall("joint")
-    if not fixed:
+    free = any(type_name(joint) == "free" for joint in base.joints)
+    if free:
+        warnings.append(f"the free joint of the base {base.name!r} was dropped")
+    hangs = bool(base.joints) and not free
+    if hangs:
         parts.links.append(LinkSpec("world"))
-    _read_body(parts, bodies[0], None if fixed else "world", "main")
-    if root.find("tendon") is not None:
+    _read_body(parts, base, "world" if hangs else None)
+    if parts.spec.tendons:
         warnings.append("tendons are not read: joints that they couple move by themselves")
     if parts.shown:
         warnings.append(f"no colliding geom, so the visual ones are taken: {', '.join(parts.shown)}")
-    direct = _couplings(parts, root)
-    efforts = _efforts(settings, root)
+    efforts, couplings = _efforts(parts), resolved_couplings(path, _couplings(parts))
     joints = [replace(j, effort=min(j.effort, efforts.get(j.name, np.inf))) for j in parts.joints]
-    name = str(root.get("model") or path.stem)
-    return assemble(path, name, parts.links, joints, resolved_couplings(path, direct), tuple(warnings))
+    return assemble(path, root.get("model") or path.stem, parts.links, joints, couplings, tuple(warnings))
 
 
-def _is_free(settings: MjcfSettings, body: ET.Element) -> bool:
-    free = [with_defaults(settings, joint, "main").get("type") == "free" for joint in body.findall("joint")]
-    return body.find("freejoint") is not None or any(free)
+def _refuse(path: Path, root: ET.Element) -> None:
+    """Raise HandError for what is not read, and for what MuJoCo should not see."""
+    for element in root.iter():
+        if element.tag in _REFUSED:
+            raise wrong(path, element, f"<{element.tag}> is not read; save the compiled model as one plain MJCF file")
+        for key, text in element.attrib.items():
+            # MuJoCo takes them, with a note on the terminal and in a file of its own.
+            if key not in _NAMES and re.search(r"(?i)(^|\s)[+-]?(nan|inf)", text):
+                raise wrong(path, element, f"<{element.tag} {key}={shown(text)}>: expected finite numbers")
+    classes = len(root.findall(".//default"))
+    if classes > _MOST_CLASSES:
+        raise wrong(path, root, f"{classes} default classes; a hand has at most {_MOST_CLASSES}")
+    refuse_crowds(path, *(len(root.findall(f"worldbody//{tag}")) for tag in ("body", "joint", "geom")))
 
 
-def _mesh_assets(settings: MjcfSettings, root: ET.Element) -> dict[str, ET.Element]:
-    meshes: dict[str, ET.Element] = {}
-    for element in root.findall("asset/mesh"):
-        whole = with_defaults(settings, element, "main")
-        meshes[whole.get("name") or Path(whole.get("file") or "").stem] = whole
-    return meshes
+def _compiled(path: Path, root: ET.Element) -> _Parts:
+    """The file in MuJoCo's hands, with a small sphere in the place of each mesh, so that no mesh file is opened."""
+    mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
+    root[:] = [section for section in root if section.tag in _SECTIONS]
+    for assets in root.findall("asset"):
+        assets[:] = assets.findall("mesh")
+    for element in root.iter():
+        element.attrib.pop("material", None)
+    try:
+        spec = mujoco.MjSpec.from_string(as_text(root))
+        assets, meshes = read_assets(path, spec), []
+        for geom in spec.geoms:
+            in_world, name = geom.parent.name == "world", geom.meshname
+            if not in_world:
+                check_type(path, geom, assets)
+            if in_world or name:
+                geom.type, geom.meshname, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, "", (0.01, 0.0, 0.0)
+                meshes.append((geom, assets.get(name)))
+        for mesh in list(spec.meshes):
+            spec.delete(mesh)
+        return _Parts(path, spec, spec.compile(), {geom.id: mesh for geom, mesh in meshes if mesh})
+    except (ValueError, mujoco.FatalError) as error:
+        raise _refusal(path, root, " ".join(str(error).split())) from error
 
 
-def _read_body(parts: _Parts, body: ET.Element, parent: str | None, above: str) -> None:
-    """Append a body's link and joints, then those of the bodies in it; `above` is the class that it inherits."""
-    settings = parts.settings
-    child_class = body.get("childclass", above)
-    name = body.get("name") or f"body_{len(parts.links)}"
-    primitives = _primitives(parts, body, child_class, name)
-    link = LinkSpec(name, *_inertial(settings, body), tuple(primitives))
+def _refusal(path: Path, root: ET.Element, text: str) -> HandError:
+    """MuJoCo's refusal as an error about the element that it names."""
+    line, tag = re.search(r",? line (\d+)", text), re.search(r"Element '(\w+)'", text)
+    place = Element(tag.group(1) if tag else "mujoco")
+    if line:
+        place.line, text = int(line.group(1)), text.replace(line.group(), "")
+    named = [e.owner for e in root.iter(place.tag) if isinstance(e, Element) and e.line == place.line]
+    place.owner = named[0] if named else ""
+    return wrong(path, place, f"MuJoCo refuses it: {text[:400]}")
+
+
+def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
+    """Append a body's link and joints, then those of the bodies in it."""
+    model, name = parts.model, body.name or f"body_{len(parts.links)}"
+    link = LinkSpec(name, *_inertial(parts, body), _primitives(parts, body, name))
+    rotation, translation = pose(model.body_pos[body.id], model.body_quat[body.id])
     if parent is not None:
-        rotation, translation = read_pose(settings, body)
-        joints = [with_defaults(settings, joint, child_class) for joint in body.findall("joint")]
-        for number, joint in enumerate(joints):
-            label = joint.get("name") or f"{name}_joint{number}"
-            offset = read_position(settings.path, joint, "pos")
-            last = number == len(joints) - 1 and not offset.any()
+        _refuse_far(parts, body, translation)
+        above: str = parent
+        for number, joint in enumerate(body.joints):
+            label = parts.labels[joint.id] = joint.name or f"{name}_joint{number}"
+            offset = np.array(model.jnt_pos[joint.id])
+            _refuse_far(parts, joint, offset)
+            last = number == len(body.joints) - 1 and not offset.any()
             # A joint beside the body's origin, or one of several, moves a link of its own that the body is welded to.
             child = name if last else f"{name}:{label}"
-            spec = _joint(parts, joint, label, parent, child, rotation, translation + rotation @ offset)
-            parts.joints.append(spec)
-            if last:
-                rotation = None
-                break
-            parts.links.append(LinkSpec(child))
-            parent, rotation, translation = child, np.eye(3), -offset
-        if rotation is not None:
-            parts.joints.append(JointSpec(f"{name}:weld", parent, name, "fixed", rotation, translation))
+            at_joint = JointSpec(label, above, child, "fixed", rotation, translation + rotation @ offset)
+            parts.joints.append(_moving(parts, joint, at_joint))
+            above, rotation, translation = child, np.eye(3), -offset
+            if not last:
+                parts.links.append(LinkSpec(child))
+        if above != name:
+            parts.joints.append(JointSpec(f"{name}:weld", above, name, "fixed", rotation, translation))
     parts.links.append(link)
-    for child in body.findall("body"):
-        if child.find("freejoint") is not None:
-            raise wrong(settings.path, child, "has a free joint inside the hand")
-        _read_body(parts, child, name, child_class)
+    for child in body.bodies:
+        _read_body(parts, child, name)
 
 
-def _joint(
-    parts: _Parts,
-    joint: ET.Element,
-    label: str,
-    parent: str,
-    child: str,
-    rotation: Float[np.ndarray, "3 3"],
-    translation: Float[np.ndarray, "3"],
-) -> JointSpec:
-    settings, path = parts.settings, parts.settings.path
-    kind = _KINDS.get(joint.get("type", "hinge"))
+def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
+    """The joint that moves as the file says, of one that stands where it says."""
+    model, number = parts.model, joint.id
+    kind = _KINDS.get(type_name(joint))
     if kind is None:
-        raise wrong(path, joint, f"is of type {joint.get('type')!r}; known: {', '.join(_KINDS)}")
-    unit = settings.angle if kind == "revolute" else 1.0
-    axis = read_axis(settings, joint)
+        raise fault(parts.path, joint, f"is of type {type_name(joint)!r}; known: {', '.join(_KINDS)}")
+    axis, rotation, translation = np.array(model.jnt_axis[number]), placed.rotation, placed.translation
     # At `ref` the joint is as drawn; a joint value of zero lies that far back.
-    reference = float(read_numbers(path, joint, "ref", 1, "0")[0]) * unit
-    parts.references[label] = reference
     if kind == "revolute":
-        rotation = rotation @ axis_rotation(axis, -reference)
+        rotation = rotation @ axis_rotation(axis, -_reference(parts, number))
     else:
-        translation = translation - rotation @ axis * reference
-    lower, upper = -np.inf, np.inf
-    ends = read_range(settings, joint, "range", "limited")
-    if ends is not None:
-        lower, upper = (ends * unit).tolist()
-        if lower > upper:
-            raise wrong(path, joint, f"has lower {lower:g} above upper {upper:g}")
-    forces = read_range(settings, joint, "actuatorfrcrange", "actuatorfrclimited")
-    effort = np.inf if forces is None else float(np.abs(forces).max())
-    return JointSpec(label, parent, child, kind, rotation, translation, axis, lower, upper, effort)
+        translation = translation - rotation @ axis * _reference(parts, number)
+    if joint.range[0] > joint.range[1]:
+        raise fault(parts.path, joint, f"has lower {joint.range[0]:g} above upper {joint.range[1]:g}")
+    lower, upper = model.jnt_range[number].tolist() if model.jnt_limited[number] else (-np.inf, np.inf)
+    effort = float(np.abs(model.jnt_actfrcrange[number]).max()) if model.jnt_actfrclimited[number] else np.inf
+    moves = {"kind": kind, "rotation": rotation, "translation": translation, "axis": axis}
+    return replace(placed, **moves, lower=lower, upper=upper, effort=effort)
 
 
-def _primitives(parts: _Parts, body: ET.Element, child_class: str, name: str) -> list[Primitive]:
+def _reference(parts: _Parts, joint: int) -> float:
+    """The joint's value in which the file draws it [rad] or [m]."""
+    return float(parts.model.qpos0[parts.model.jnt_qposadr[joint]])
+
+
+def _refuse_far(parts: _Parts, element: Any, position: Float[np.ndarray, "3"]) -> None:
+    if not np.abs(position).max() <= FARTHEST:
+        text = f"pos={shown(position.tolist())}: more than {FARTHEST:g} m away; lengths are in metres"
+        raise fault(parts.path, element, text)
+
+
+def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
     """The colliding geoms of a body, or all where none collides."""
-    geoms = [with_defaults(parts.settings, geom, child_class) for geom in body.findall("geom")]
-    colliding = [g for g in geoms if (g.get("contype", "1"), g.get("conaffinity", "1")) != ("0", "0")]
-    if geoms and not colliding:
+    colliding = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+    if body.geoms and not colliding:
         parts.shown.append(name)
-    return [read_geom(parts.settings, geom, parts.meshes) for geom in colliding or geoms]
+    corners, found = corners_each(len(parts.meshes)), []
+    for geom in colliding or body.geoms:
+        mesh = parts.meshes.get(geom.id)
+        hull = None if mesh is None else asset_hull(parts.path, mesh, corners)
+        found.append(read_geom(parts.path, parts.model, geom, hull))
+        _refuse_far(parts, geom, found[-1].translation)
+    return tuple(found)
 
 
-def _inertial(
-    settings: MjcfSettings, body: ET.Element
-) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Mass [kg], centre [m] and inertia about it [kg·m²]; zero where the body gives none."""
-    inertial = body.find("inertial")
-    if inertial is None:
+    if not body.explicitinertial:
         return 0.0, np.zeros(3), np.zeros((3, 3))
-    rotation, com = read_pose(settings, inertial)
-    mass = float(read_numbers(settings.path, inertial, "mass", 1, "0")[0])
-    if "fullinertia" in inertial.attrib:
-        xx, yy, zz, xy, xz, yz = read_numbers(settings.path, inertial, "fullinertia", 6, "")
-    else:
-        (xx, yy, zz), xy, xz, yz = read_numbers(settings.path, inertial, "diaginertia", 3, "0 0 0"), 0.0, 0.0, 0.0
-    moments = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if mass < 0 or max(mass, float(np.abs(moments).max())) > 1e3:
-        raise wrong(settings.path, inertial, f"weighs {mass:g} kg: no hand")
-    return mass, com, rotation @ moments @ rotation.T
+    model, number = parts.model, body.id
+    rotation, com = pose(model.body_ipos[number], model.body_iquat[number])
+    mass, moments = float(model.body_mass[number]), np.array(model.body_inertia[number])
+    if body.mass < 0 or not max(mass, *moments) <= _HEAVIEST:
+        heavy = f"weighs {min(mass, body.mass):g} kg, with moments up to {moments.max():g} kg·m²: no hand"
+        raise fault(parts.path, body, heavy)
+    _refuse_far(parts, body, com)
+    return mass, com, (rotation * moments) @ rotation.T
 
 
-def _couplings(parts: _Parts, root: ET.Element) -> dict[str, Coupling]:
+def _couplings(parts: _Parts) -> dict[str, Coupling]:
     """Joints that an equality ties to another by a straight line: q₁ − ref₁ = c₀ + c₁ (q₂ − ref₂)."""
-    path, joints = parts.settings.path, parts.references
     direct: dict[str, Coupling] = {}
-    for section in root.findall("equality"):
-        for given in section:
-            element = with_defaults(parts.settings, given, "main")
-            if element.get("active", "true") == "false":
-                continue
-            if element.tag != "joint" or "joint2" not in element.attrib:
-                raise wrong(path, element, f"equality <{element.tag}> is not read: only a joint tied to another is")
-            one, two = str(element.get("joint1")), str(element.get("joint2"))
-            for name in (one, two):
-                if name not in joints:
-                    raise wrong(path, element, f"names the joint {name!r}; known: {', '.join(joints)}")
-            count = len((element.get("polycoef") or "0 1 0 0 0").split())
-            constant, slope, *bends = np.resize(read_numbers(path, element, "polycoef", count, "0 1 0 0 0"), 5)
-            if count != 5 or any(bends):
-                raise wrong(
-                    path, element, f"<joint polycoef={element.get('polycoef')!r}>: only a straight line is read"
-                )
-            direct[one] = Coupling(two, float(slope), float(joints[one] + constant - slope * joints[two]))
+    for tie in parts.spec.equalities:
+        if not tie.active:
+            continue
+        kind = tie.type.name.removeprefix("mjEQ_").lower()
+        if kind != "joint" or not tie.name2:
+            raise fault(parts.path, tie, f"equality <{kind}> is not read: only a joint tied to another is")
+        constant, slope, *bends = tie.data[:5].tolist()
+        if any(bends):
+            given = shown(tie.data[:5].tolist())
+            raise fault(parts.path, tie, f"<joint polycoef={given}>: only a straight line is read")
+        one, two = (parts.model.joint(name).id for name in (tie.name1, tie.name2))
+        offset = _reference(parts, one) + constant - slope * _reference(parts, two)
+        direct[parts.labels[one]] = Coupling(parts.labels[two], slope, offset)
     return direct
 
 
-def _efforts(settings: MjcfSettings, root: ET.Element) -> dict[str, float]:
+def _efforts(parts: _Parts) -> dict[str, float]:
     """The greatest torque or force that a joint's actuator gives, where it is limited."""
-    efforts: dict[str, float] = {}
-    for section in root.findall("actuator"):
-        for given in section:
-            element = with_defaults(settings, given, "main")
-            what = "force" if "forcerange" in element.attrib or element.tag != "motor" else "ctrl"
-            forces = read_range(settings, element, f"{what}range", f"{what}limited")
-            force = 0.0 if forces is None else float(np.abs(forces).max())
-            count = len(element.get("gear", "").split()) or 1
-            gear = float(np.abs(read_numbers(settings.path, element, "gear", count, "1"))[0])
-            if "joint" in element.attrib and force > 0 and gear > 0:
-                efforts[str(element.get("joint"))] = force * gear
+    mujoco: Any = importlib.import_module("mujoco")
+    model, efforts = parts.model, {}
+    for i in range(model.nu):
+        gain = float(model.actuator_gainprm[i, 0])
+        motor = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        motor = motor and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        force = 0.0
+        if model.actuator_forcelimited[i]:
+            force = float(np.abs(model.actuator_forcerange[i]).max())
+        elif motor and model.actuator_ctrllimited[i]:
+            force = float(np.abs(gain * model.actuator_ctrlrange[i]).max())
+        force *= abs(float(model.actuator_gear[i, 0]))
+        if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT and 0 < force < np.inf:
+            efforts[parts.labels.get(int(model.actuator_trnid[i, 0]), "")] = force
     return efforts

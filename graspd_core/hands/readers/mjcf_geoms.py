@@ -1,93 +1,128 @@
-"""Geoms of an MJCF file as primitives."""
+"""Geoms of an MJCF file, as MuJoCo has compiled them, as primitives; errors about an element of MuJoCo's."""
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
+from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import Primitive, PrimitiveKind
 from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, mesh_hull
-from graspd_core.hands.readers.mjcf_values import MjcfSettings, read_pose, turn_z_to
-from graspd_core.hands.readers.xml_io import wrong
-from graspd_core.hands.readers.xml_values import read_numbers
+from graspd_core.hands.readers.xml_io import Element, wrong
 from graspd_core.mesh.convex_parts import limited_hull
+from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import TriangleMesh
 
 # How many of a geom's sizes count.
-_SIZES = {"box": 3, "ellipsoid": 3, "sphere": 1, "capsule": 2, "cylinder": 2}
-_PLAIN: dict[str, PrimitiveKind] = {
-    "box": "box",
-    "sphere": "sphere",
-    "capsule": "capsule",
-    "cylinder": "cylinder",
-}
+_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
+_PLAIN: dict[str, PrimitiveKind] = {"sphere": "sphere", "capsule": "capsule", "cylinder": "cylinder", "box": "box"}
+_CORNERS_OF_ELLIPSOID = 200
 
 
-def read_geom(settings: MjcfSettings, geom: ET.Element, meshes: Mapping[str, ET.Element]) -> Primitive:
-    """One geom, its class's attributes included, as a primitive of link zero; ellipsoids and meshes as hulls.
+@dataclass(frozen=True, eq=False)
+class MeshAsset:
+    """A mesh of the file.
+
+    Attributes:
+        place: its line and name, for errors.
+        file: relative to the file's folder; empty for a mesh whose vertices are in the file.
+        scale: of its coordinates, along each axis.
+        vertices: of a mesh without file [m].
+    """
+
+    place: Element
+    file: str
+    scale: Float[np.ndarray, "3"]
+    vertices: Float[np.ndarray, "_ 3"]
+
+
+def read_assets(path: Path, spec: Any) -> dict[str, MeshAsset]:
+    """The meshes of a parsed file by name.
 
     Raises:
-        HandError: its type is not known, its size not positive, or its mesh not there.
+        HandError: one is moved or turned, or has no size.
     """
-    path = settings.path
-    rotation, translation = read_pose(settings, geom)
-    kind = geom.get("type", "sphere")
-    if kind == "mesh":
-        hull = _mesh(settings, geom, meshes)
+    assets = {}
+    for mesh in spec.meshes:
+        if np.any(mesh.refpos) or not np.array_equal(mesh.refquat, (1, 0, 0, 0)):
+            raise fault(path, mesh, "<mesh refpos=...> and <mesh refquat=...> are not read")
+        if not np.all(mesh.scale):
+            raise fault(path, mesh, f"<mesh scale={shown(list(mesh.scale))}>: a factor cannot be zero")
+        file = str(Path(spec.meshdir) / mesh.file) if mesh.file else ""
+        vertices = np.array(mesh.uservert, dtype=float).reshape(-1, 3)
+        assets[mesh.name or Path(mesh.file).stem] = MeshAsset(_place(mesh), file, np.array(mesh.scale), vertices)
+    return assets
+
+
+def fault(path: Path, element: Any, message: str) -> HandError:
+    """The error to raise about an element of a `MjSpec`: names the file, the line, and what it belongs to."""
+    return wrong(path, _place(element), message)
+
+
+def _place(element: Any) -> Element:
+    named = element if element.name or not hasattr(element, "parent") else element.parent
+    place = Element(type(named).__name__.removeprefix("Mjs").lower())
+    place.line = int(element.info.removeprefix("line ") or 0)
+    place.owner = f"{place.tag} {named.name!r}" if named.name else ""
+    return place
+
+
+def type_name(element: Any) -> str:
+    """The type of a geom or joint as MJCF writes it."""
+    return element.type.name.partition("_")[2].lower()
+
+
+def pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation [m] of one of a model's poses."""
+    return rotation_from_quaternion(torch.as_tensor(np.array(quaternion))).numpy(), np.array(position)
+
+
+def check_type(path: Path, geom: Any, assets: Mapping[str, MeshAsset]) -> None:
+    """Raise HandError for a geom of a type that is not read, or a mesh that the file does not hold."""
+    kind, known = type_name(geom), (*_SIZES, "mesh")
+    if kind not in known or (geom.meshname and kind != "mesh"):
+        raise fault(path, geom, f"<geom type={kind!r}> is not read; known: {', '.join(known)}")
+    if kind == "mesh" and geom.meshname not in assets:
+        raise fault(path, geom, f"names the mesh {geom.meshname!r}; known: {', '.join(assets) or 'none'}")
+
+
+def read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
+    """One geom as a primitive of link zero: ellipsoids and meshes, of which `hull` is one, as hulls.
+
+    Raises:
+        HandError: it is larger than anything of a hand.
+    """
+    rotation, translation = pose(model.geom_pos[geom.id], model.geom_quat[geom.id])
+    if hull is not None:
         return Primitive(0, "hull", rotation, translation, (), hull.vertices, hull.faces)
-    if kind not in _SIZES or "mesh" in geom.attrib:
-        raise wrong(path, geom, f"<geom type={kind!r}> is not read; known: {', '.join((*_SIZES, 'mesh'))}")
-    if "fromto" in geom.attrib:
-        ends = read_numbers(path, geom, "fromto", 6, "").reshape(2, 3)
-        length = float(np.linalg.norm(ends[1] - ends[0]))
-        if not 1e-9 < length < LARGEST_SIZE or kind not in ("capsule", "cylinder"):
-            raise wrong(path, geom, f"<geom fromto={geom.get('fromto')!r}>: only a capsule or cylinder of some length")
-        # MuJoCo's z runs from the second end to the first; a solid of revolution looks the same either way.
-        rotation, translation = turn_z_to((ends[1] - ends[0]) / length), ends.mean(0)
-        size = np.array([_sizes(settings, geom, 1)[0], 0.5 * length])
-    else:
-        size = _sizes(settings, geom, _SIZES[kind])
-    if kind == "ellipsoid":
-        import trimesh
+    kind = type_name(geom)
+    size = model.geom_size[geom.id, : _SIZES[kind]].copy()
+    if not (size <= LARGEST_SIZE).all():
+        raise fault(path, geom, f"<geom size='{size}'>: larger than {LARGEST_SIZE:g} m; lengths are in metres")
+    if kind in _PLAIN:
+        return Primitive(0, _PLAIN[kind], rotation, translation, tuple(size.tolist()))
+    import trimesh
 
-        hull = limited_hull(np.asarray(trimesh.creation.icosphere(subdivisions=2).vertices) * size, 200)
-        return Primitive(0, "hull", rotation, translation, (), hull.vertices, hull.faces)
-    return Primitive(0, _PLAIN[kind], rotation, translation, tuple(size.tolist()))
+    ball = limited_hull(np.asarray(trimesh.creation.icosphere(subdivisions=2).vertices) * size, _CORNERS_OF_ELLIPSOID)
+    return Primitive(0, "hull", rotation, translation, (), ball.vertices, ball.faces)
 
 
-def _sizes(settings: MjcfSettings, geom: ET.Element, count: int) -> Float[np.ndarray, "n"]:
-    words = (geom.get("size") or "").split()
-    values = read_numbers(settings.path, geom, "size", len(words) or 1, "")
-    # More sizes than the type needs are allowed, and mean nothing.
-    if len(values) < count or not ((values[:count] > 0) & (values[:count] <= LARGEST_SIZE)).all():
-        text = f"<geom size={geom.get('size')!r}>"
-        raise wrong(settings.path, geom, f"{text}: expected {count} positive number(s) of at most {LARGEST_SIZE:g} m")
-    return values[:count]
+def asset_hull(path: Path, mesh: MeshAsset, corners: int) -> TriangleMesh:
+    """The hull of a mesh, of some `corners` at most [m].
 
-
-def _mesh(settings: MjcfSettings, geom: ET.Element, meshes: Mapping[str, ET.Element]) -> TriangleMesh:
-    name = geom.get("mesh", "")
-    if name not in meshes:
-        raise wrong(settings.path, geom, f"names the mesh {name!r}; known: {', '.join(meshes) or 'none'}")
-    asset = meshes[name]
-    for key in ("refpos", "refquat", "builtin"):
-        if key in asset.attrib:
-            raise wrong(settings.path, asset, f"<mesh {key}=...> is not read")
-    scale = read_numbers(settings.path, asset, "scale", 3, "1 1 1")
-    if (scale == 0).any():
-        raise wrong(settings.path, asset, f"<mesh scale={asset.get('scale')!r}>: a factor cannot be zero")
-    if "vertex" in asset.attrib:
-        words = str(asset.get("vertex")).split()
-        points = read_numbers(settings.path, asset, "vertex", len(words) // 3 * 3, "").reshape(-1, 3) * scale
-        if len(points) == 0 or np.abs(points).max() > LARGEST_SIZE:
-            raise wrong(
-                settings.path, asset, f"<mesh vertex=...>: {len(points)} points, not all within {LARGEST_SIZE:g} m"
-            )
-        return limited_hull(points, settings.corners)
-    return mesh_hull(
-        settings.path, asset, str(Path(settings.mesh_folder) / (asset.get("file") or "")), scale, settings.corners
-    )
+    Raises:
+        HandError: its file is not there or not a mesh, or it is larger than anything of a hand.
+    """
+    if mesh.file:
+        return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
+    points = mesh.vertices * mesh.scale
+    if len(points) < 4 or np.abs(points).max() > LARGEST_SIZE:
+        text = f"{len(points)} points; expected four or more, within {LARGEST_SIZE:g} m"
+        raise wrong(path, mesh.place, f"<mesh vertex=...>: {text}")
+    return limited_hull(points, corners)

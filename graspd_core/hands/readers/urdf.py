@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.hands.model import HandModel, JointKind
-from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
+from graspd_core.hands.readers.joint_limits import JointSpec
 from graspd_core.hands.readers.link_meshes import corners_each
 from graspd_core.hands.readers.mimic import read_couplings
 from graspd_core.hands.readers.urdf_geometry import colliding, read_primitives

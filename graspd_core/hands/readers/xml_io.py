@@ -11,9 +11,12 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 from graspd_core.errors import HandError
 
+# Of an error: a file may have a word of megabytes.
+_LONGEST = 1000
 _LARGEST_FILE = 32 * 2**20
 _DEEPEST = 150
 # The largest hand known has some 1000 elements; each takes half a kilobyte, however short it is written.
@@ -50,12 +53,31 @@ def read_xml(path: Path) -> Element:
     return _parsed(path, text)
 
 
+def as_text(root: ET.Element) -> str:
+    """The elements as XML again, each in the line in which it stood; without texts and comments."""
+    pieces, line = [], 1
+    # An element of which only the end is left to write is None, with its tag.
+    ahead: list[tuple[ET.Element | None, str]] = [(root, root.tag)]
+    while ahead:
+        element, tag = ahead.pop()
+        if element is None:
+            pieces.append(f"</{tag}>")
+            continue
+        pieces.append("\n" * (getattr(element, "line", line) - line))
+        line = max(line, getattr(element, "line", line))
+        pieces.append("".join([f"<{tag}", *(f" {key}={quoteattr(text)}" for key, text in element.items()), ">"]))
+        ahead += [(None, tag), *((child, child.tag) for child in reversed(element))]
+    return "".join(pieces)
+
+
 def wrong(path: Path, element: ET.Element, message: str) -> HandError:
     """The error to raise about an element: names the file, the line, and the link or joint that it belongs to."""
     line, owner = getattr(element, "line", 0), getattr(element, "owner", "")
     place_points = f"{path}:{line}" if line else f"{path}"
     if owner:
         message = f"{owner} {message}" if message.startswith(("is ", "has ")) else f"{owner}: {message}"
+    if len(message) > _LONGEST:
+        message = f"{message[: _LONGEST // 2]} ... {message[-_LONGEST // 2 :]}"
     return HandError(f"{place_points}: {message}")
 
 

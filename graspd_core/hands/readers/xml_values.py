@@ -11,7 +11,7 @@ from jaxtyping import Float
 from graspd_core.hands.readers.xml_io import wrong
 
 # Nothing in a hand is farther than this from the frame that it is given in [m].
-_FARTHEST = 10.0
+FARTHEST = 10.0
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
@@ -30,9 +30,9 @@ def read_position(path: Path, element: ET.Element, key: str) -> Float[np.ndarray
         HandError: they are not numbers, or farther away than anything in a hand is.
     """
     position = read_numbers(path, element, key, 3, "0 0 0")
-    if np.abs(position).max() > _FARTHEST:
+    if np.abs(position).max() > FARTHEST:
         text = f"<{element.tag} {key}={element.get(key)!r}>"
-        raise wrong(path, element, f"{text}: more than {_FARTHEST:g} m away; lengths are in metres")
+        raise wrong(path, element, f"{text}: more than {FARTHEST:g} m away; lengths are in metres")
     return position
 
 

@@ -6,12 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from graspd_core.errors import HandError
-from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, point_jacobian, points_in_base
 from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, load_hand
 from graspd_core.hands.model import HandModel, Mimic, all_joint_names, all_joint_positions
 from graspd_core.hands.readers.urdf import read_urdf
@@ -134,33 +130,6 @@ def test_a_bad_coupling_is_refused_by_name(tmp_path: Path, mimic: str, message: 
     )
     with pytest.raises(HandError, match=message):
         read_urdf(write(tmp_path, text))
-
-
-def test_an_uncoupled_copy_at_the_same_values_stands_alike(tmp_path: Path, hand: HandModel) -> None:
-    free = LINKAGE
-    for leader, multiplier, offset in (("second", -2, 0.1), ("first", 0.5, -0.2)):
-        free = free.replace(follows(leader, multiplier=multiplier, offset=offset), "")
-    copy = read_urdf(write(tmp_path, free))
-    assert copy.joint_names == all_joint_names(hand)
-    q = np.array([0.37, 0.04])
-    for ours, theirs in zip(link_poses(hand, q), link_poses(copy, all_joint_positions(hand, q)), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-14)
-
-
-@given(st.integers(0, 2**31))
-def test_gradients_go_through_the_coupling(hand: HandModel, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(hand.lower, hand.upper)
-    kinematics = make_kinematics(hand, dtype=torch.float64)
-    joints = torch.as_tensor(q)[None].requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: tuple(vars(forward(kinematics, x)).values()), joints)
-    points, links = rng.normal(size=(10, 3)) * 0.05, rng.integers(0, hand.num_links, 10)
-
-    def positions(x: torch.Tensor) -> torch.Tensor:
-        return points_in_base(kinematics, x[None], torch.as_tensor(points), torch.as_tensor(links))[0]
-
-    expected = torch.autograd.functional.jacobian(positions, torch.as_tensor(q))
-    np.testing.assert_allclose(point_jacobian(hand, q, points, links), np.asarray(expected), atol=1e-12)
 
 
 def test_a_sliding_joint_has_its_own_scale_and_default_force(tmp_path: Path) -> None:

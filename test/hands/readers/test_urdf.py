@@ -20,6 +20,12 @@ HINGE = (
 HAND = f'<robot name="tiny"><link name="palm">{BOX}</link><link name="finger">{BOX}</link>{HINGE}</robot>'
 
 
+LOOP = '<link name="x"/><link name="y"/>' + "".join(
+    f'<joint name="{one}" type="continuous"><parent link="{one}"/><child link="{other}"/></joint>'
+    for one, other in ("xy", "yx")
+) + "</robot>"  # fmt: skip
+
+
 def _read(tmp_path: Path, text: str | bytes) -> HandModel:
     path = tmp_path / "tiny.urdf"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
@@ -140,6 +146,10 @@ def test_axes_are_normalised_and_inertials_optional(tmp_path: Path) -> None:
         ("<collision>", '<inertial><mass value="-1"/></inertial><collision>', "link 'palm' has a negative mass"),
         (HINGE, "", "one root link, this file has 2: palm, finger"),
         (f'<link name="finger">{BOX}</link>{HINGE}', "", r"'tiny' has no joint that moves \(1 links\)"),
+        ('<child link="finger"/>', '<child link="thumb"/>', "child link 'thumb', which the file does not define"),
+        ('xyz="0 1 0"', 'xyz="0 up 0"', "<axis xyz='0 up 0'>: expected 3 finite number"),
+        ('size="0.02 0.02 0.04"', 'size="0.02 0 0.04"', "sizes must be positive"),
+        ("</robot>", LOOP, "not reachable from the root: x, y"),
         ("</robot>", HINGE.replace('"hinge"', '"second"') + "</robot>", "link 'finger' is the child of two joints"),
     ],
 )

@@ -1,0 +1,77 @@
+"""Grasps for a folder of objects: python examples/many_objects.py OUT OBJECT ... (files, folders or shape:NAME).
+
+One JSON file an object and one table of all; an object that cannot be used costs a line, not the run. What is done
+already is skipped, so that the same command resumes. Several processes, each on one core, share the work.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+
+import graspd_core as graspd
+
+ENDINGS = (".obj", ".stl", ".ply", ".off", ".glb", ".dae")
+HAND, PRESET, COUNT = "allegro_right", "fast", 4
+
+
+@cache
+def hand() -> graspd.HandModel:
+    """Loaded once a process; one thread, since the processes fill the cores."""
+    torch.set_num_threads(1)
+    return graspd.load_hand(HAND)
+
+
+def objects(arguments: Sequence[str]) -> Iterator[str]:
+    """Every object that the arguments name."""
+    for argument in arguments:
+        folder = Path(argument)
+        if folder.is_dir():
+            yield from sorted(str(path) for path in folder.rglob("*") if path.suffix in ENDINGS)
+        else:
+            yield argument
+
+
+def verified(grasps: Sequence[graspd.Grasp]) -> int:
+    """How many grasps held."""
+    return sum(grasp.verdict is graspd.Verdict.VERIFIED for grasp in grasps)
+
+
+def plan(out: Path, source: str) -> tuple[str, int, str]:
+    """The object, how many grasps of it were verified, and how that ended."""
+    path = out / f"{source.replace('shape:', '').replace('/', '_')}.json"
+    try:
+        if path.exists():
+            return source, verified(graspd.load_grasps(path)), "done before"
+        scene, preset = graspd.load_scene(source), graspd.load_preset(PRESET)
+        result = graspd.plan_grasps(scene, hand(), count=COUNT, preset=preset, deadline=60.0)
+        graspd.save_result(path, result, scene.object, hand(), preset)
+    except graspd.GraspdError as error:
+        return source, 0, str(error)
+    return source, verified(result.grasps), result.outcome.name.lower()
+
+
+def main(arguments: Sequence[str], processes: int | None = None) -> int:
+    """The number of objects without a verified grasp."""
+    out, *named = arguments or ["grasps"]
+    out, sources = Path(out), list(objects(named or ["shape:mug", "shape:box"]))
+    with ProcessPoolExecutor(processes or os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        rows = list(pool.map(partial(plan, out), sources))
+    out.mkdir(exist_ok=True)
+    with (out / "objects.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([("object", "verified", "ending"), *rows])
+    for source, count, ending in rows:
+        print(f"{count:>3} verified  {source}: {ending}")
+    return sum(count == 0 for _, count, _ in rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,68 @@
+"""A trial of somebody else's grasp: python examples/try_your_grasp.py [OBJECT].
+
+Another planner gives the pose of a gripper and the width of what it holds. `verify_grasps` tries it in MuJoCo and
+measures it exactly as graspd's own are. For a hand of many joints, give its three postures in the same way.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graspd_core import Grasp, HandModel, Posture, load_hand, load_scene, verify_grasps
+
+OPENING, PRESS = 0.015, 0.010  # by how much each jaw opens before, and wants to close after the touch [m]
+
+
+@dataclass(frozen=True)
+class GripperGrasp:
+    """What another planner gives.
+
+    Attributes:
+        position: of the gripper's base in the object's frame [m].
+        quaternion_wxyz: of the gripper's base; z is the way it approaches, the jaws close along y.
+        width: between the jaws where they touch [m].
+    """
+
+    position: tuple[float, float, float]
+    quaternion_wxyz: tuple[float, float, float, float]
+    width: float
+
+
+FROM_ABOVE, SIDEWAYS = (0.0, 1.0, 0.0, 0.0), (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0)
+# On a box of 6 x 6 x 9 cm about the origin.
+GRASPS = {
+    "from above": GripperGrasp((0.0, 0.0, 0.15), FROM_ABOVE, 0.06),
+    "turned by 90 degrees": GripperGrasp((0.0, 0.0, 0.15), SIDEWAYS, 0.06),
+    "beside the middle": GripperGrasp((0.028, 0.0, 0.168), FROM_ABOVE, 0.06),
+    "too high": GripperGrasp((0.0, 0.0, 0.30), FROM_ABOVE, 0.06),
+}
+
+
+def as_graspd(grasp: GripperGrasp, hand: HandModel) -> Grasp:
+    """The same as three postures: open and clear, touching, and the targets that press."""
+    touch = grasp.width / 2
+    jaws = [np.clip([jaw], hand.lower, hand.upper) for jaw in (touch + OPENING, touch, touch - PRESS)]
+    position, quaternion = np.array(grasp.position), np.array(grasp.quaternion_wxyz)
+    pregrasp, touching, squeeze = (Posture(position, quaternion, jaw) for jaw in jaws)
+    return Grasp(pregrasp, touching, squeeze)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """How many of the grasps failed."""
+    scene, hand = load_scene(*(arguments or ["shape:box"]), mass=0.2, friction=0.6), load_hand("parallel_gripper")
+    tried = verify_grasps(scene, hand, [as_graspd(grasp, hand) for grasp in GRASPS.values()], verify="standard")
+    for name, grasp in zip(GRASPS, tried, strict=True):
+        moved = ", ".join(
+            f"moved {trial.displacement * 100:.1f} cm in the {trial.name} trial" for trial in grasp.trials
+        )
+        area = (grasp.metrics or {})["contact_area"] or 0.0
+        print(f"{name}: {grasp.verdict}; {grasp.reason or moved}; contact area {area * 1e4:.1f} cm²")
+    return sum(not trial.passed for grasp in tried for trial in grasp.trials)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,53 @@
+"""A metric of your own, measured like the built-in ones: python examples/your_own_metric.py [OBJECT].
+
+A metric is one row of a dictionary. From then on every verified grasp has it, and files and tables show it. It sees the
+hand's surface samples in the object's frame (`grasp.placed`), the object and the hand (`grasp.context`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from graspd_core import METRICS, Metric, Verdict, load_hand, load_preset, load_scene, plan_grasps, save_result
+from graspd_core.metrics.prepared_grasp import PreparedGrasp
+
+TOUCHING = 0.002  # distance to the object that counts as contact [m]
+
+
+def contact_offset(grasp: PreparedGrasp) -> float | None:
+    """Distance of the contacts' centroid, weighted by area, to the centre of mass [m]; None without a contact."""
+    touching = np.abs(grasp.placed.distance) <= TOUCHING
+    if not touching.any():
+        return None
+    centroid = np.average(grasp.placed.points[touching], axis=0, weights=grasp.placed.areas[touching])
+    return float(np.linalg.norm(centroid - grasp.context.target.center_of_mass))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """0 when there is a verified grasp, else 1."""
+    METRICS["contact_offset"] = Metric(
+        name="contact_offset",
+        unit="mm",
+        scale=1e3,
+        measure=contact_offset,
+        description="distance of the contacts' centroid to the centre of mass",
+        digits=1,
+    )
+    scene, hand, preset = load_scene(*(arguments or ["shape:hammer"])), load_hand("allegro_right"), load_preset("fast")
+    result = plan_grasps(scene, hand, count=4, seed=0, preset=preset)
+    held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED and grasp.metrics]
+    # The steadiest first: held near the centre of mass.
+    held.sort(key=lambda grasp: (grasp.metrics or {}).get("contact_offset") or np.inf)
+    for grasp in held:
+        values = [(METRICS[name], (grasp.metrics or {})[name]) for name in ("contact_offset", "penetration", "epsilon")]
+        print(", ".join(row.text(value) for row, value in values if value is not None))
+    save_result("grasps.json", result, scene.object, hand, preset)
+    print('grasps.json: each grasp has "contact_offset_mm" among its metrics')
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

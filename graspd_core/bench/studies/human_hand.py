@@ -1,0 +1,116 @@
+"""Human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
+
+    graspd bench mano --hand MANO_RIGHT.pkl
+
+The model is the user's (https://mano.is.tue.mpg.de; never shipped). All grasps go through the hold trial, and the two
+best ranked of every object are measured, as the paper does. Area and volume are those of the skinned mesh; the trials
+use the convex hulls that stand for it. The paper's row is of 57 ShapeNet objects: these are other objects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
+from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
+from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
+from graspd_core.bench.report import markdown_table
+from graspd_core.bench.study import Record, Request, Sections, object_hash, thing_name
+from graspd_core.errors import ConfigError
+from graspd_core.hands.mano.mano_hand import load_mano
+from graspd_core.mesh.mesh_distance import make_distance_query
+from graspd_core.methods.plan_config import to_mapping
+from graspd_core.metrics.skin_metrics import measure_skin
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import object_parts
+from graspd_core.trials.hold_trial import hold_trial
+from graspd_core.trials.world import PROTOCOLS, build_world
+
+SHAPES = ("shape:sphere", "shape:cylinder", "shape:box")
+BEST = 2
+# Turpin et al. 2022, table 1, MANO: mean over 57 ShapeNet objects of the two best grasps each.
+PAPER = {"Grasp'D": (43.0, 5.70, 7.55, 0.59), "ObMan / GraspIt!": (9.4, 1.28, 7.37, 1.95)}
+_HEADINGS = ["object", "held, raw", "contact area cm² within 2 mm (5, 10)", "intersection cm³", "CA/IV 1/cm"]
+_HEADINGS += ["displacement cm", "penetration mm"]
+
+
+@dataclass(frozen=True)
+class HumanGrasps(ObjectCase):
+    """Grasps of an object with the model in a file."""
+
+    content: str = ""
+
+    def asked(self) -> Record:
+        return {**asdict(self), "hand": "", "object": object_hash(self.object), "settings": to_mapping(self.config)}
+
+
+def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
+    """One an object and seed. Raises ConfigError: the hand is not a file."""
+    model = Path(request.hand)
+    if not model.is_file():
+        raise ConfigError(f"hand: {request.hand or 'none given'}; valid: MANO_RIGHT.pkl or MANO_LEFT.pkl, as a path")
+    content = hashlib.sha256(model.read_bytes()).hexdigest()
+    return tuple(HumanGrasps(**vars(case), content=content) for case in object_cases(request, SHAPES, 8))
+
+
+def run_mano(case: HumanGrasps) -> Record:
+    """Plan on one object, try every grasp, measure the best."""
+    config = case.config
+    mano = load_mano(Path(case.hand), [], candidates=config.problem.fine_candidates)
+    scene = load_scene(case.object, resolution=config.resolution)
+    began = time.process_time()
+    grasps = raw_grasps(scene, mano.model, config, case.count, case.seed)
+    seconds = (time.process_time() - began) / case.count
+    parts = object_parts(scene.object)
+    world = build_world(mano.model, scene.object, parts, PROTOCOLS["standard"])
+    holds = [hold_trial(world, grasp, PROTOCOLS["standard"]) for grasp in grasps]
+    query = make_distance_query(scene.object.mesh)
+    skins = [measure_skin(query, mano.skinned_mesh(grasp.grasp)) for grasp in grasps[:BEST]]
+    bullet = build_bullet_world(mano.model, scene.object, parts) if bullet_available() else None
+    return {
+        "held": sum(hold.passed for hold in holds),
+        "reasons": [hold.reason for hold in holds if not hold.passed],
+        "contact_area_cm2": [[area * 1e4 for area in skin.contact_area] for skin in skins],
+        "intersection_volume_cm3": [skin.intersection_volume * 1e6 for skin in skins],
+        "penetration_mm": [skin.penetration * 1e3 for skin in skins],
+        "displacement_cm": [bullet_displacement(bullet, g.grasp) * 100 for g in grasps[:BEST]] if bullet else [],
+        "cpu_seconds_per_grasp": seconds,
+    }
+
+
+def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The objects, their mean, and the paper's rows, as Markdown."""
+    good = [record for record in records if not record["error"]]
+    measured = [record for record in good if record["contact_area_cm2"]]
+    body = [_row(thing_name(r["object"]), f"{r['held']}/{r['count']}", [r]) for r in measured]
+    body += [[thing_name(r["object"]), "no grasp found", *[""] * 5] for r in good if r not in measured]
+    if measured:
+        share = sum(r["held"] for r in good) / sum(r["count"] for r in good)
+        body.append(_row("**mean**", f"{share:.0%}", measured))
+    for name, (area, volume, ratio, moved) in PAPER.items():
+        body.append([f"{name}, as published", "", f"{area}", f"{volume:.2f}", f"{ratio}", f"{moved}", ""])
+    return {"mano": [markdown_table(_HEADINGS, body)]}
+
+
+def _row(name: str, held: str, records: Sequence[Record]) -> list[str]:
+    def mean(key: str) -> float | None:
+        values = [value for record in records for value in record[key]]
+        return float(np.mean(values)) if values else None
+
+    area = np.mean([areas for record in records for areas in record["contact_area_cm2"]], axis=0)
+    volume, moved, depth = (mean(k) for k in ("intersection_volume_cm3", "displacement_cm", "penetration_mm"))
+    return [
+        name,
+        held,
+        f"{area[0]:.1f} ({area[1]:.1f}, {area[2]:.1f})",
+        f"{volume:.2f}",
+        f"{area[0] / volume:.2f}" if volume else "none",
+        "no pybullet" if moved is None else f"{moved:.2f}",
+        f"{depth:.1f}",
+    ]

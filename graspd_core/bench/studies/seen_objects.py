@@ -1,0 +1,151 @@
+"""What a camera sees of a thing on a table, to grasps that are tried on the truth: study `rgbd`.
+
+Every case is rendered with the sensor noise of a D415 and goes through segmentation, reconstruction and `plan_grasps`
+as a user's clouds do; every grasp that was verified on the reconstruction is tried again on the true mesh.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from graspd_core.bench.object_case import ObjectCase, object_cases
+from graspd_core.bench.study import Record, Request
+from graspd_core.errors import GraspdError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import load_mesh, surface_samples
+from graspd_core.mesh.sdf import build_sdf
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
+from graspd_core.mesh.topology import is_closed
+from graspd_core.mesh.winding_number import winding_inside
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.rendering.depth_noise import DEFAULT
+from graspd_core.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
+from graspd_core.runtime import disk_cache
+from graspd_core.scene.scene import Obstacle, Scene, build_scene, object_parts
+from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.trials.hold_trial import hold_trial
+from graspd_core.trials.lift_trial import lift_trial
+from graspd_core.trials.world import PROTOCOLS, build_world
+from graspd_core.types import Grasp, GraspResult, Verdict
+
+SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
+# Cameras; 0 plans on the true mesh.
+VIEWS = (0, 1, 3, 15)
+# Elevation of the camera at each start: a robot looks at its table from half above [deg].
+ELEVATIONS = (40.0, 50.0, 30.0)
+YAW = 0.3
+# Where a sphere of 5 mm about a true point meets the reconstruction, that point counts as found.
+FOUND, SAMPLES = 0.005, 20_000
+
+
+@dataclass(frozen=True)
+class Seen(ObjectCase):
+    """Grasps of what `views` cameras see; 0 plans on the true mesh. The seed is of noise and grasps, and of the place
+    of the first camera."""
+
+    views: int = 1
+
+
+def seen_cases(request: Request) -> tuple[Seen, ...]:
+    """Every object from every number of views, by default from two places."""
+    request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
+    cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
+    return tuple(Seen(**vars(case), views=views) for case in cases for views in VIEWS[: 2 if request.quick else None])
+
+
+def seen_seconds(case: Seen) -> float:
+    """CPU seconds of a case, roughly."""
+    return 4.0 + 0.4 * case.count + 0.6 * case.views
+
+
+def run_seen(case: Seen) -> Record:
+    """Everything that is reported of one case; a refusal is a result with its message."""
+    hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
+    thing = case.object.removeprefix("shape:")
+    stage = tabletop(thing if case.object.startswith("shape:") else load_mesh(case.object), yaw=YAW)
+    clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
+    _load_libraries()
+    # Or the full mesh would be met again at its next start.
+    disk_cache.forget()
+    began = time.perf_counter()
+    try:
+        scene = scene_from_views(clouds) if case.views else _true_scene(stage, case.object)
+    except GraspdError as error:
+        return {"refused": str(error), "scene_s": time.perf_counter() - began, "verified": 0, "held": 0}
+    scene_s = time.perf_counter() - began
+    return {"scene_s": scene_s, **reconstruction_error(scene, stage), **_grasps(case, scene, stage, hand)}
+
+
+def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
+    """One camera, three around, or two rings of eight and seven."""
+    azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
+    elevation = np.deg2rad(ELEVATIONS[case.seed % len(ELEVATIONS)])
+    if case.views <= 3:
+        return ring_poses(case.views, elevation=elevation, azimuth=azimuth)
+    upper = ring_poses(case.views // 2, elevation=np.deg2rad(60.0), azimuth=azimuth + 0.2)
+    return (*ring_poses(case.views - case.views // 2, elevation=np.deg2rad(30.0), azimuth=azimuth), *upper)
+
+
+@lru_cache(maxsize=1)
+def _load_libraries() -> None:
+    """Load what makes scenes of views, by a view of a ball."""
+    scene_from_views(views_of(tabletop("sphere"), CAMERA, ring_poses(1, elevation=0.8)))
+
+
+def _true_scene(stage: TabletopScene, source: str) -> Scene:
+    obstacles = tuple(Obstacle(mesh, build_sdf(mesh, resolution=32, padding=0.02)) for mesh in stage.obstacles)
+    return replace(build_scene(stage.truth, source=source), support=stage.support, obstacles=obstacles)
+
+
+def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
+    """Plan one grasp against the clock, then `count`; try all that were verified on the truth."""
+    first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
+    many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
+    protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
+    parts = object_parts(truth.object)
+    world = build_world(hand, truth.object, parts, protocol)
+    table = build_world(hand, truth.object, parts, protocol, stage.support, truth.obstacles)
+    one = [hold_trial(world, grasp, protocol) for grasp in _verified(first)]
+    holds = [(grasp, hold_trial(world, grasp, protocol)) for grasp in _verified(many)]
+    lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]
+    timing = first.timing
+    return {
+        "first_s": None if timing.first_verified is None else timing.first_verified - timing.load - timing.sdf,
+        "outcome": many.outcome.name,
+        "first_held": bool(one and one[0].passed),
+        "verified": len(holds),
+        "held": sum(hold.passed for _, hold in holds),
+        "lifted": sum(lift.passed for lift in lifts),
+        "reasons": [trial.reason for trial in (*(hold for _, hold in holds), *lifts) if not trial.passed],
+        "warnings": list(many.warnings),
+    }
+
+
+def _verified(result: GraspResult) -> list[Grasp]:
+    return [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+
+
+def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
+    """Distances between the reconstruction's surface and the true one, and whether it is closed.
+
+    chamfer_mm: mean of the mean distances either way [mm]; completeness: share of the true surface within 5 mm of the
+    reconstruction; beyond_10mm: share of the reconstruction farther than 10 mm from the truth.
+    """
+    points, normals = surface_samples(stage.truth, SAMPLES, 0)
+    # Bodies that overlap have surfaces that nobody could see.
+    outer = points[~winding_inside(stage.truth, points + 1e-4 * normals)]
+    found = surface_samples(scene.object.mesh, SAMPLES, 0)[0]
+    missing = surface_distance(make_surface(scene.object.mesh), outer)
+    stray = surface_distance(make_surface(stage.truth), found)
+    return {
+        "chamfer_mm": 500 * float(missing.mean() + stray.mean()),
+        "completeness": float((missing < FOUND).mean()),
+        "beyond_10mm": float((stray > 0.01).mean()),
+        "watertight": bool(is_closed(scene.object.mesh)),
+    }

@@ -1,0 +1,48 @@
+"""Other shapes that what was seen allows: its hidden side guessed by the rules that were not chosen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graspd_core.errors import GraspdError
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
+from graspd_core.reconstruction.evidence import Evidence
+from graspd_core.reconstruction.reconstruct import closed_mesh
+from graspd_core.reconstruction.shape_completion import RULES, guess_by
+from graspd_core.types import TriangleMesh
+
+# A trial feels no finer detail: cells along the longest side, Poisson's finest cell, and faces.
+_CELLS, _POISSON_CELL_M, _FACES = 40, 0.004, 4000
+# Two shapes nearer to each other than this are one [m].
+_SAME_M = 5e-4
+_SAMPLES = 1500
+
+
+def other_rules(evidence: Evidence | None) -> tuple[str, ...]:
+    """The rules that the reconstruction did not take, in the order of `RULES`; none where nothing was hidden."""
+    return () if evidence is None else tuple(rule for rule in RULES if rule != evidence.chosen)
+
+
+def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMesh | None:
+    """The object with its hidden side guessed by a rule, in the frame of the views [m].
+
+    None where the rule says nothing, no closed surface fits what it says, or the surface is that of `than`.
+    """
+    guess = guess_by(rule, evidence.seen, evidence.free_space, evidence.step)
+    if guess is None:
+        return None
+    settings = replace(
+        evidence.settings,
+        poisson_cell=max(evidence.settings.poisson_cell, _POISSON_CELL_M),
+        max_faces=min(evidence.settings.max_faces, _FACES),
+    )
+    try:
+        mesh = closed_mesh(evidence.seen, guess, evidence.free_space, evidence.step, settings, _CELLS)
+    except GraspdError:
+        return None
+    mesh = TriangleMesh(mesh.vertices @ evidence.rotation.T + evidence.origin, mesh.faces)
+    apart = surface_distance(make_surface(than), surface_samples(mesh, _SAMPLES, seed=0)[0])
+    return None if float(np.mean(apart)) < _SAME_M else mesh

@@ -1,0 +1,130 @@
+"""Grasps of an object of which one side was seen: what else may be true, how many survive it, what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from graspd_core.config import CertaintyConfig
+from graspd_core.config.certainty_config import HELD_AFTER
+from graspd_core.errors import ConfigError
+from graspd_core.hands.library import load_hand
+from graspd_core.methods.plan_config import load_preset
+from graspd_core.planning.hypotheses import Hypotheses, Hypothesis, try_hypotheses
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import Scene
+from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, TrialResult, Verdict
+
+POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
+GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 0.0)
+
+
+@cache
+def seen_from(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
+    """A cylinder on a table, seen by one camera, in coordinates moved by `shift` [m]."""
+    views = views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8))
+    return scene_from_views([PointCloud(view.points + shift, view.viewpoint + np.array(shift)) for view in views])
+
+
+def plan(scene: Scene, probability: float) -> GraspResult:
+    config = replace(load_preset("fast"), certainty=CertaintyConfig(probability))
+    return plan_grasps(scene, load_hand("allegro_right"), count=3, preset=config, measure=False)
+
+
+def under(*passed: bool) -> Hypotheses:
+    def hypothesis(number: int, held: bool) -> Hypothesis:
+        result = TrialResult("hold", held, 0.01 * number, 0.0, "" if held else "the object moved")
+        return Hypothesis(f"number {number}", lambda grasp, stop: result)
+
+    return Hypotheses(tuple(hypothesis(number, held) for number, held in enumerate(passed)), allowed=1)
+
+
+@pytest.mark.parametrize(
+    ("passed", "verified", "probability"),
+    [
+        ((True, True, True), True, HELD_AFTER[0]),
+        ((True, False, True), True, HELD_AFTER[1]),
+        ((False, True, False), False, HELD_AFTER[2]),
+    ],
+)
+def test_a_grasp_may_fail_under_as_many_as_are_allowed(passed, verified, probability):
+    result, likely = try_hypotheses(under(*passed), GRASP, lambda: False)
+    assert (result.name, result.passed, likely) == (HYPOTHESES, verified, probability)
+    assert bool(result.reason) is not verified
+    assert result.displacement == max(0.01 * number for number, held in enumerate(passed) if held)
+
+
+def test_the_reason_names_what_the_grasp_failed_under():
+    result, _ = try_hypotheses(under(False, True, False), GRASP, lambda: False)
+    assert "number 0: the object moved; number 2: the object moved" in result.reason
+
+
+def test_nothing_is_tried_after_the_last_that_is_allowed():
+    def never(grasp, stop):
+        raise AssertionError("tried")
+
+    failing = under(False, False)
+    try_hypotheses(Hypotheses((*failing.items, Hypothesis("late", never)), 1), GRASP, lambda: False)
+
+
+def test_a_grasp_that_was_stopped_is_not_verified():
+    assert not try_hypotheses(under(True), GRASP, lambda: True)[0].passed
+
+
+def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
+    result = plan(seen_from(), 0.9)
+    verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+    assert verified
+    for grasp in verified:
+        assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
+        assert grasp.probability is not None
+        assert grasp.probability >= 0.9
+    for grasp in result.grasps:
+        if grasp.verdict is Verdict.UNVERIFIED:
+            assert not grasp.usable
+            assert grasp.probability is not None
+            assert grasp.probability < 0.9
+    order = [grasp.verdict for grasp in result.grasps]
+    assert order == sorted(order, key=[Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED].index)
+
+
+def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape():
+    result = plan(seen_from(), 0.0)
+    assert all(grasp.probability is None for grasp in result.grasps)
+    assert all(trial.name != HYPOTHESES for grasp in result.grasps for trial in grasp.trials)
+
+
+def test_a_mesh_is_not_doubted():
+    result = plan(load_scene("shape:cylinder"), 0.9)
+    assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.grasps)
+
+
+def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from(monkeypatch):
+    monkeypatch.setattr("graspd_core.planning.hypotheses._LESS_FRICTION", 0.01)
+    monkeypatch.setattr(
+        "graspd_core.planning.hypotheses.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
+    )
+    result = plan(seen_from(), 0.95)
+    assert result.grasps
+    assert not any(grasp.usable for grasp in result.grasps)
+    assert result.grasps[0].verdict is Verdict.UNVERIFIED
+    assert "none is sure enough" in result.message
+    assert result.next_view is not None
+
+
+def test_far_from_the_origin_the_other_shapes_are_where_the_object_is():
+    near, far = plan(seen_from(), 0.9), plan(seen_from((300.0, -200.0, 100.0)), 0.9)
+    assert sum(grasp.usable for grasp in far.grasps) == sum(grasp.usable for grasp in near.grasps) == 3
+
+
+@pytest.mark.parametrize("probability", [-0.1, 0.99, float("nan")])
+def test_no_grasp_can_be_surer_than_was_ever_measured(probability):
+    with pytest.raises(ConfigError, match=r"certainty.probability: .*; valid: 0 to"):
+        CertaintyConfig(probability)
