@@ -38,8 +38,8 @@ docs: setup  ## the pages of docs/ and the reference of the library, to build/si
 	$(RUN)/mkdocs build
 	@echo build/site/index.html
 
-pictures: setup  ## the picture of README.md anew
-	$(RUN)/python scripts/pictures.py
+pictures: setup  ## the pictures of README.md and docs/viewer.md anew, the same every time (half a minute)
+	$(RUN)/python benchmarks/pictures.py
 
 wheel: setup  ## a source distribution and a wheel, to dist/
 	$(RUN)/python -m build

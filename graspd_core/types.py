@@ -204,7 +204,25 @@ class Progress:
     elapsed: float
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """The hands that a run works on at one moment, object frame: starts on their way, or candidates on trial.
+
+    Attributes:
+        positions: of their base links [m].
+        quaternions_wxyz: of their base links, any non-zero length.
+        joint_positions: [rad] or [m].
+        verdicts: of candidates, in their order; those that are not tried yet are unverified. Empty while optimising.
+    """
+
+    positions: Float[np.ndarray, "hands 3"]
+    quaternions_wxyz: Float[np.ndarray, "hands 4"]
+    joint_positions: Float[np.ndarray, "hands joints"]
+    verdicts: tuple[Verdict, ...] = ()
+
+
 ProgressHook = Callable[[Progress], None]
+WatchHook = Callable[[Snapshot], None]
 StopHook = Callable[[], bool]
 
 

@@ -77,10 +77,11 @@ MAY_IMPORT = {
     "__init__": BELOW_PLANNING | {"planning"},
     "bench": BELOW_PLANNING | {"planning", "__init__"},
     "doctor": BELOW_PLANNING | {"planning", "__init__"},
-    "cli": BELOW_PLANNING | {"planning", "bench", "doctor", "__init__"},
+    "viewer": BELOW_PLANNING | {"planning", "bench", "__init__"},
+    "cli": BELOW_PLANNING | {"planning", "bench", "doctor", "viewer", "__init__"},
 }
-# What the node sees: the public names, values, and what only a process that serves needs.
-NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags"}
+# What the node sees: the public names, values, the viewer, and what only a process that serves needs.
+NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags", "viewer"}
 NODE_SEES |= {"runtime", "hands", "pointcloud", "formats", "planning"}
 
 # library: where it may be imported, as a path prefix below the repository root
@@ -94,9 +95,10 @@ CONFINED = {
         "graspd_core/reconstruction/",
     ),
     "matplotlib": ("graspd_core/bench/charts/",),
+    "viser": ("graspd_core/viewer/",),
 }
 HEAVY = {"open3d", "trimesh", "igl", "vhacdx", "mujoco", "matplotlib", "fast_simplification"}
-HEAVY |= {"pybullet"}
+HEAVY |= {"pybullet", "viser"}
 ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
 
 

@@ -23,7 +23,7 @@ from graspd_core.formats.grasps_json import save_text
 
 FORMAT, VERSION = "graspd/bench", 2
 # Parts of the package that no figure depends on; of the benchmark itself, a study names its own.
-_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench")
+_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench", "viewer")
 
 
 def case_key(study: str, case: Case) -> str:
@@ -101,7 +101,7 @@ def read_results(path: Path) -> list[Record]:
 
 @lru_cache
 def code_version(sources: tuple[str, ...] = ()) -> str:
-    """The package's version and a hash of the sources that figures depend on: all but command line, charts and bags.
+    """The package's version and a hash of the sources that figures depend on: all but those of `_BESIDE`.
 
     The kernel's C++ counts. Of the benchmark itself only the files that the globs `sources` name below `bench` do.
     """

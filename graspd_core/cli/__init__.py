@@ -1,6 +1,6 @@
 """The command line, one file a command; heavy imports wait for who needs them.
 
-graspd synthesize | replay | reconstruct | bench | hands | doctor
+graspd synthesize | view | replay | reconstruct | bench | hands | doctor
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from graspd_core.cli import hands_command as hands
 from graspd_core.cli import reconstruct_command as reconstruct
 from graspd_core.cli import replay_command as replay
 from graspd_core.cli import synthesize_command as synthesize
+from graspd_core.cli import view_command as view
 from graspd_core.cli.deadline import process_began
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from graspd_core.errors import ConfigError, GraspdError
@@ -61,6 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="graspd", description="Verified grasps for multi-fingered hands.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
     synthesize.add_command(commands)
+    view.add_command(commands)
     replay.add_command(commands)
     reconstruct.add_command(commands)
     bench.add_command(commands)

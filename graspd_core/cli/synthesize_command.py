@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.cloud_options import add_object_options, scene_config_of, target_of
 from graspd_core.cli.deadline import Deadline, DeadlinePassed
@@ -18,6 +18,13 @@ from graspd_core.cli.planning_options import (
     summary,
 )
 from graspd_core.cli.running import Interrupt, Reporter
+from graspd_core.cli.view_command import add_address, watched
+from graspd_core.types import GraspResult
+
+if TYPE_CHECKING:
+    from graspd_core.hands.model import HandModel
+    from graspd_core.methods.plan_config import PlanConfig
+    from graspd_core.scene.scene import Scene
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 
@@ -34,13 +41,14 @@ def add_command(commands: Any) -> None:
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
     parser.add_argument("--out", type=Path, default=None, metavar="grasps.json")
     parser.add_argument("--html", type=Path, default=None, metavar="view.html")
+    parser.add_argument("--view", action="store_true", help="watch it in a browser (docs/viewer.md)")
+    add_address(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Returns the exit status."""
-    from graspd_core.formats.grasps_json import check_writable, save_result
+    from graspd_core.formats.grasps_json import check_writable
     from graspd_core.hands.library import load_hand
-    from graspd_core.metrics.diversity import distinct
     from graspd_core.planning.plan_grasps import plan_grasps
     from graspd_core.scene.load_scene import load_scene
 
@@ -69,9 +77,22 @@ def run(options: argparse.Namespace) -> int:
         return exit_status(result)
     for warning in scene.object.warnings:
         print(f"graspd: {warning}", file=sys.stderr)
-    with Reporter() as reporter, Interrupt() as interrupt:
-        hooks = {"progress": reporter, "stop": interrupt.came}
-        result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
+    with watched(options, scene, hand, config) as page:
+        with Reporter() as reporter, Interrupt() as interrupt:
+            hooks = {"progress": page.progress(reporter), "watch": page.watch, "stop": interrupt.came}
+            result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
+        _report(options, result, scene, hand, config)
+        page.show(result)
+    return exit_status(result)
+
+
+def _report(
+    options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
+) -> None:
+    """Write what was found where that was asked for, and say it."""
+    from graspd_core.formats.grasps_json import save_result
+    from graspd_core.metrics.diversity import distinct
+
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html:
@@ -80,4 +101,3 @@ def run(options: argparse.Namespace) -> int:
         save_view(options.html, scene.object.mesh, hand, result.grasps)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
-    return exit_status(result)

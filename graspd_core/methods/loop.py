@@ -48,12 +48,14 @@ class Hooks:
         stop: true ends the run within one step.
         deadline: `time.perf_counter()` value at which the run ends within one step.
         interval: least time between reports [s].
+        watch: called with the best poses so far beside every report; None where nobody looks.
     """
 
     report: Callable[[int, int, float], None] = field(default=lambda step, steps, loss: None)
     stop: Callable[[], bool] = field(default=lambda: False)
     deadline: float = float("inf")
     interval: float = 0.1
+    watch: Callable[[Poses], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,10 @@ def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -
         state = solver.step(problem, state, done)
         done += 1
         if now - last_report >= hooks.interval or done == solver.steps:
-            hooks.report(done, solver.steps, float(solver.best(state)[1].min()))
+            poses, loss = solver.best(state)
+            hooks.report(done, solver.steps, float(loss.min()))
+            if hooks.watch is not None:
+                hooks.watch(poses)
             last_report = now
     poses, loss = solver.best(state)
     return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), done, interrupted)

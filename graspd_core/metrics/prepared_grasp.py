@@ -13,7 +13,7 @@ from graspd_core.mesh.sharp_features import farthest_points
 from graspd_core.metrics import intersection
 from graspd_core.metrics.hand_contacts import PlacedHand, placed_hand, touching
 from graspd_core.metrics.metrics_context import MetricsContext
-from graspd_core.metrics.wrench_hull import wrench_hull
+from graspd_core.metrics.wrench_hull import weakest_push, wrench_hull
 from graspd_core.types import Posture
 
 # Contacts that the wrench hull is made of. The protocol allows 32, whose hull in six dimensions has some 22,000 facets
@@ -40,10 +40,20 @@ class PreparedGrasp:
     @cached_property
     def wrench_hull(self) -> tuple[float, float]:
         """Ferrari-Canny radius and volume of the grasp wrench hull."""
+        return wrench_hull(*self._contacts)
+
+    @cached_property
+    def weakest_push(self) -> Float[np.ndarray, "6"] | None:
+        """The unit disturbance that the wrench hull resists least (force, torque over the object's radius)."""
+        return weakest_push(*self._contacts)
+
+    @property
+    def _contacts(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float, float]:
+        """Arms [m], normals, friction and torque scale [m] of the contacts that the wrench hull is made of."""
         target, points = self.context.target, self.placed.points[touching(self.placed)]
         chosen = points[farthest_points(points, self.max_contacts)]
         normals = surface_normals(self.context.query, chosen)
-        return wrench_hull(chosen - target.center_of_mass, normals, target.friction, target.radius)
+        return chosen - target.center_of_mass, normals, target.friction, target.radius
 
     @cached_property
     def intersection_volume(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -24,17 +26,35 @@ def wrench_hull(
     Returns:
         Radius of the largest origin-centred ball in the hull (0 where the origin is outside) and the hull's volume.
     """
+    hull = _hull(arms, normals, friction, length)
+    return (0.0, 0.0) if hull is None else (max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume))
+
+
+def weakest_push(
+    arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
+) -> Float[np.ndarray, "6"] | None:
+    """The unit disturbance (force, torque over length) that contacts resist least: against the hull's nearest facet.
+
+    Arguments as of `wrench_hull`. None where the hull does not hold the origin.
+    """
+    hull = _hull(arms, normals, friction, length)
+    if hull is None or hull.equations[:, -1].max() >= 0:
+        return None
+    return -hull.equations[hull.equations[:, -1].argmax(), :-1]
+
+
+def _hull(arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float) -> Any:
+    """The convex hull of the contacts' wrenches; None where it has no volume."""
     from scipy.spatial import ConvexHull
 
     if len(arms) < 2:
-        return 0.0, 0.0
+        return None
     wrenches = cone_wrenches(arms, normals, friction, length)
     extent = np.linalg.svd(wrenches - wrenches.mean(0), compute_uv=False)
     if extent[-1] <= _FLAT * extent[0]:
-        return 0.0, 0.0
+        return None
     # Joggled by some 1e-10: takes half the time of merging facets, and is the same every time.
-    hull = ConvexHull(wrenches, qhull_options="QJ")
-    return max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume)
+    return ConvexHull(wrenches, qhull_options="QJ")
 
 
 def cone_wrenches(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict
+from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
 
 
 def plan_grasps(
@@ -42,6 +43,7 @@ def plan_grasps(
     measure: bool = True,
     progress: ProgressHook | None = None,
     stop: StopHook | None = None,
+    watch: WatchHook | None = None,
 ) -> GraspResult:
     """Plan grasps and try them in rank order until `count` pass all trials of the scene; those that fail come last.
 
@@ -56,6 +58,7 @@ def plan_grasps(
         device: of the optimiser's tensors.
         measure: whether grasps get their metrics, those that failed a trial excepted; it takes longer than a trial.
         progress: called from this thread with `Progress` values.
+        watch: called from this thread with the hands that the run works on.
         stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
 
     Raises:
@@ -63,23 +66,34 @@ def plan_grasps(
         ResourceError: the machine has too little memory for so many grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
-    check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
-    run = Run(time.perf_counter(), deadline, progress, stop)
-    support, message, far, rounds = scene.support, "", np.zeros(3), []
-    if not run.over():  # else it begins nothing
-        scene, far = planning_scene(scene, config.resolution)
-        hand = with_candidates(hand, config.problem.fine_candidates)
-        message = out_of_reach(scene, hand)
-        rounds = [] if message else rounds_of(scene, config, verify)
+    request: dict[str, Any] = {"count": count, "seed": seed, "verify": verify, "device": device}
+    check_request(deadline=deadline, **request)
+    run = Run(time.perf_counter(), deadline, progress, stop, watch)
+    support = scene.support
+    scene, hand, message, rounds = _prepared(run, scene, hand, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    request = {"count": count, "seed": seed, "verify": verify, "device": device, "measure": measure}
-    found = run_rounds(run, scene, hand, rounds, parts, **request)
-    moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
+    found = run_rounds(run, scene, hand, rounds, parts, measure=measure, **request)
+    moved = tuple(moved_grasp(grasp, run.origin) for grasp in _ranked(run, found, config, seed))
     outcome, timing = run.outcome(bool(moved), found.good, count), _timing(run, scene, found)
     result = GraspResult(outcome, moved, timing, seed, config.method, message)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     result = replace(result, warnings=scene.object.warnings, support=support, audits=found.audits)
-    return result if found.good else _less_sure(scene, far, result)
+    return result if found.good else _less_sure(scene, run.origin, result)
+
+
+def _prepared(
+    run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str
+) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
+    """Scene and hand as they are planned on, why the hand can hold nothing there, and the rounds to run.
+
+    A run that is over before it began begins nothing.
+    """
+    if run.over():
+        return scene, hand, "", []
+    scene, run.origin = planning_scene(scene, config.resolution)
+    hand = with_candidates(hand, config.problem.fine_candidates)
+    message = out_of_reach(scene, hand)
+    return scene, hand, message, [] if message else rounds_of(scene, config, verify)
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:

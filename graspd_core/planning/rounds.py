@@ -9,6 +9,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.methods.poses import Poses
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import (
@@ -21,7 +22,7 @@ from graspd_core.planning.verification import (
     surest_first,
 )
 from graspd_core.scene.scene import Scene
-from graspd_core.types import AuditCount, Grasp, Stage
+from graspd_core.types import AuditCount, Grasp, Snapshot, Stage
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
@@ -70,6 +71,11 @@ class RoundsResult:
         return sum(grasp.usable for grasp in self.grasps)
 
 
+def poses_seen(poses: Poses) -> Snapshot:
+    """The hands of an optimiser."""
+    return Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values()))
+
+
 def run_rounds(
     run: Run,
     scene: Scene,
@@ -99,6 +105,7 @@ def run_rounds(
             report=lambda step, of, loss, good=good: run.report(Stage.OPTIMISE, step, of, loss, good),
             # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.
             stop=run.over,
+            watch=None if run.watch is None else lambda poses: run.show(poses_seen(poses)),
         )
         seeded = seed + _SEED_STEP * attempt
         with enough_memory(f"{wanted} grasps at once"):

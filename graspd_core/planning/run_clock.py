@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
-from graspd_core.types import Outcome, Progress, ProgressHook, Stage, StopHook
+import numpy as np
+
+from graspd_core.types import Outcome, Progress, ProgressHook, Snapshot, Stage, StopHook, WatchHook
 
 
 class Run:
@@ -13,10 +16,21 @@ class Run:
     Attributes:
         began: `time.perf_counter()` value.
         cancelled: whether the stop hook has said so.
+        watch: sees the hands that the run works on, where somebody watches.
+        origin: of what the run works on, in the frame of the scene that it was given [m].
     """
 
-    def __init__(self, began: float, deadline: float | None, progress: ProgressHook | None, stop: StopHook | None):
+    def __init__(
+        self,
+        began: float,
+        deadline: float | None,
+        progress: ProgressHook | None,
+        stop: StopHook | None,
+        watch: WatchHook | None = None,
+    ):
         self.began = began
+        self.watch = watch
+        self.origin = np.zeros(3)
         self.cancelled = False
         self._end = began + deadline if deadline is not None else float("inf")
         self._progress, self._stop = progress, stop
@@ -38,6 +52,11 @@ class Run:
         """Tell the caller."""
         if self._progress is not None:
             self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began))
+
+    def show(self, seen: Snapshot) -> None:
+        """Let who watches see it."""
+        if self.watch is not None:
+            self.watch(replace(seen, positions=seen.positions + self.origin))
 
     def outcome(self, any_found: bool, good: int, count: int) -> Outcome:
         """How the run ended, with `good` of `count` grasps."""

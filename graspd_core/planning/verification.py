@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import chain, repeat
 
+import numpy as np
 import torch
 
 from graspd_core.config import CertaintyConfig, RobustConfig
@@ -25,7 +26,7 @@ from graspd_core.trials.audit import audited_trials
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, Protocol, at_friction
-from graspd_core.types import AuditCount, Grasp, GraspMetrics, Stage, StopHook, TriangleMesh, Verdict
+from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, TriangleMesh, Verdict
 
 Parts = Future[tuple[TriangleMesh, ...]]
 
@@ -115,6 +116,12 @@ class TriedGrasps:
     audits: AuditCount = field(default_factory=AuditCount)
 
 
+def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
+    """The hands of candidates, none of them tried."""
+    hands = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in candidates]
+    return Snapshot(*map(np.stack, zip(*hands, strict=True)), verdicts=(Verdict.UNVERIFIED,) * len(candidates))
+
+
 def run_trials(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> TriedGrasps:
@@ -125,6 +132,7 @@ def run_trials(
     verified: list[Grasp] = []
     others: list[Grasp] = []
     first, audits = None, AuditCount()
+    seen = None if run.watch is None else candidates_seen(candidates)
     trials = results_in_order(run, partial(_all_trials, context), candidates, torch.get_num_threads())
     with closing(trials):
         for index, (tried, audit) in enumerate(trials):
@@ -135,6 +143,9 @@ def run_trials(
             audits += audit
             first = first or (time.perf_counter() if passed else None)
             run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed)
+            if seen is not None:
+                seen = replace(seen, verdicts=(*seen.verdicts[:index], tried.verdict, *seen.verdicts[index + 1 :]))
+                run.show(seen)
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
                 tried = replace(tried, metrics=measure(context.metrics(), tried.grasp))

@@ -25,7 +25,7 @@ from graspd_core.trials.early_stop import (
     answer_known,
     stop_rule,
 )
-from graspd_core.trials.world import Protocol, World, trial_data
+from graspd_core.trials.world import Protocol, World, advance, trial_data
 from graspd_core.types import Grasp, Posture, TrialResult
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
@@ -86,7 +86,6 @@ def step_until_known(
 
     `worst` travel [m] and turn [rad] are brought up to date. Returns why the trial is over, empty if it is not.
     """
-    import mujoco
 
     rule, done = stop_rule(protocol), 0
     looks = 1 + rule.window // LOOK_EVERY if rule else 0
@@ -95,7 +94,7 @@ def step_until_known(
         if done % CHECK_EVERY == 0 and stop():
             return STOPPED
         count = min(LOOK_EVERY, steps - done)
-        mujoco.mj_step(world.model, data, count)
+        advance(world, data, count)
         done += count
         checked = done % CHECK_EVERY == 0 or done == steps
         reason = breach(world, data, protocol, worst) if checked else ""
@@ -193,12 +192,11 @@ def set_joints(world: World, data: Any, values: np.ndarray) -> None:
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
     """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
-    import mujoco
 
     steps = round(protocol.stage_time / protocol.timestep)
     for step in range(1, steps + 1):
         set_targets(data, start, end, step / steps)
-        mujoco.mj_step(world.model, data)
+        advance(world, data)
         if step % CHECK_EVERY == 0:
             reason = breach(world, data, protocol, worst)
             if reason:

@@ -35,7 +35,7 @@ from graspd_core.trials.hold_trial import (
     set_targets,
     step_until_known,
 )
-from graspd_core.trials.world import Protocol, World, trial_data
+from graspd_core.trials.world import Protocol, World, advance, trial_data
 from graspd_core.types import Grasp, Posture, TrialResult
 
 _COMING, _CLOSING, _LIFTING = "while the hand came", "while closing", "while lifting"
@@ -125,7 +125,6 @@ def _raise(
     stop: Callable[[], bool],
 ) -> str:
     """Come, close, squeeze and lift; returns why the trial is over, empty if it is not. Brings `worst` up to date."""
-    import mujoco
 
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
@@ -134,7 +133,7 @@ def _raise(
             set_targets(data, start, end, step / steps)
             if name == _LIFTING:
                 _sink(world, data, away if world.up is None else world.up, step / steps, settings)
-            mujoco.mj_step(world.model, data)
+            advance(world, data)
             if not touched and name in (_COMING, _CLOSING):
                 touched = _touches(world, data)
                 _rest(world, data)

@@ -13,7 +13,7 @@ published parameters. Nothing here is differentiable and nothing is shared with 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -120,6 +120,7 @@ class World:
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
         spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
+        watch: called with the `mujoco.MjData` after every step of a trial; None, as in planning, costs nothing.
     """
 
     model: Any
@@ -135,6 +136,7 @@ class World:
     coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     mimics: tuple[Mimic, ...] = ()
     spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
+    watch: Callable[[Any], None] | None = field(default=None, repr=False, compare=False)
 
 
 @contextmanager
@@ -153,6 +155,18 @@ def trial_data(world: World) -> Iterator[Any]:
         data = mujoco.MjData(world.model)
     yield data
     world.spare.append(data)
+
+
+def advance(world: World, data: Any, steps: int = 1) -> None:
+    """Simulate so many steps, under the eyes of who watches."""
+    import mujoco
+
+    if world.watch is None:
+        mujoco.mj_step(world.model, data, steps)
+        return
+    for _ in range(steps):
+        mujoco.mj_step(world.model, data)
+        world.watch(data)
 
 
 def build_world(

@@ -225,5 +225,5 @@ def test_objects_are_shapes_files_and_folders(tmp_path: Path):
 
 def test_an_override_names_what_it_does_not_know():
     assert override(PlanConfig(), {"problem.candidates": 7, "resolution": 9}).problem.candidates == 7
-    with pytest.raises(ConfigError, match="unknown key 'speed'; valid keys: closed_form"):
+    with pytest.raises(ConfigError, match="unknown key 'speed'; valid keys: certainty, closed_form"):
         override(PlanConfig(), {"speed": 1})

@@ -93,7 +93,7 @@ class _Follow:
     interrupted: str = ""
     reported: float = -float("inf")
 
-    def look(self, done: int, loss: Tensor) -> bool:
+    def look(self, done: int, state: AdamState) -> bool:
         """Report that so many steps are done; whether to stop."""
         now = time.perf_counter()
         if self.hooks.stop():
@@ -101,7 +101,9 @@ class _Follow:
         elif now >= self.hooks.deadline:
             self.interrupted = "deadline"
         elif done > 0 and (now - self.reported >= self.hooks.interval or done == self.steps):
-            self.hooks.report(done, self.steps, float(loss.min()))
+            self.hooks.report(done, self.steps, float(state.loss.min()))
+            if self.hooks.watch is not None:
+                self.hooks.watch(state.best()[0])
             self.reported = now
         return bool(self.interrupted)
 
@@ -112,7 +114,7 @@ def _run_steps(
     """The steps of a span, of every row of the state, in place; returns within milliseconds of an interruption."""
     begin, end = span
     rows = len(state.x)
-    if rows == 0 or follow.interrupted or follow.look(begin, state.loss):
+    if rows == 0 or follow.interrupted or follow.look(begin, state):
         return
     pointers = structs.State(**{name: getattr(state, name).data_ptr() for name in structs.names_of(structs.State)})
     arguments = byref(compiled.struct), byref(_schedule(config)), byref(pointers), rows, begin, end
@@ -120,11 +122,11 @@ def _run_steps(
         "graspd_run_steps",
         *arguments,
         torch.get_num_threads(),
-        watch=lambda done: follow.look(min(begin + done // rows, end - 1), state.loss),
+        watch=lambda done: follow.look(min(begin + done // rows, end - 1), state),
     )
     if not follow.interrupted:
         follow.done = end
-        follow.look(end, state.loss)
+        follow.look(end, state)
 
 
 def _schedule(config: ClosedFormConfig) -> structs.Schedule:

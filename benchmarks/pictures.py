@@ -1,0 +1,203 @@
+"""The pictures of the docs, drawn from what `graspd view` shows: plans and draws, the same every time. Not a test.
+
+    python benchmarks/pictures.py [--figures docs/figures]
+
+grasps.png of README.md, and view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and view_failed.png of
+docs/viewer.md: rays against the meshes of `graspd_core.viewer.drawing`, so that no browser and no screen is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+# One thread, said before torch is imported: the same grasps on machines with other cores.
+os.environ.update(OMP_NUM_THREADS="1")
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core import HandModel, PlanConfig, hand_names, load_hand, load_preset, load_scene, plan_grasps
+from graspd_core.rendering.depth_noise import DepthNoise
+from graspd_core.rendering.render import camera_of_view, look_at, render_scene, render_shaded, save_png
+from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
+from graspd_core.scene.scene import Scene, object_parts
+from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.se3 import perpendicular, rotation_from_quaternion
+from graspd_core.trials.trial_recording import record_trial
+from graspd_core.trials.trial_registry import build_worlds
+from graspd_core.trials.world import PROTOCOLS
+from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
+from graspd_core.viewer.drawing import SEEN, Part, contact_parts, force_parts, hand_parts, scene_parts, weakest_parts
+from graspd_core.viewer.mechanics import Mechanics
+from graspd_core.viewer.motion import STAGES, placed_links, posture_at
+from graspd_core.viewer.session import Session
+
+# What is grasped on the README's picture, and by which hand.
+PAIRS = (("shape:mug", "allegro_right"), ("shape:torus", "barrett_like"), ("shape:hammer", "leap_right"))
+# Ways to turn things before they are looked at [rad].
+TURNS = np.arange(0.0, 2 * np.pi, np.pi / 8)
+# Pixels of a picture's side; rays are cast through four times as many.
+SIDE, FINER = 360, 2
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.figures.mkdir(parents=True, exist_ok=True)
+    mug, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("balanced")
+    grasps = plan_grasps(mug, hand, count=8, preset=config, measure=False).grasps
+    pictures = {
+        "grasps": pairs(),
+        "view_hero": hero(mug, hand, config, grasps[0]),
+        "view_sequence": sequence(mug, hand, grasps[0]),
+        "view_cloud": cloud(),
+        "view_hands": hands(),
+        "view_failed": failed(),
+    }
+    for name, picture in pictures.items():
+        path = options.figures / f"{name}.png"
+        save_png(picture, path)
+        print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+def pairs() -> np.ndarray:
+    """Three hands, each with the best grasp that held."""
+    found = []
+    for source, name in PAIRS:
+        scene, hand = load_scene(source), load_hand(name)
+        best = plan_grasps(scene, hand, count=4, measure=False).grasps[0]
+        if best.verdict is not Verdict.VERIFIED:
+            raise RuntimeError(f"{source} by {name}: {best.reason}")
+        drawn, held = scene_parts(scene), at(hand, best.grasp)
+        found.append(shot(scene, drawn + held, near=1.25, turn=clearest(scene, drawn, held)))
+    return np.hstack(found)
+
+
+def hero(scene: Scene, hand: HandModel, config: PlanConfig, grasp: Grasp) -> np.ndarray:
+    """A grasp with its contacts, squeeze forces and weakest push, beside it without the hand."""
+    mechanics = Mechanics(Session("", hand, (grasp,), scene, config))
+    pressing, push = mechanics.squeeze_forces(grasp), mechanics.weakest_push(grasp)
+    marks = [*contact_parts(grasp.contacts), *force_parts(pressing.positions, pressing.forces)]
+    marks += weakest_parts(push, scene.object) if push is not None else []
+    drawn = scene_parts(scene)
+    return np.hstack([shot(scene, drawn + at(hand, grasp.squeeze), near=1.4), shot(scene, drawn + marks, near=1.4)])
+
+
+def sequence(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
+    """From the retreat to the squeeze."""
+    ways = (posture_at(hand, grasp, float(stage)) for stage in range(len(STAGES)))
+    return np.hstack([shot(scene, scene_parts(scene) + at(hand, way), width=0.9) for way in ways])
+
+
+def cloud() -> np.ndarray:
+    """A mug on a table as one depth camera sees it: what was seen and what was guessed, and a grasp of it."""
+    table = tabletop("mug", yaw=2.2)
+    camera = camera_of_view(320, 240)
+    poses = ring_poses(1, distance=0.5, elevation=0.7)
+    views = views_of(table, camera, poses, DepthNoise(), seed=0)
+    scene = scene_from_views(views)
+    hand = load_hand("allegro_right")
+    best = plan_grasps(scene, hand, count=1, preset="fast", measure=False).grasps[0]
+    drawn = scene_parts(scene)
+    seen = [dots(np.concatenate([view.points for view in views]), scene), *drawn[2:3]]
+    held = at(hand, best.grasp)
+    turn = clearest(scene, drawn[:2], held)
+    return np.hstack([shot(scene, p, near=1.3, turn=turn) for p in (seen, drawn, drawn + held)])
+
+
+def dots(points: np.ndarray, scene: Scene) -> Part:
+    """The points about the object as small solids."""
+    corners = scene.object.mesh.vertices
+    near = ((points > corners.min(0) - 0.03) & (points < corners.max(0) + 0.03)).all(1)
+    solid = 0.0008 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    kept = points[near]
+    vertices = (kept[:, None] + solid).reshape(-1, 3)
+    return Part("cloud", TriangleMesh(vertices, (faces + 4 * np.arange(len(kept))[:, None, None]).reshape(-1, 3)), SEEN)
+
+
+def hands() -> np.ndarray:
+    """Every hand that graspd ships with, on the same bottle."""
+    scene, found = load_scene("shape:bottle"), []
+    for name in hand_names():
+        hand = load_hand(name)
+        best = plan_grasps(scene, hand, count=1, preset="fast", measure=False).grasps[0]
+        found.append(shot(scene, scene_parts(scene) + at(hand, best.grasp), width=0.7, near=1.3))
+    return np.hstack(found)
+
+
+def failed() -> np.ndarray:
+    """A grasp that is told not to press: as it is pulled, half-way out, and at the moment of its failure."""
+    scene, hand = load_scene("shape:bottle"), load_hand("barrett_like")
+    grasp = plan_grasps(scene, hand, count=1, preset="fast", measure=False).grasps[0]
+    soft = grasp.grasp.joint_positions
+    weak = replace(grasp, squeeze=replace(grasp.squeeze, joint_positions=soft))
+    worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
+    frames = record_trial(worlds, weak, "hold").frames
+    begun = next(index for index, frame in enumerate(frames) if frame.stage == frames[-1].stage)
+    shots = []
+    for frame in (frames[begun], frames[(begun + len(frames)) // 2], frames[-1]):
+        links = [moved(part, frame.positions[link], frame.quaternions[link]) for link, part in hand_parts(hand).items()]
+        things = [moved(part, frame.positions[-1], frame.quaternions[-1]) for part in scene_parts(scene)]
+        shots.append(shot(scene, [*links, *things, *force_parts(frame.contacts, frame.forces)], near=0.9))
+    return np.hstack(shots)
+
+
+def at(hand: HandModel, posture: Posture) -> list[Part]:
+    """The hand at a posture."""
+    positions, quaternions = placed_links(hand, posture)
+    return [moved(part, positions[link], quaternions[link]) for link, part in hand_parts(hand).items()]
+
+
+def moved(part: Part, position: np.ndarray, quaternion: np.ndarray) -> Part:
+    """A part somewhere else."""
+    rotation = rotation_from_quaternion(torch.as_tensor(quaternion).double()).numpy()
+    return replace(part, mesh=TriangleMesh(part.mesh.vertices @ rotation.T + position, part.mesh.faces))
+
+
+def shot(
+    scene: Scene, parts: Sequence[Part], *, width: float = 1.0, near: float = 1.0, turn: float = 0.0
+) -> np.ndarray:
+    """A picture of parts, the support's free side up; `width` is its share of the height."""
+    meshes, pose = stood(scene, parts, near, turn)
+    colours = [part.colour for part in parts]
+    size = {"width": round(width * SIDE) * FINER, "height": SIDE * FINER}
+    fine = render_shaded(list(zip(meshes, colours, strict=True)), T_world_camera=pose, **size).astype(float)
+    rows, columns = SIDE, round(width * SIDE)
+    return fine.reshape(rows, FINER, columns, FINER, 3).mean((1, 3)).astype(np.uint8)
+
+
+def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> float:
+    """The turn in which the fewest of what is shown is hidden by what may be before it [rad]."""
+
+    def seen(turn: float) -> int:
+        meshes, pose = stood(scene, [*shown, *before], 1.0, turn)
+        return int(np.isin(render_scene(meshes, camera_of_view(60, 60), pose)[1], range(len(shown))).sum())
+
+    return max(TURNS, key=seen)
+
+
+def stood(
+    scene: Scene, parts: Sequence[Part], near: float, turn: float
+) -> tuple[list[TriangleMesh], Float[np.ndarray, "4 4"]]:
+    """Meshes with up at z, from where the light comes, turned about it; and the camera."""
+    corners = scene.object.mesh.vertices
+    middle = 0.5 * (corners.min(0) + corners.max(0))
+    up = np.array([0.0, 0.0, 1.0]) if scene.support is None else scene.support.normal
+    first = perpendicular(up)
+    side = np.cos(turn) * first + np.sin(turn) * np.cross(up, first)
+    rotation = np.stack([side, np.cross(up, side), up])
+    distance = (0.30 + 1.2 * float(np.ptp(corners, axis=0).max())) / near
+    pose = look_at(distance * np.array([0.75, 0.55, 0.45]), np.zeros(3))
+    return [TriangleMesh((p.mesh.vertices - middle) @ rotation.T, p.mesh.faces) for p in parts], pose
+
+
+if __name__ == "__main__":
+    main()

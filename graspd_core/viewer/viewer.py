@@ -1,0 +1,98 @@
+"""The page: its tabs, and the thread that draws. Runs until it is closed; visitors come and go."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from graspd_core.runtime.latest_jobs import LatestJobs
+from graspd_core.viewer.grasp_tab import GraspTab
+from graspd_core.viewer.help_text import HELP
+from graspd_core.viewer.live_view import LiveView
+from graspd_core.viewer.plan_tab import PlanTab
+from graspd_core.viewer.scene_nodes import SceneNodes
+from graspd_core.viewer.server import quiet, start_server
+from graspd_core.viewer.session import Session
+
+HOST, PORT = "127.0.0.1", 8080
+
+
+class Viewer:
+    """A page that shows sessions to whoever comes.
+
+    Args:
+        host, port: to listen on; by default only this machine can come, and the next free port is taken.
+        plan: whether visitors may plan.
+
+    Raises:
+        ConfigError: the address cannot be listened on, or viser is not installed.
+    """
+
+    def __init__(self, *, host: str = HOST, port: int = PORT, plan: bool = True) -> None:
+        self._server = start_server(host, port)
+        self._host = host
+        self._jobs = LatestJobs(_report)
+        self._nodes = SceneNodes(self._server)
+        gui = self._server.gui
+        self._theme(False)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Grasps"):
+            self._status = gui.add_markdown("", visible=False)
+            self._grasps = GraspTab(self._server, self._jobs, self._nodes)
+        self._planner: PlanTab | None = None
+        self.live = LiveView(self._jobs, self._nodes, self.tell)
+        if plan:
+            with tabs.add_tab("Plan"):
+                self._planner = PlanTab(self._server, self._jobs, self.live, self.show)
+        with tabs.add_tab("Help"):
+            dark = gui.add_checkbox("Dark", False)
+            gui.add_markdown(HELP)
+
+        @dark.on_update
+        def _(_event: Any) -> None:
+            self._theme(bool(dark.value))
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"http://{host}:{self._server.get_port()}"
+
+    def show(self, session: Session) -> None:
+        """Show a session in place of the one before, from any thread."""
+        self._jobs.submit("session", lambda: self._grasps.show(session))
+
+    def wait_for_visitor(self, patience: float) -> None:
+        """Return when somebody has opened the page, or after `patience` seconds."""
+        end = time.monotonic() + patience
+        while not self._server.get_clients() and time.monotonic() < end:
+            time.sleep(0.05)
+
+    def do(self, kind: str, work: Callable[[], None]) -> None:
+        """Have the drawing thread do something; of each kind the newest."""
+        self._jobs.submit(kind, work)
+
+    def tell(self, line: str, share: float) -> None:
+        """Show how far a run is. From the drawing thread."""
+        self._status.content, self._status.visible = line, share < 1.0
+        if self._planner is not None:
+            self._planner.tell(line, share)
+
+    def close(self) -> None:
+        """End runs, threads and the server."""
+        if self._planner is not None:
+            self._planner.close()
+        self._jobs.close()
+        with quiet():
+            self._server.stop()
+
+    def _theme(self, dark: bool) -> None:
+        self._server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
+
+
+def _report(error: Exception) -> None:
+    """A fault of the drawing: the page goes on."""
+    traceback.print_exception(error, file=sys.stderr)

@@ -1,0 +1,193 @@
+"""`graspd_view`: follows a running node by its topics and shows its grasps in a browser, from any machine of a domain.
+
+graspd_view [--node /graspd] [--object OBJECT] [--hand FILE] [--host H] [--port P] [--ros-args -r points:=/seen]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from functools import lru_cache
+from typing import Any, NoReturn
+
+import numpy as np
+
+from graspd_core.errors import ConfigError, GraspdError, HandError
+from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
+
+EXIT_DONE, EXIT_BAD_INPUT = 0, 2
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def main(args: list[str] | None = None) -> int:
+    """Follow a node until a signal; 0 when stopped, 2 for bad input."""
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args, try_shutdown
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    arguments = sys.argv if args is None else ["graspd_view", *args]
+    try:
+        options = _parse(remove_ros_args(arguments)[1:])
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        _serve(options, stop)
+    except GraspdError as error:
+        sys.stderr.write(f"graspd_view: {error}\n")
+        return EXIT_BAD_INPUT
+    finally:
+        try_shutdown()
+    return EXIT_DONE
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = _Parser(prog="graspd_view", description="Look at what a graspd node finds, in a browser.")
+    parser.add_argument("--node", default="/graspd", help="name of the node (default /graspd)")
+    parser.add_argument("--object", default=None, metavar="OBJECT", help="a file, in the answers' frame")
+    parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="instead of the one that answers name")
+    parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
+    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")
+    return parser.parse_args(arguments)
+
+
+def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
+    import rclpy
+
+    from graspd_core import load_hand, load_scene
+    from graspd_core.viewer.viewer import Viewer
+
+    scene = load_scene(options.object) if options.object else None
+    if options.hand:
+        load_hand(options.hand)
+    viewer = Viewer(host=options.host, port=options.port, plan=False)
+    try:
+        node = rclpy.create_node("graspd_view")
+        Follower(node, viewer, options.node, scene=scene, hand=options.hand)
+        print(f"{viewer.url} - follows {options.node}, Ctrl-C ends it", flush=True)
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+        node.destroy_node()
+    finally:
+        viewer.close()
+
+
+class Follower:
+    """Subscriptions of one node, whose newest answer a viewer shows.
+
+    Args:
+        node: that subscribes.
+        viewer: that shows.
+        name: of the node to follow.
+        scene: the object in the frame of the answers, where it is known.
+        hand: a name or a path, instead of the one that answers name.
+    """
+
+    def __init__(self, node: Any, viewer: Any, name: str, *, scene: Any = None, hand: str | None = None) -> None:
+        from graspd_msgs.msg import GraspArray, GraspProgress
+        from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+        from sensor_msgs.msg import PointCloud2
+
+        self._node, self._viewer, self._scene, self._hand = node, viewer, scene, hand
+        self._cloud: Any = None
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(GraspArray, f"{name}/grasps", self._on_answer, latched)
+        node.create_subscription(GraspProgress, f"{name}/progress", self._on_progress, 50)
+        node.create_subscription(PointCloud2, "points", self._on_cloud, qos_profile_sensor_data)
+
+    def _on_cloud(self, message: Any) -> None:
+        self._cloud = message  # read only when an answer is shown with it
+
+    def _on_progress(self, message: Any) -> None:
+        line = f"{message.request_id}: {message.stage} {message.step} of {message.of}, {message.verified} verified"
+        self._viewer.do("progress", lambda: self._viewer.tell(line, min(message.fraction, 0.99)))
+
+    def _on_answer(self, message: Any) -> None:
+        from graspd_core import PlanConfig
+        from graspd_core.viewer.session import Session, make_session
+
+        ending = message.message or f"{len(message.grasps)} grasps"
+        self._viewer.do("progress", lambda: self._viewer.tell(ending, 1.0))
+        if not message.grasps:
+            return
+        try:
+            hand = _hand(self._hand or message.grasps[0].hand, named_by_message=self._hand is None)
+            grasps = tuple(grasp_of(grasp, hand.joint_names) for grasp in message.grasps)
+        except (GraspdError, ValueError) as error:
+            self._node.get_logger().warning(f"the answer to {message.request_id} is not shown: {error}")
+            return
+        title, notes = f"request {message.request_id}", (ending, *message.warnings)
+        seen = self._seen(message.header.frame_id)
+        if self._scene is None:
+            self._viewer.show(Session(title, hand, grasps, seen=seen, notes=notes))
+        else:
+            self._viewer.show(make_session(title, hand, grasps, self._scene, PlanConfig(), seen, notes))
+
+    def _seen(self, frame: str) -> np.ndarray:
+        """The points of the newest cloud, where it is in the frame of the answer [m]."""
+        from graspd_core.bags.messages import points_from_message
+
+        if self._cloud is None or self._cloud.header.frame_id != frame:
+            return np.zeros((0, 3))
+        try:
+            points = points_from_message(self._cloud)
+        except GraspdError as error:
+            self._node.get_logger().warning(f"the cloud is not shown: {error}")
+            return np.zeros((0, 3))
+        return points[np.isfinite(points).all(1)]
+
+
+@lru_cache(maxsize=4)
+def _hand(name: str, *, named_by_message: bool) -> Any:
+    """A hand; a message may name one, but no path. Raises HandError."""
+    from graspd_core import hand_names, load_hand
+
+    if named_by_message and name not in hand_names():
+        raise HandError(f"hand {name[:80]!r} is not one of {', '.join(hand_names())}; give its file with --hand")
+    return load_hand(name)
+
+
+def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
+    """A grasp out of its message. Raises ValueError: a joint is missing, or a number is not finite."""
+
+    def posture(pose: Any, joints: Any) -> Posture:
+        values = dict(zip(joints.name, joints.position, strict=True))
+        missing = [name for name in joint_names if name not in values]
+        if missing:
+            raise ValueError(f"no value for joint {missing[0]}")
+        p, q = pose.position, pose.orientation
+        made = (np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z]), np.array([values[n] for n in joint_names]))
+        if not all(np.isfinite(numbers).all() for numbers in made) or not 0.9 < np.linalg.norm(made[1]) < 1.1:
+            raise ValueError("a posture that is not finite, or no unit quaternion")
+        return Posture(*made)
+
+    def moved(value: float) -> float:
+        return value if value >= 0 else float("inf")  # −1 where the simulation diverged
+
+    return Grasp(
+        pregrasp=posture(message.pregrasp_pose, message.pregrasp_joints),
+        grasp=posture(message.grasp_pose, message.grasp_joints),
+        squeeze=posture(message.grasp_pose, message.squeeze_joints),
+        contacts=tuple(
+            Contact(c.link, (c.position.x, c.position.y, c.position.z), (c.normal.x, c.normal.y, c.normal.z))
+            for c in message.contacts
+        ),
+        score=message.score,
+        metrics=GraspMetrics({metric.name: metric.value for metric in message.metrics}),
+        trials=tuple(
+            TrialResult(t.name, t.passed, moved(t.displacement), moved(t.rotation), t.reason) for t in message.trials
+        ),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

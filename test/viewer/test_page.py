@@ -1,0 +1,153 @@
+"""The page in a real browser: grasps are chosen, the hand moves, trials play, and what visitors do breaks nothing."""
+
+from __future__ import annotations
+
+import re
+import threading
+
+import numpy as np
+import pytest
+
+from graspd_core.viewer.session import open_grasps
+
+
+def places(viewer) -> np.ndarray:
+    """Where the links of the hand are, in viser's scene."""
+    return np.array([node.position for node in viewer._nodes._links.values()])
+
+
+def unlike(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of pixels that differ by more than a shade."""
+    return float((np.abs(one - other).max(-1) > 16).mean())
+
+
+@pytest.fixture
+def page(viewer, visit, grasps_file):
+    viewer.show(open_grasps(grasps_file))
+    page = visit(viewer.url)
+    page.text("grasps.json")
+    page.text("#0 verified")
+    return page
+
+
+def test_a_grasp_is_chosen_and_said(page, viewer):
+    before = places(viewer)
+    page.choose("Grasp", "✗ #3 failed, 3 contacts")
+    page.text("the object moved")
+    page.until(lambda: np.abs(places(viewer) - before).max() > 0.05)
+
+
+def test_the_scrubber_moves_the_hand(page, viewer):
+    page.tab.wait_for_timeout(1500)
+    at_grasp, seen = places(viewer), page.picture()
+    assert unlike(page.picture(), seen) < 0.01
+    page.set("Way", 0)
+    page.until(lambda: np.abs(places(viewer) - at_grasp).max() > 0.09)
+    page.until(lambda: unlike(page.picture(), seen) > 0.05)
+    page.set("Way", 2)
+    page.until(lambda: places(viewer) == pytest.approx(at_grasp))
+    page.until(lambda: unlike(page.picture(), seen) < 0.01)
+
+
+def test_keys_go_to_the_next_grasp_and_back(page):
+    page.key("n")
+    page.text("#1 verified")
+    page.key("p")
+    page.text("#0 verified")
+    page.key("p")
+    page.text("#3 failed")
+
+
+def test_the_list_is_filtered_and_sorted(page):
+    page.choose("Show", "failed")
+    page.text("1 of 1 shown (3 verified, 1 failed)")
+    page.choose("Show", "unverified")
+    page.text("no grasp passes this filter")
+    page.choose("Show", "all")
+    page.choose("Sort by", "epsilon")
+    page.text("1 of 4 shown")
+
+
+def test_a_failed_trial_is_replayed_to_its_reason(page, viewer):
+    page.choose("Show", "failed")
+    page.text("1 of 1 shown")
+    page.press("Run and play")
+    page.tab.get_by_text(re.compile(r"failed at \d+\.\d\d s: the object moved .* under a pull along")).wait_for()
+    page.until(lambda: np.linalg.norm(viewer._nodes._object.position) > 0.04)
+    page.set("Way", 1)
+    page.until(lambda: np.linalg.norm(viewer._nodes._object.position) == 0)
+
+
+def test_a_second_visitor_sees_the_same_and_one_that_leaves_stops_nothing(page, viewer, visit):
+    second = visit(viewer.url)
+    second.text("#0 verified")
+    page.key("n")
+    second.text("#1 verified")
+    page.tab.reload()
+    page.text("#1 verified")
+    second.tab.close()
+    page.key("n")
+    page.text("#2 verified")
+
+
+def test_a_flood_of_sliders_ends_where_the_last_one_is(page, viewer):
+    page.tab.wait_for_timeout(500)
+    at_grasp = places(viewer)
+    field = page.widget("Way")
+    for value in np.linspace(0, 3, 25):
+        field.fill(f"{value:.2f}")
+    page.set("Way", 2)
+    page.until(lambda: places(viewer) == pytest.approx(at_grasp))
+
+
+def test_plans_are_made_stopped_and_saved(viewer, visit):
+    page = visit(viewer.url)
+    page.tab.get_by_role("tab", name="Plan").click()
+    page.choose("Hand", "parallel_gripper")
+    page.choose("Object", "box")
+    page.set("Grasps", 2)
+    page.press("Plan")
+    page.text("2 of 2 grasps")
+    with page.tab.expect_download() as saved:
+        page.press("Save grasps.json")
+    assert '"graspd/grasps"' in saved.value.path().read_text()
+    page.choose("Preset", "accurate")
+    page.set("Grasps", 64)
+    page.press("Plan")
+    page.tab.get_by_text(re.compile(r"searching \d+ of \d+")).first.wait_for()
+    page.press("Stop")
+    page.text("the caller cancelled the run")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("notes.txt", b"hello", "notes.txt: unknown ending; valid endings"),
+        ("cut.stl", b"solid x\nfacet", "refused: cut.stl"),
+        ("<b>x.obj", b"nothing", "refused: <b>x.obj"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_reason(viewer, visit, name: str, content: bytes, reason: str):
+    page = visit(viewer.url)
+    page.tab.get_by_role("tab", name="Plan").click()
+    with page.tab.expect_file_chooser() as chooser:
+        page.press("Send a mesh or a cloud")
+    chooser.value.set_files([{"name": name, "mimeType": "application/octet-stream", "buffer": content}])
+    if not name.endswith("txt"):
+        page.text("press Plan")
+        page.press("Plan")
+    page.text(reason)
+
+
+def test_a_page_that_is_closed_leaves_no_thread_behind(visit):
+    from graspd_core.viewer.viewer import Viewer
+
+    before = set(threading.enumerate())
+    viewer = Viewer(port=0)
+    page = visit(viewer.url)
+    page.tab.get_by_role("tab", name="Plan").click()
+    page.press("Plan")
+    page.tab.get_by_text(re.compile(r"loading|searching|trying")).first.wait_for()
+    viewer.close()
+    page.errors.clear()  # of the connection that is gone
+    page.until(lambda: not [t for t in set(threading.enumerate()) - before if not t.name.startswith("graspd-parts")])
