@@ -73,7 +73,12 @@ class GraspNode(Node):
         self._transforms = TransformBuffer()
         self._listener = TransformListener(self, self._transforms)
         self._pairs = ImagePairs()
-        self._request_builder = RequestBuilder(self._hand.name, self._now, self._transform)
+        self._request_builder = RequestBuilder(
+            self._hand.name,
+            self._now,
+            self._transform,
+            lambda target, source, stamp: self._transform_in_time(target, source, stamp, self._stopping),
+        )
         self._responses = Responses(self, self._hand)
         self._planner = Planner(self._hand, self._transform_in_time)
         self._worker: Worker[Request, Planned] = Worker(
@@ -241,6 +246,9 @@ class GraspNode(Node):
         return self._transforms.lookup(target, source, nanoseconds(stamp) or None)
 
     # The worker's side.
+
+    def _stopping(self) -> bool:
+        return self._worker.stopping()
 
     def _transform_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> np.ndarray:
         at = nanoseconds(stamp) or None

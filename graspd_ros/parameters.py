@@ -63,7 +63,7 @@ def _check_scene_config(path: str) -> None:
 
 def _check_corner(corner: list[float]) -> None:
     if len(corner) != 3 or not np.isfinite(corner).all():
-        raise ConfigError(f"{list(corner)} is no corner; give three finite numbers, x, y and z in metres")
+        raise ConfigError(f"{list(corner)} is no place; give three finite numbers, x, y and z in metres")
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,15 @@ class Settings:
     )
     roi_max: list[float] = _setting(
         [WORKSPACE] * 3, "upper corner of the workspace, in the frame of the cloud [m]", check=_check_corner
+    )
+    sensor_frame: str = _setting(
+        "",
+        "frame at whose origin the camera of clouds stood, by /tf; empty: at the origin of the cloud's own",
+    )
+    view_point: list[float] = _setting(
+        [0.0] * 3,
+        "where the camera of clouds stood, in the frame of the cloud [m]; all 0: as sensor_frame says",
+        check=_check_corner,
     )
     scene_config: str = _setting(
         "",
@@ -153,7 +162,7 @@ def declare_settings(node: Node) -> Settings:
 def read_settings(node: Node) -> Settings:
     """The parameters as they are now."""
     values: dict[str, Any] = {s.name: _word(s, node.get_parameter(s.name).value) for s in dataclasses.fields(Settings)}
-    for name in ("mesh_roots", "roi_min", "roi_max"):
+    for name in ("mesh_roots", "roi_min", "roi_max", "view_point"):
         values[name] = list(values[name] or [])
     return Settings(**values)
 

@@ -102,6 +102,19 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise _bad(f"cloud: {len(message.cloud.data)} bytes; at most {MOST_CLOUD_BYTES} are taken")
     if message.use_target_point:
         point_of(message)
+    check_camera_and_mask(message)
+
+
+def check_camera_and_mask(message: GraspRequest) -> None:
+    """Refuse a view point that is no place, and a mask beside another wish. Raises RequestError."""
+    place = [message.view_point.x, message.view_point.y, message.view_point.z]
+    if message.use_view_point and not (np.abs(place) <= _FARTHEST).all():
+        raise _bad(f"view_point: {place}; it must be finite, within {_FARTHEST:g} m")
+    if message.target_mask.height and (message.use_target_point or message.alone):
+        other = "target_point" if message.use_target_point else "alone"
+        raise _bad(f"target_mask: {other} is given too; give one of target_point, target_mask and alone")
+    if message.target_mask.height and message.source not in (GraspRequest.CLOUD, GraspRequest.LATEST_CLOUD):
+        raise _bad(f"target_mask: with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
@@ -113,6 +126,7 @@ def settings_of(message: GraspRequest, settings: Settings) -> Settings:
         seed=settings.seed if message.seed < 0 else message.seed,
         deadline=message.time_budget or settings.deadline,
         mesh_scale=message.mesh_scale or 1.0,
+        segment=settings.segment and not message.alone,
     )
 
 

@@ -190,13 +190,13 @@ def test_views_are_gathered_in_one_frame():
 
 def test_the_number_of_views_and_their_size_are_bounded():
     views, settings, crowd = Views(), Settings(), sensor_frame(np.random.default_rng(0).normal(size=(500_000, 3)))
-    views = views.add(crowd, settings, lambda *_: np.eye(4))
+    views = views.add(crowd, crowd.read(), settings, lambda *_: np.eye(4))
     assert len(views.clouds[0].points) <= 200_000
     few = sensor_frame(np.zeros((3, 3)))
     for _ in range(MOST_VIEWS - 1):
-        views = views.add(few, settings, lambda *_: np.eye(4))
+        views = views.add(few, few.read(), settings, lambda *_: np.eye(4))
     with pytest.raises(RequestError, match="64 views are kept already"):
-        views.add(few, settings, lambda *_: np.eye(4))
+        views.add(few, few.read(), settings, lambda *_: np.eye(4))
 
 
 @given(
