@@ -12,10 +12,12 @@ from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
 from rclpy.action.server import ActionServer, CancelResponse, RCLError, ServerGoalHandle
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from graspd_ros.inputs.requests import Listener
 
+GOAL_DEPTH = 500  # a reader keeps only its newest messages: of a burst of goals most would vanish
 RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result; rclpy's 900 keep a lot in memory
 
 
@@ -35,6 +37,7 @@ class GoalServer:
         self._submit = submit
         self._cancel = cancel
         self._ids: dict[bytes, str] = {}
+        deep = QoSProfile(depth=GOAL_DEPTH)
         self._server = ActionServer(
             node,
             SynthesizeGrasps,
@@ -42,6 +45,9 @@ class GoalServer:
             execute_callback=_no_execution,
             handle_accepted_callback=self._on_accepted,
             cancel_callback=self._on_cancel,
+            goal_service_qos_profile=deep,
+            result_service_qos_profile=deep,
+            cancel_service_qos_profile=deep,
             result_timeout=RESULT_TIMEOUT,
         )
 

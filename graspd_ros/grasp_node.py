@@ -42,7 +42,7 @@ from graspd_ros.inputs.sensor_frames import SensorFrame, cloud_frame, depth_sens
 from graspd_ros.inputs.source_registry import SOURCES
 from graspd_ros.outputs.error_codes import RequestError, sentence_of
 from graspd_ros.outputs.responses import Responses
-from graspd_ros.parameters import Settings, declare_settings, read_settings
+from graspd_ros.parameters import Settings, declare_settings, doubts, read_settings
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
@@ -64,9 +64,11 @@ class GraspNode(Node):
     def __init__(self, on_failure: Callable[[], None]) -> None:
         super().__init__("graspd")
         settings = declare_settings(self)
+        for doubt in doubts(self, settings):
+            self.get_logger().warning(doubt)
         # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
         torch.set_num_threads(settings.torch_threads)
-        self._hand = load_hand(settings.hand)
+        self._hand = load_hand(settings.hand, prefix=settings.hand_prefix)
         self._on_failure = on_failure
         self._ready = False
         self._announcing = threading.Lock()
@@ -153,8 +155,7 @@ class GraspNode(Node):
 
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
-            culprit = GraspdError(f"cancel: no request {message.data!r} is waiting or running")
-            self._responses.tell_error(message.data, "cancel", culprit)
+            self._responses.nothing_to_cancel(message.data)
 
     def _on_list_hands(self, _: ListHands.Request, response: ListHands.Response) -> ListHands.Response:
         response.names, response.current = list(hand_names()), self._hand.name

@@ -107,7 +107,10 @@ class Planner:
         file = ""
         if settings.output_dir and not stop():
             path = Path(settings.output_dir) / f"{request.id}.json"
-            save_result(path, result, scene.object, self._hand, config)
+            # As planned: a mesh's grasps in the mesh's own frame, wherever it stands.
+            frame = request.frame if request.T_frame_object is None else settings.mesh_frame
+            seconds = request.stamp.sec + 1e-9 * request.stamp.nanosec
+            save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
             file = str(path)
         for pose in (request.T_frame_object, T_out_frame):
             result = result if pose is None else moved_result(result, pose)

@@ -117,3 +117,16 @@ def test_a_goal_that_is_refused_or_superseded_is_aborted_and_told_why(client, no
     client.send_cancel("")  # not by its own client: rcl knows no cancelled state for that
     status, result = second.end()
     assert (status, result.status) == (GoalStatus.STATUS_ABORTED, GraspArray.CANCELLED)
+
+
+def test_each_goal_of_a_burst_gets_its_reply_and_its_result(client, node, actions):
+    """Ten requests at a time are kept by a service as rclpy makes it; of fifty, most got no reply."""
+    goals = [SynthesizeGrasps.Goal(request=GraspRequest(**SPHERE, **FEW, id=f"burst-{k}")) for k in range(50)]
+    sent = [actions.send_goal_async(goal) for goal in goals]
+    client.spin_until(lambda: all(future.done() for future in sent), "replies to 50 goals")
+    handles = [future.result() for future in sent]
+    assert all(handle.accepted for handle in handles)
+    ends = [handle.get_result_async() for handle in handles]
+    client.spin_until(lambda: all(future.done() for future in ends), "results of 50 goals")
+    codes = [future.result().result.result.error_code for future in ends]
+    assert {code for code in codes if code} == {"BUSY"}

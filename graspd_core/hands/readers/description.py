@@ -19,7 +19,7 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
 from graspd_core.hands.readers.mount import is_number, read_mount
 
-_KEYS = ("name", "urdf", "palm", "approach", "effort", "open", "closed", "mount")
+_KEYS = ("name", "urdf", "root", "palm", "approach", "effort", "open", "closed", "mount")
 _REQUIRED = ("urdf",)
 _PALM_KEYS = ("link", "center", "normal")
 
@@ -40,6 +40,7 @@ class HandDescription:
         open, closed: joint values by joint name [rad] or [m]; None where they are to be guessed.
         lines: line of each key in the file, `palm.center` for a nested one.
         mount: where the base link sits on an arm; None where the file does not say.
+        root: the link that the hand begins at, where the URDF holds a whole robot; None: all of it is the hand.
     """
 
     path: Path
@@ -54,6 +55,7 @@ class HandDescription:
     closed: dict[str, float] | None
     lines: dict[str, int]
     mount: Mount | None = None
+    root: str | None = None
 
     def error(self, key: str, message: str) -> HandError:
         """The error to raise about a key: names file, line and key."""
@@ -82,7 +84,12 @@ def read_description(path: Path) -> HandDescription:
     palm = _mapping(path, lines["palm"], "palm", root["palm"]) if "palm" in root else {}
     _check_keys(path, lines, palm, "palm.", _PALM_KEYS, ("center", "normal") if "palm" in root else ())
 
-    for key, value in (("name", root.get("name", "")), ("urdf", root["urdf"]), ("palm.link", palm.get("link", ""))):
+    for key, value in (
+        ("name", root.get("name", "")),
+        ("urdf", root["urdf"]),
+        ("root", root.get("root", "")),
+        ("palm.link", palm.get("link", "")),
+    ):
         if not isinstance(value, str):
             raise HandError(f"{path}:{lines[key]}: {key}: expected text, got {shown(value)}")
     # In this order, which decides what is told of a file with several mistakes.
@@ -100,6 +107,7 @@ def read_description(path: Path) -> HandDescription:
         closed=_numbers(path, lines, "closed", root["closed"]) if "closed" in root else None,
         lines=lines,
         mount=read_mount(path, lines, root["mount"]) if "mount" in root else None,
+        root=root.get("root"),
     )
 
 
