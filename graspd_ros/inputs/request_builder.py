@@ -10,7 +10,7 @@ from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 
 from graspd_ros.inputs.camera_place import place_of, seen_by_camera
-from graspd_ros.inputs.requests import Listener, Request, check_request, settings_of
+from graspd_ros.inputs.requests import Listener, Request, check_request, pose_matrix, settings_of
 from graspd_ros.inputs.sensor_frames import SensorFrame, Views, nanoseconds
 from graspd_ros.inputs.source_registry import Lookup, SourceInput, frame_loader, latest_frame, mesh_loader, source_of
 from graspd_ros.parameters import Settings
@@ -97,4 +97,10 @@ class RequestBuilder:
             T_frame_object=found.T_frame_object,
             listener=listener,
             timeless=timeless,
+            object_key=found.key,
+            exclude=tuple(message.exclude),
+            exclude_poses=tuple(
+                (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
+                for stamped in message.exclude_poses
+            ),
         )

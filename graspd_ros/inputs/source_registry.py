@@ -17,7 +17,15 @@ from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.inputs.camera_place import CameraPlace, masked_cloud, place_of, seen_by_camera
 from graspd_ros.inputs.mesh_path import resolve_mesh
 from graspd_ros.inputs.requests import point_of, pose_matrix
-from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, scene_of_views, trimmed, within
+from graspd_ros.inputs.sensor_frames import (
+    SensorFrame,
+    Views,
+    cloud_frame,
+    nanoseconds,
+    scene_of_views,
+    trimmed,
+    within,
+)
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings
 
@@ -56,12 +64,14 @@ class SourceObject:
         stamp: when it was as it was given; zero where the source does not say.
         load: reads the object; slow, may raise a GraspdError.
         T_frame_object: pose of the object's own frame in `frame`; None where they are one.
+        key: same for the very same object, as it is or was seen then; empty where nobody can tell.
     """
 
     frame: str
     stamp: Time
     load: Callable[[], Scene]
     T_frame_object: Float[np.ndarray, "4 4"] | None = None
+    key: str = ""
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,12 @@ def mesh_loader(uri: str, settings: Settings) -> Callable[[], Scene]:
     path = resolve_mesh(uri, settings.mesh_roots)
     mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
     return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
+
+
+def mesh_key(uri: str, settings: Settings) -> str:
+    """Same for the same mesh in the same size, as long as the file is not written again."""
+    changed = resolve_mesh(uri, settings.mesh_roots).stat().st_mtime_ns
+    return f"mesh {uri} {changed} {settings.mesh_scale} {settings.mass} {settings.friction}"
 
 
 def frame_loader(
@@ -132,7 +148,8 @@ def _from_cloud(given: SourceInput) -> SourceObject:
 def _from_mesh(given: SourceInput) -> SourceObject:
     header = given.message.header
     frame, pose = header.frame_id or given.settings.mesh_frame, pose_matrix(given.message.object_pose)
-    return SourceObject(frame, header.stamp, mesh_loader(given.message.mesh_uri, given.settings), pose)
+    load = mesh_loader(given.message.mesh_uri, given.settings)
+    return SourceObject(frame, header.stamp, load, pose, mesh_key(given.message.mesh_uri, given.settings))
 
 
 def _from_latest_cloud(given: SourceInput) -> SourceObject:
@@ -168,7 +185,9 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> SourceObject:
     message, place = given.message, place_of(given.settings, given.message)
     point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
     load = frame_loader(frame, given.settings, place, given.lookup_in_time, point, mask)
-    return SourceObject(frame.frame, frame.stamp, load)
+    meant = "" if mask is not None else f"{point} {place} {given.settings.segment}"
+    key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
+    return SourceObject(frame.frame, frame.stamp, load, key=key)
 
 
 def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
