@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -15,7 +15,7 @@ from builtin_interfaces.msg import Time
 
 from graspd_core import HandModel, load_preset, plan_grasps, save_result
 from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
-from graspd_ros.inputs.frames import moved_result
+from graspd_ros.inputs.frames import moved_grasp, moved_result
 from graspd_ros.inputs.requests import Request
 from graspd_ros.recovery import RecentRuns, without
 from graspd_ros.worker import Report, WorkerEnding
@@ -95,7 +95,8 @@ class Planner:
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
         result, file = self._runs.next_best(request, excluded) if excluded else None, ""
         if result is None:
-            result, file = self._search(request, excluded, stop, tell)
+            poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
+            result, file = self._search(request, excluded, stop, lambda progress: tell(_placed(progress, poses)))
         self._runs.keep(request, result)
         for pose in (request.T_frame_object, T_out_frame):
             result = result if pose is None else moved_result(result, pose)
@@ -161,6 +162,16 @@ class Aside(Generic[T]):
             self._value = work()
         except BaseException as error:
             self._error = error
+
+
+def _placed(progress: Progress, poses: list[np.ndarray]) -> Progress:
+    """A report whose grasp is in the frame that the results are told in."""
+    found = progress.found
+    if found is None:
+        return progress
+    for pose in poses:
+        found = moved_grasp(found, pose)
+    return replace(progress, found=found)
 
 
 def _with_threads(count: int, work: Callable[[], T]) -> T:

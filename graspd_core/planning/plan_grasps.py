@@ -63,16 +63,16 @@ def plan_grasps(
     config = load_preset(preset) if isinstance(preset, str) else preset
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=device)
     run = Run(time.perf_counter(), deadline, progress, stop)
-    support, message, far, rounds = scene.support, "", np.zeros(3), []
+    support, message, rounds = scene.support, "", []
     if not run.over():  # else it begins nothing
-        scene, far = planning_scene(scene, config.resolution)
+        scene, run.far = planning_scene(scene, config.resolution)
         hand = with_candidates(hand, config.problem.fine_candidates)
         message = out_of_reach(scene, hand)
         rounds = [] if message else rounds_of(scene, config, verify)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
     request = {"count": count, "seed": seed, "verify": verify, "device": device, "measure": measure}
     found = run_rounds(run, scene, hand, rounds, parts, **request)
-    moved = tuple(moved_grasp(grasp, far) for grasp in _ranked(run, found, config, seed))
+    moved = tuple(moved_grasp(grasp, run.far) for grasp in _ranked(run, found, config, seed))
     timing, outcome = _timing(run, scene, found), run.outcome(bool(moved), found.good, count)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     model = scene.object

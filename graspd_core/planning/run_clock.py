@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import time
 
-from graspd_core.types import Outcome, Progress, ProgressHook, Stage, StopHook
+import numpy as np
+
+from graspd_core.scene.far_objects import moved_grasp
+from graspd_core.types import Grasp, Outcome, Progress, ProgressHook, Stage, StopHook
 
 
 class Run:
@@ -13,11 +16,13 @@ class Run:
     Attributes:
         began: `time.perf_counter()` value.
         cancelled: whether the stop hook has said so.
+        far: where the origin that is planned about lies in the scene given [m].
     """
 
     def __init__(self, began: float, deadline: float | None, progress: ProgressHook | None, stop: StopHook | None):
         self.began = began
         self.cancelled = False
+        self.far = np.zeros(3)
         self._end = began + deadline if deadline is not None else float("inf")
         self._progress, self._stop = progress, stop
 
@@ -34,10 +39,11 @@ class Run:
         """Whether the deadline has passed."""
         return time.perf_counter() >= self._end
 
-    def report(self, stage: Stage, step: int, of: int, best: float, verified: int) -> None:
+    def report(self, stage: Stage, step: int, of: int, best: float, verified: int, found: Grasp | None = None) -> None:
         """Tell the caller."""
         if self._progress is not None:
-            self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began))
+            found = None if found is None else moved_grasp(found, self.far)
+            self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))
 
     def outcome(self, any_found: bool, good: int, count: int) -> Outcome:
         """How the run ended, with `good` of `count` grasps."""

@@ -131,7 +131,8 @@ def run_trials(
                 break
             audits += audit
             first = first or (time.perf_counter() if passed else None)
-            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed)
+            found = tried if passed else None
+            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed, found)
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
                 tried = replace(tried, metrics=measure(context.metrics(), tried.grasp))

@@ -5,13 +5,17 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
+from graspd_core import Scene
 from graspd_ros.inputs.camera_place import place_of, seen_by_camera
 from graspd_ros.inputs.requests import Listener, Request, check_request, pose_matrix, settings_of
-from graspd_ros.inputs.sensor_frames import SensorFrame, Views, nanoseconds
+from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, nanoseconds
 from graspd_ros.inputs.source_registry import Lookup, SourceInput, frame_loader, latest_frame, mesh_loader, source_of
 from graspd_ros.parameters import Settings
 
@@ -104,3 +108,27 @@ class RequestBuilder:
                 for stamped in message.exclude_poses
             ),
         )
+
+    def from_loader(
+        self,
+        request_id: str,
+        source: str,
+        header: Header,
+        settings: Settings,
+        load: Callable[[], Scene],
+        listener: Listener | None,
+    ) -> Request:
+        """An object that is read already, in the frame of a header; an empty one is `mesh_frame`."""
+        timeless = nanoseconds(header.stamp) == 0
+        stamp = self._now() if timeless else header.stamp
+        frame = header.frame_id or settings.mesh_frame
+        return Request(request_id, source, frame, stamp, settings, load, listener=listener, timeless=timeless)
+
+    def from_cluster(
+        self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
+    ) -> Request:
+        """A cloud that shows one object, in the frame of a header. Raises RequestError: it is too large or too old."""
+        seen = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
+        seen.check_age(nanoseconds(self._now()), settings.cloud_max_age)
+        load = frame_loader(seen, settings, place_of(settings), self._lookup_in_time)
+        return self.from_loader(request_id, "grasp_planning", header, settings, load, listener)

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose
-from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
+from graspd_msgs.msg import Grasp, GraspArray, GraspProgress, GraspRequest
 from jaxtyping import Float
 
 from graspd_core import Scene, preset_names
@@ -30,6 +30,7 @@ class Listener(Protocol):
     """One more who wants to know of one request, beside the topics; called in the thread that publishes."""
 
     def progressed(self, message: GraspProgress) -> None: ...
+    def found(self, message: Grasp) -> None: ...
     def ended(self, message: GraspArray) -> None: ...
 
 

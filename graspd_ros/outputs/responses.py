@@ -121,7 +121,16 @@ class Responses:
             message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
             self._report(request, message)
 
-        return limited(tell, request.settings.progress_rate)
+        limited_tell = limited(tell, request.settings.progress_rate)
+
+        def hook(progress: Progress) -> None:
+            if progress.found is not None and request.listener is not None:
+                rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
+                found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
+                request.listener.found(found)
+            limited_tell(progress)
+
+        return hook
 
     def _report(self, request: Request, message: GraspProgress) -> None:
         self.publishers.publish(message)
@@ -181,10 +190,8 @@ class Responses:
         self._publish(answer, request.listener)
 
     def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
-        settings = request.settings
-        pace = Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
-        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, pace)
+        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, _pace(request))
 
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
         self.counters.answered(message)
@@ -223,3 +230,8 @@ class Responses:
 
     def _log(self):
         return self._node.get_logger()
+
+
+def _pace(request: Request) -> Pace:
+    settings = request.settings
+    return Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)

@@ -13,6 +13,7 @@ from rclpy.action.client import ActionClient
 from rclpy.action.server import RCLError
 
 from graspd_ros.action_server import Goal as OurGoal
+from graspd_ros.action_server import SynthesizeMessages
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
@@ -60,7 +61,7 @@ def test_a_goal_that_is_cancelled_in_the_moment_that_it_begins_still_ends():
 
     handle: Any = Handle()
     node: Any = SimpleNamespace(executor=None)
-    goal = OurGoal(node, handle, on_end=lambda: None)
+    goal = OurGoal(node, handle, SynthesizeMessages(), on_end=lambda: None)
     goal.ended(GraspArray())
     assert handle.tried == 2
 
