@@ -18,6 +18,7 @@ from rclpy.parameter import Parameter
 from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError
+from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
@@ -68,6 +69,12 @@ def _check_scene_config(path: str) -> None:
 def _check_corner(corner: Any) -> None:
     if not _numbers(corner) or len(corner) != 3 or not np.isfinite(corner).all():
         raise ConfigError(f"{corner} is no place; give three finite numbers, x, y and z in metres")
+
+
+def _check_parts(parts: Any) -> None:
+    unknown = [part for part in parts or [] if part not in PARTS]
+    if unknown:
+        raise ConfigError(f"{unknown[0]!r} is not one of {', '.join(PARTS)}")
 
 
 @dataclass(frozen=True)
@@ -144,6 +151,10 @@ class Settings:
     )
     shortest_stage: float = _setting(1.0, "least time of each stage of a trajectory [s]", low=0.01, high=100.0)
     publish_markers: bool = _setting(True, "whether ~/markers shows the result")
+    marker_grasps: int = _setting(1, "how many of the best grasps ~/markers shows", low=0, high=MOST_GRASPS)
+    marker_parts: list[str] = _setting(
+        list(USUAL_PARTS), f"what ~/markers shows: any of {', '.join(PARTS)}", check=_check_parts
+    )
     output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
 
 
@@ -169,7 +180,8 @@ def declare_settings(node: Node) -> Settings:
 def read_settings(node: Node) -> Settings:
     """The parameters as they are now."""
     values: dict[str, Any] = {s.name: _word(s, node.get_parameter(s.name).value) for s in dataclasses.fields(Settings)}
-    values["mesh_roots"] = list(values["mesh_roots"] or [])
+    for name in ("mesh_roots", "marker_parts"):
+        values[name] = list(values[name] or [])
     return Settings(**values)
 
 

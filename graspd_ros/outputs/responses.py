@@ -181,7 +181,9 @@ class Responses:
             shown.append(convert.pose_message(best, request.frame_out, request.stamp))
             shown.append(next(iter(answer.grasps)).trajectory)
         if request.settings.publish_markers and planned.worked_on:
-            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp))
+            settings = request.settings
+            look = {"shown": settings.marker_grasps, "parts": settings.marker_parts}
+            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp, **look))
         for message in shown:
             self.publishers.publish(message)
         self.publishers.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
