@@ -123,8 +123,8 @@ def things_behind(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray,
 
 def _some(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3"]:
     """Measured points, no more than are needed; zeros and the camera's own place are what drivers fill gaps with."""
-    if len(points) > 2 * MOST_POINTS:
-        points = points[np.random.default_rng(0).choice(len(points), 2 * MOST_POINTS, replace=False)]
+    # In any order: clouds are often sorted by place, and the first of them would be a part of the scene.
+    points = points[np.random.default_rng(0).permutation(len(points))[: 2 * MOST_POINTS]]
     return points[measured(points, viewpoint)][:MOST_POINTS]
 
 
