@@ -14,7 +14,7 @@ help:  ## list the targets
 setup: $(STAMP)  ## build .venv (Python 3.11 or 3.12; PYTHON=... names one)
 
 # The directories too: adding or removing a message makes the environment stale.
-INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*) scripts/tf2_msgs/msg/*)
+INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*) scripts/*_msgs/*/*)
 
 KERNEL := $(wildcard graspd_core/kernel/src/*)
 

@@ -194,6 +194,7 @@ class Progress:
         best: lowest loss so far while optimising; 0 elsewhere.
         verified: grasps that passed the trial so far.
         elapsed: seconds since the run began.
+        found: the grasp that has just passed, without metrics yet; None in all other reports.
     """
 
     stage: Stage
@@ -202,6 +203,7 @@ class Progress:
     best: float
     verified: int
     elapsed: float
+    found: Grasp | None = None
 
 
 @dataclass(frozen=True)

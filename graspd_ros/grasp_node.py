@@ -11,11 +11,13 @@ import gc
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspRequest
 from graspd_msgs.srv import ListHands
 from rclpy.clock import Clock
@@ -32,7 +34,7 @@ from graspd_core.errors import GraspdError
 from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.heap import trim_heap
 from graspd_core.transforms import TransformBuffer
-from graspd_ros.action_server import GoalServer
+from graspd_ros.action_server import GoalServer, SynthesizeMessages
 from graspd_ros.diagnostics import health_message, resident_memory
 from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.frames import TransformListener, wait_for_transform
@@ -42,7 +44,7 @@ from graspd_ros.inputs.sensor_frames import SensorFrame, cloud_frame, depth_sens
 from graspd_ros.inputs.source_registry import SOURCES
 from graspd_ros.outputs.error_codes import RequestError, sentence_of
 from graspd_ros.outputs.responses import Responses
-from graspd_ros.parameters import Settings, declare_settings, read_settings
+from graspd_ros.parameters import Settings, declare_settings, doubts, read_settings
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
@@ -64,23 +66,30 @@ class GraspNode(Node):
     def __init__(self, on_failure: Callable[[], None]) -> None:
         super().__init__("graspd")
         settings = declare_settings(self)
+        for doubt in doubts(self, settings):
+            self.get_logger().warning(doubt)
         # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
         torch.set_num_threads(settings.torch_threads)
-        self._hand = load_hand(settings.hand)
+        self._hand = load_hand(settings.hand, prefix=settings.hand_prefix)
         self._on_failure = on_failure
         self._ready = False
         self._announcing = threading.Lock()
         self._transforms = TransformBuffer()
         self._listener = TransformListener(self, self._transforms)
         self._pairs = ImagePairs()
-        self._request_builder = RequestBuilder(self._hand.name, self._now, self._transform)
+        self._request_builder = RequestBuilder(
+            self._hand.name,
+            self._now,
+            self._transform,
+            lambda target, source, stamp: self._transform_in_time(target, source, stamp, self._stopping),
+        )
         self._responses = Responses(self, self._hand)
         self._planner = Planner(self._hand, self._transform_in_time)
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )
         self._create_inlets()
-        self._goals = GoalServer(self, self._on_goal, lambda request_id: self._worker.cancel(request_id) > 0)
+        self._goals = self._create_actions()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # health does not stop where simulated time does
         self.create_timer(1.0, self._on_diagnostics_due, clock=steady)
@@ -103,16 +112,30 @@ class GraspNode(Node):
         self.create_service(Trigger, "~/add_view", self._on_add_view)
         self.create_service(Trigger, "~/reset_views", self._on_reset_views)
 
+    def _create_actions(self) -> list[GoalServer]:
+        def cancel(request_id: str) -> bool:
+            return self._worker.cancel(request_id) > 0
+
+        servers = [GoalServer(self, SynthesizeGrasps, "~/synthesize", SynthesizeMessages, self._on_goal, cancel)]
+        try:
+            from grasping_msgs.action import GraspPlanning
+
+            from graspd_ros.grasp_planning import PlanningMessages
+        except ImportError:
+            self.get_logger().info("grasping_msgs or moveit_msgs is not installed: there is no ~/grasp_planning")
+            return servers
+        make, submit = lambda: PlanningMessages(self._hand), self._on_planning_goal
+        return [*servers, GoalServer(self, GraspPlanning, "~/grasp_planning", make, submit, cancel)]
+
     def close(self, timeout: float) -> bool:
         """Cancel everything and publish no more; True when the worker ended within `timeout` seconds.
 
         The executor must still spin: goals end there.
         """
         ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
-        if not self._goals.idle():
-            end = time.monotonic() + GOAL_PATIENCE
-            while not self._goals.idle() and time.monotonic() < end:
-                time.sleep(0.01)
+        end = time.monotonic() + GOAL_PATIENCE
+        while not all(server.idle() for server in self._goals) and time.monotonic() < end:
+            time.sleep(0.01)
         time.sleep(RESULT_PATIENCE)
         self._responses.publishers.close()
         return ended
@@ -129,8 +152,20 @@ class GraspNode(Node):
     def _on_request(self, message: GraspRequest) -> None:
         self._take_request(message, "request", None)
 
-    def _on_goal(self, message: GraspRequest, listener: Listener) -> str:
-        return self._take_request(message, "goal", listener)
+    def _on_goal(self, goal: SynthesizeGrasps.Goal, listener: Listener) -> str:
+        return self._take_request(goal.request, "goal", listener)
+
+    def _on_planning_goal(self, goal: Any, listener: Listener) -> str:
+        from graspd_ros.grasp_planning import request_from_goal
+
+        request_id, builder = self._request_builder.new_id("planning"), self._request_builder
+        self._take(
+            "grasp_planning",
+            request_id,
+            lambda name, given: request_from_goal(builder, self._hand.name, name, given, goal, listener),
+            listener,
+        )
+        return request_id
 
     def _on_points(self, message: PointCloud2) -> None:
         try:
@@ -148,8 +183,7 @@ class GraspNode(Node):
 
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
-            culprit = GraspdError(f"cancel: no request {message.data!r} is waiting or running")
-            self._responses.tell_error(message.data, "cancel", culprit)
+            self._responses.nothing_to_cancel(message.data)
 
     def _on_list_hands(self, _: ListHands.Request, response: ListHands.Response) -> ListHands.Response:
         response.names, response.current = list(hand_names()), self._hand.name
@@ -241,6 +275,9 @@ class GraspNode(Node):
         return self._transforms.lookup(target, source, nanoseconds(stamp) or None)
 
     # The worker's side.
+
+    def _stopping(self) -> bool:
+        return self._worker.stopping()
 
     def _transform_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> np.ndarray:
         at = nanoseconds(stamp) or None

@@ -9,9 +9,13 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from graspd_ros.probe import foreign_rclpy
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -94,6 +98,11 @@ def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None
 def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspNode | None:
     """The node; None where an argument or a parameter is bad, which standard error then says."""
     import rclpy
+
+    if told := foreign_rclpy(str(rclpy.__file__)):
+        sys.stderr.write(f"graspd_node: {told}\n")
+    if told := log_directory():
+        sys.stderr.write(f"graspd_node: {told}\n")
     from rclpy.exceptions import ParameterException
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown
@@ -112,6 +121,20 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
         sys.stderr.write(f"graspd_node: {error}\n")
         try_shutdown()
         return None
+
+
+def log_directory() -> str:
+    """Set a directory that logs can be written to, where the usual one cannot; gives the line that says so."""
+    if os.environ.get("ROS_LOG_DIR"):
+        return ""
+    usual = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"
+    try:
+        usual.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=usual):
+            return ""
+    except OSError as error:
+        os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="graspd-log-")
+        return f"{usual} cannot be written ({error.strerror}): ROS_LOG_DIR={os.environ['ROS_LOG_DIR']}"
 
 
 def _on_signal(action: Callable[[], None]) -> None:

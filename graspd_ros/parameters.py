@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import array
 import dataclasses
+import difflib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -15,12 +18,14 @@ from rclpy.parameter import Parameter
 from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError
+from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
 MOST_GRASPS = 256
 BUDGETS = (0.1, 3600.0)  # seconds
 SCALES = (1e-6, 1e6)
+_CORNERS = ("roi_min", "roi_max", "view_point")
 WORKSPACE = 10.0  # metres from the camera: beyond any depth sensor that grasps
 
 
@@ -61,9 +66,15 @@ def _check_scene_config(path: str) -> None:
         load_scene_config(path)
 
 
-def _check_corner(corner: list[float]) -> None:
-    if len(corner) != 3 or not np.isfinite(corner).all():
-        raise ConfigError(f"{list(corner)} is no corner; give three finite numbers, x, y and z in metres")
+def _check_corner(corner: Any) -> None:
+    if not _numbers(corner) or len(corner) != 3 or not np.isfinite(corner).all():
+        raise ConfigError(f"{corner} is no place; give three finite numbers, x, y and z in metres")
+
+
+def _check_parts(parts: Any) -> None:
+    unknown = [part for part in parts or [] if part not in PARTS]
+    if unknown:
+        raise ConfigError(f"{unknown[0]!r} is not one of {', '.join(PARTS)}")
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,9 @@ class Settings:
     """The parameters as they stood when a request came; the descriptions are those that `ros2 param describe` shows."""
 
     hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
+    hand_prefix: str = _setting(
+        "", "put before the names of the hand's joints and links, where a robot has several hands", read_only=True
+    )
     device: str = _setting("cpu", "torch device of the optimiser", check=_check_device, read_only=True)
     torch_threads: int = _setting(
         1,
@@ -100,6 +114,15 @@ class Settings:
     roi_max: list[float] = _setting(
         [WORKSPACE] * 3, "upper corner of the workspace, in the frame of the cloud [m]", check=_check_corner
     )
+    sensor_frame: str = _setting(
+        "",
+        "frame at whose origin the camera of clouds stood, by /tf; empty: at the origin of the cloud's own",
+    )
+    view_point: list[float] = _setting(
+        [0.0] * 3,
+        "where the camera of clouds stood, in the frame of the cloud [m]; all 0: as sensor_frame says",
+        check=_check_corner,
+    )
     scene_config: str = _setting(
         "",
         "path of a yaml file with settings of segmentation, reconstruction and obstacles, as of `graspd --scene`; "
@@ -128,6 +151,10 @@ class Settings:
     )
     shortest_stage: float = _setting(1.0, "least time of each stage of a trajectory [s]", low=0.01, high=100.0)
     publish_markers: bool = _setting(True, "whether ~/markers shows the result")
+    marker_grasps: int = _setting(1, "how many of the best grasps ~/markers shows", low=0, high=MOST_GRASPS)
+    marker_parts: list[str] = _setting(
+        list(USUAL_PARTS), f"what ~/markers shows: any of {', '.join(PARTS)}", check=_check_parts
+    )
     output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
 
 
@@ -144,8 +171,8 @@ def declare_settings(node: Node) -> Settings:
             default = setting.default_factory()
         node.declare_parameter(setting.name, default, _descriptor(setting))
     settings = read_settings(node)
-    for name, value in dataclasses.asdict(settings).items():
-        _check_value(name, value)
+    for name in (setting.name for setting in dataclasses.fields(Settings)):
+        _check_value(name, node.get_parameter(name).value)
     node.add_on_set_parameters_callback(check_parameters)
     return settings
 
@@ -153,9 +180,25 @@ def declare_settings(node: Node) -> Settings:
 def read_settings(node: Node) -> Settings:
     """The parameters as they are now."""
     values: dict[str, Any] = {s.name: _word(s, node.get_parameter(s.name).value) for s in dataclasses.fields(Settings)}
-    for name in ("mesh_roots", "roi_min", "roi_max"):
+    for name in ("mesh_roots", "marker_parts"):
         values[name] = list(values[name] or [])
     return Settings(**values)
+
+
+def doubts(node: Node, settings: Settings) -> list[str]:
+    """What the node should warn of at its start: names that no parameter has, and values that leave nothing to do."""
+    told, known = [], [setting.name for setting in dataclasses.fields(Settings)]
+    # rclpy keeps what was given to the node in no public place, and says nothing of what nobody declares.
+    for name in getattr(node, "_parameter_overrides", {}):
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            near = difflib.get_close_matches(name, known, 1)
+            told.append(f"parameter {name}: there is none; " + (f"is {near[0]} meant?" if near else "it is ignored"))
+    if any(low > high for low, high in zip(settings.roi_min, settings.roi_max, strict=True)):
+        told.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
+    for root in settings.mesh_roots:
+        if not root.startswith("package://") and not Path(root).is_dir():
+            told.append(f"mesh_roots: {root!r} is no directory")
+    return told
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
@@ -173,6 +216,12 @@ def _check_value(name: str, value: Any) -> None:
     if setting is None:
         return  # ROS has parameters of its own on every node
     choices, check, value = setting.metadata["choices"], setting.metadata["check"], _word(setting, value)
+    if _is_number(setting) and not _is_number_like(value):
+        raise ConfigError(f"parameter {name}: {value!r} is no number")
+    if _is_number(setting) and setting.metadata["range"] is not None:
+        low, high = setting.metadata["range"]
+        if not low <= value <= high:
+            raise ConfigError(f"parameter {name}: {value!r}; valid: {low:g} to {high:g}")
     if choices and value not in choices:
         raise ConfigError(f"parameter {name}: {value!r} is not one of {', '.join(choices)}")
     if check is not None:
@@ -183,10 +232,27 @@ def _check_value(name: str, value: Any) -> None:
 
 
 def _word(setting: dataclasses.Field, value: Any) -> Any:
-    """The value; YAML, and with it the command line, reads an unquoted `off` as a truth value."""
+    """The value; YAML reads an unquoted `off` as a truth value, and numbers without a point as integers."""
+    if isinstance(value, int) and not isinstance(value, bool) and _is_number(setting):
+        return float(value)
+    if setting.name in _CORNERS:
+        return [float(number) for number in value] if _numbers(value) else value
     if isinstance(value, bool) and "off" in setting.metadata["choices"]:
         return "on" if value else "off"
     return value
+
+
+def _is_number(setting: dataclasses.Field) -> bool:
+    return isinstance(setting.default, float)
+
+
+def _is_number_like(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _numbers(values: Any) -> TypeGuard[list[float]]:
+    """Whether it is an array of numbers, as ROS gives it."""
+    return isinstance(values, list | tuple | array.array) and all(_is_number_like(value) for value in values)
 
 
 def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
@@ -194,7 +260,8 @@ def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=setting.metadata["description"],
         read_only=setting.metadata["read_only"],
-        dynamic_typing="off" in choices,
+        # What is given is checked here: ROS would refuse 5 where 5.0 is meant.
+        dynamic_typing="off" in choices or _is_number(setting) or setting.name in _CORNERS,
         additional_constraints=f"one of {', '.join(choices)}" if choices else "",
     )
     if setting.metadata["range"] is not None:

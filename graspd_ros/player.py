@@ -98,17 +98,15 @@ def play(
     _wait_for_subscriber(publishers, wait, stop)
     published = 0
     while True:
-        begun, start = time.monotonic(), None
-        shift = 0
+        begun, began_at, start = time.monotonic(), time.time_ns(), None
         for topic, recorded, data in read_raw(bag, tuple(publishers)):
             if start is None:
                 start = recorded
-                shift = time.time_ns() - recorded
             due = begun + (recorded - start) / SECOND / rate
             if stop.wait(max(0.0, due - time.monotonic())):
                 return published
             publisher, kind = publishers[topic.name]
-            publisher.publish(_shifted(data, kind, shift) if now else data)
+            publisher.publish(_shifted(data, kind, start, began_at, rate) if now else data)
             published += 1
         if not loop or stop.is_set():
             _wait_for_delivery(publishers)
@@ -183,15 +181,18 @@ def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
         publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
 
-def _shifted(data: bytes, kind: type, shift: int) -> Any:
-    """The message with every header's stamp later by `shift` [ns]; messages without headers as they are."""
+def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> Any:
+    """The message with every header's stamp moved to when it is due; messages without headers as they are.
+
+    What was stamped at `start` of the recording [ns] is due at `began` [ns], and time goes `rate` times as fast.
+    """
     from rclpy.serialization import deserialize_message
 
     message = deserialize_message(data, kind)
     for stamped in (message, *getattr(message, "transforms", ())):
         if hasattr(stamped, "header"):
             stamp = stamped.header.stamp
-            moved = max(0, stamp.sec * SECOND + stamp.nanosec + shift)
+            moved = max(0, began + round((stamp.sec * SECOND + stamp.nanosec - start) / rate))
             stamp.sec, stamp.nanosec = moved // SECOND, moved % SECOND
     return message
 

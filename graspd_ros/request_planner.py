@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -15,8 +15,9 @@ from builtin_interfaces.msg import Time
 
 from graspd_core import HandModel, load_preset, plan_grasps, save_result
 from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
-from graspd_ros.inputs.frames import moved_result
+from graspd_ros.inputs.frames import moved_grasp, moved_result
 from graspd_ros.inputs.requests import Request
+from graspd_ros.recovery import RecentRuns, without
 from graspd_ros.worker import Report, WorkerEnding
 
 PATIENCE = 0.15  # seconds that work gets to end by itself when its request is over
@@ -49,6 +50,7 @@ class Planner:
         self._hand = hand
         self._lookup = lookup
         self._behind: Aside[Planned] | None = None
+        self._runs = RecentRuns()
 
     def plan(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
         """Work off one request. Raises what reading, planning and /tf raise."""
@@ -85,18 +87,34 @@ class Planner:
         return self._behind is None or self._behind.wait(lambda: time.monotonic() > end)
 
     def _run(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
-        settings = request.settings
-        config = load_preset(settings.preset)
         # Looked up before the work, which would be lost where there is no transform.
         run_isolated = request.frame_out != request.frame
         stamp = Time() if request.timeless else request.stamp
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
+        newest = Time()
+        excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
+        result, file = self._runs.next_best(request, excluded) if excluded else None, ""
+        if result is None:
+            poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
+            result, file = self._search(request, excluded, stop, lambda progress: tell(_placed(progress, poses)))
+        self._runs.keep(request, result)
+        for pose in (request.T_frame_object, T_out_frame):
+            result = result if pose is None else moved_result(result, pose)
+        return Planned(result, file)
+
+    def _search(
+        self, request: Request, excluded: list[np.ndarray], stop: StopHook, tell: ProgressHook
+    ) -> tuple[GraspResult, str]:
+        """A run, without grasps like those excluded, and the file that it was written to."""
+        settings = request.settings
+        config = load_preset(settings.preset)
         scene = request.load()
         result = plan_grasps(
             scene,
             self._hand,
-            count=settings.num_grasps,
-            seed=settings.seed,
+            # Some may be like those excluded, which other starts make less likely.
+            count=settings.num_grasps + len(excluded),
+            seed=settings.seed + len(excluded),
             preset=config,
             verify=settings.verify,
             deadline=max(request.time_left(), 1e-3),
@@ -104,14 +122,16 @@ class Planner:
             progress=tell,
             stop=stop,
         )
-        file = ""
-        if settings.output_dir and not stop():
-            path = Path(settings.output_dir) / f"{request.id}.json"
-            save_result(path, result, scene.object, self._hand, config)
-            file = str(path)
-        for pose in (request.T_frame_object, T_out_frame):
-            result = result if pose is None else moved_result(result, pose)
-        return Planned(result, file)
+        if excluded:
+            result = without(result, excluded, settings.num_grasps)
+        if not settings.output_dir or stop():
+            return result, ""
+        path = Path(settings.output_dir) / f"{request.id}.json"
+        # As planned: a mesh's grasps in the mesh's own frame, wherever it stands.
+        frame = request.frame if request.T_frame_object is None else settings.mesh_frame
+        seconds = request.stamp.sec + 1e-9 * request.stamp.nanosec
+        save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
+        return result, str(path)
 
 
 class Aside(Generic[T]):
@@ -142,6 +162,16 @@ class Aside(Generic[T]):
             self._value = work()
         except BaseException as error:
             self._error = error
+
+
+def _placed(progress: Progress, poses: list[np.ndarray]) -> Progress:
+    """A report whose grasp is in the frame that the results are told in."""
+    found = progress.found
+    if found is None:
+        return progress
+    for pose in poses:
+        found = moved_grasp(found, pose)
+    return replace(progress, found=found)
 
 
 def _with_threads(count: int, work: Callable[[], T]) -> T:

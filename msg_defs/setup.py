@@ -148,6 +148,16 @@ def copy_python(sources: Path, package: Path) -> None:
     (package / "__init__.py").touch()
 
 
+def copy_headers(sources: Path, include: Path) -> None:
+    """The C headers, for packages whose messages hold these."""
+    for kind in GENERATORS:
+        generated = sources / kind
+        for path in generated.rglob("*.h"):
+            target = include / path.relative_to(generated)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+
+
 def write_index(share: Path, index: Path) -> None:
     """What `ros2 interface` and ament look up."""
     definitions = [str(path.relative_to(share)) for path in share.glob("*/*") if path.suffix != ".json"]
@@ -186,6 +196,7 @@ class BuildInterfaces(build_py):
         copy_python(sources, package)
         compile_all(cc, cxx, prefix, sources)
         link_all(cxx, prefix, sources, tree / "lib", package)
+        copy_headers(sources, tree / "include" / NAME)
         write_index(share, tree / "share" / "ament_index" / "resource_index")
         self.distribution.data_files += data_files(tree)
 

@@ -11,7 +11,7 @@ from graspd_core.errors import CloudError, TransformError
 from graspd_core.pointcloud.camera import PinholeCamera, camera_from_calibration
 from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_from_bytes
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
+from graspd_core.pointcloud.pointcloud2 import CloudLayout, organised_points, points_from_layout
 from graspd_core.transforms import SECOND, TransformBuffer
 
 
@@ -27,8 +27,17 @@ def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
     Raises:
         CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
     """
+    return points_from_layout(_layout(message))
+
+
+def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
+    """Every point of a sensor_msgs/PointCloud2 in its place, NaN and infinite ones too. Raises CloudError as above."""
+    return organised_points(_layout(message))
+
+
+def _layout(message: Any) -> CloudLayout:
     fields = {field.name: (field.offset, field.datatype) for field in message.fields}
-    layout = CloudLayout(
+    return CloudLayout(
         width=message.width,
         height=message.height,
         point_step=message.point_step,
@@ -37,7 +46,6 @@ def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
         fields=fields,
         data=memoryview(message.data),
     )
-    return points_from_layout(layout)
 
 
 def cloud_from_message(message: Any) -> PointCloud:

@@ -88,11 +88,21 @@ def check_writable(path: Path) -> None:
 
 
 def save_result(
-    path: str | Path, result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig
+    path: str | Path,
+    result: GraspResult,
+    target: ObjectModel,
+    hand: HandModel,
+    config: PlanConfig,
+    *,
+    frame: str = "",
+    stamp: float | None = None,
 ) -> None:
-    """Write a result; the file appears whole or not at all."""
+    """Write a result; the file appears whole or not at all. `frame` and `stamp` [s] name what its poses are in."""
+    document = result_document(result, target, hand, config)
+    document |= {"frame": frame} if frame else {}
+    document |= {"stamp": stamp} if stamp is not None else {}
     # NaN is not JSON: a document that held one must never be written.
-    save_text(Path(path), json.dumps(result_document(result, target, hand, config), indent=1, allow_nan=False) + "\n")
+    save_text(Path(path), json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def save_text(path: Path, text: str) -> None:

@@ -12,7 +12,7 @@ from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.readers.description import apply_description, read_description
 from graspd_core.hands.readers.mjcf import read_mjcf
-from graspd_core.hands.readers.urdf import read_urdf
+from graspd_core.hands.readers.urdf import below_link, read_urdf
 from graspd_core.hands.readers.xml_io import read_xml, wrong
 from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
@@ -27,10 +27,11 @@ def hand_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (config_dir() / "hands").glob("*.yaml")))
 
 
-def load_hand(name_or_path: str | Path, *, candidates: int = 600) -> HandModel:
+def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = "") -> HandModel:
     """A hand by its name, by the path of its description (.yaml) or of a bare URDF (.urdf, .xml).
 
-    A bare URDF loads with a guessed palm and guessed postures, and a warning in `HandModel.warnings`.
+    A bare URDF loads with a guessed palm and guessed postures, and a warning in `HandModel.warnings`. `prefix` is put
+    before the names of joints and links, which on a robot with two hands, or a base_link of its own, must differ.
 
     Raises:
         HandError: no such hand or file, or one that cannot be used: the message names the file and the culprit.
@@ -40,18 +41,31 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600) -> HandModel:
     if Path(name_or_path).suffix == ".pkl":
         from graspd_core.hands.mano.mano_hand import load_mano
 
-        return load_mano(name_or_path, candidates=candidates).model
+        return _prefixed(load_mano(name_or_path, candidates=candidates).model, prefix)
     path = _find(name_or_path)
     if path.suffix in (".yaml", ".yml"):
         description = read_description(path)
-        hand = apply_description(_with_effort(read_hand_file(description.urdf)), description)
+        hand = apply_description(_with_effort(read_hand_file(description.urdf, description.root)), description)
     else:
         hand = default_postures(default_palm(_with_effort(read_hand_file(path))))
-    return with_candidates(replace(hand, adjacent=adjacent_links(hand)), candidates)
+    return _prefixed(with_candidates(replace(hand, adjacent=adjacent_links(hand)), candidates), prefix)
 
 
-def read_hand_file(path: Path) -> HandModel:
+def _prefixed(hand: HandModel, prefix: str) -> HandModel:
+    if not prefix:
+        return hand
+    return replace(
+        hand,
+        link_names=tuple(prefix + name for name in hand.link_names),
+        joint_names=tuple(prefix + name for name in hand.joint_names),
+        mimics=tuple(replace(mimic, name=prefix + mimic.name) for mimic in hand.mimics),
+    )
+
+
+def read_hand_file(path: Path, root_link: str | None = None) -> HandModel:
     """The hand of a URDF or an MJCF file, as `read_urdf` gives it; the root element decides which it is.
+
+    Where `root_link` is given, of a URDF that holds a whole robot, the hand is that link and what hangs on it.
 
     Raises:
         HandError: it is neither, cannot be used, or has nothing that could touch an object.
@@ -60,6 +74,8 @@ def read_hand_file(path: Path) -> HandModel:
     readers = {"robot": read_urdf, "mujoco": read_mjcf}
     if root.tag not in readers:
         raise wrong(path, root, f"the root element is <{root.tag}>; a URDF has <robot>, an MJCF file <mujoco>")
+    if root_link is not None:
+        below_link(path, root, root_link)
     hand = readers[root.tag](path, root)
     if not hand.primitives:
         raise HandError(f"{path}: no link has a collision or a visual shape, so that nothing could touch an object")

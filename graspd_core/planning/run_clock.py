@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from graspd_core.types import Outcome, Progress, ProgressHook, Snapshot, Stage, StopHook, WatchHook
+from graspd_core.scene.far_objects import moved_grasp
+from graspd_core.types import Grasp, Outcome, Progress, ProgressHook, Snapshot, Stage, StopHook, WatchHook
 
 
 class Run:
@@ -48,10 +49,11 @@ class Run:
         """Whether the deadline has passed."""
         return time.perf_counter() >= self._end
 
-    def report(self, stage: Stage, step: int, of: int, best: float, verified: int) -> None:
+    def report(self, stage: Stage, step: int, of: int, best: float, verified: int, found: Grasp | None = None) -> None:
         """Tell the caller."""
         if self._progress is not None:
-            self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began))
+            found = None if found is None else moved_grasp(found, self.origin)
+            self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))
 
     def show(self, seen: Snapshot) -> None:
         """Let who watches see it."""

@@ -142,7 +142,8 @@ def run_trials(
                 break
             audits += audit
             first = first or (time.perf_counter() if passed else None)
-            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed)
+            found = tried if passed else None
+            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed, found)
             if seen is not None:
                 seen = replace(seen, verdicts=(*seen.verdicts[:index], tried.verdict, *seen.verdicts[index + 1 :]))
                 run.show(seen)

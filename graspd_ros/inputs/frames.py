@@ -120,12 +120,13 @@ def moved_result(result: GraspResult, T_new_old: Float[np.ndarray, "4 4"]) -> Gr
     """A result in another frame: every posture's base pose, every contact and the support; all else has no frame."""
     return replace(
         result,
-        grasps=tuple(_moved_grasp(grasp, T_new_old) for grasp in result.grasps),
+        grasps=tuple(moved_grasp(grasp, T_new_old) for grasp in result.grasps),
         support=None if result.support is None else _moved_plane(result.support, T_new_old),
     )
 
 
-def _moved_grasp(grasp: Grasp, T: Float[np.ndarray, "4 4"]) -> Grasp:
+def moved_grasp(grasp: Grasp, T: Float[np.ndarray, "4 4"]) -> Grasp:
+    """A grasp in another frame."""
     return replace(
         grasp,
         pregrasp=_moved_posture(grasp.pregrasp, T),

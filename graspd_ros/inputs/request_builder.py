@@ -5,14 +5,18 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
-from graspd_ros.inputs.requests import Listener, Request, check_request, settings_of
-from graspd_ros.inputs.sensor_frames import SensorFrame, Views, nanoseconds
-from graspd_ros.inputs.source_registry import SourceInput, frame_loader, latest_frame, mesh_loader, source_of
+from graspd_core import Scene
+from graspd_ros.inputs.camera_place import place_of, seen_by_camera
+from graspd_ros.inputs.requests import Listener, Request, check_request, pose_matrix, settings_of
+from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, nanoseconds
+from graspd_ros.inputs.source_registry import Lookup, SourceInput, frame_loader, latest_frame, mesh_loader, source_of
 from graspd_ros.parameters import Settings
 
 
@@ -25,14 +29,18 @@ class RequestBuilder:
         hand: name of the hand that the node plans for.
         now: the node's clock.
         lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
+        lookup_in_time: the same for the worker's thread; waits for what comes late. None: as `lookup`.
     """
 
-    def __init__(self, hand: str, now: Callable[[], Time], lookup: Callable[[str, str, Time], np.ndarray]) -> None:
+    def __init__(
+        self, hand: str, now: Callable[[], Time], lookup: Lookup, lookup_in_time: Lookup | None = None
+    ) -> None:
         self.newest: SensorFrame | None = None
         self.views = Views()
         self._hand = hand
         self._now = now
         self._lookup = lookup
+        self._lookup_in_time = lookup_in_time or lookup
         self._numbers = itertools.count(1)
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
@@ -51,9 +59,9 @@ class RequestBuilder:
 
     def add_view(self, settings: Settings) -> None:
         """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
-        self.views = self.views.add(
-            latest_frame(self.newest, nanoseconds(self._now()), settings), settings, self._lookup
-        )
+        frame = latest_frame(self.newest, nanoseconds(self._now()), settings)
+        cloud = seen_by_camera(frame, place_of(settings), self._lookup, alone=not settings.segment)
+        self.views = self.views.add(frame, cloud, settings, self._lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
         """A mesh named by its path alone. Raises MeshError."""
@@ -63,7 +71,7 @@ class RequestBuilder:
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
         """What a camera showed unasked. Raises RequestError: it is too old."""
         sensor_frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        load = frame_loader(sensor_frame, settings, None)
+        load = frame_loader(sensor_frame, settings, place_of(settings), self._lookup_in_time)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
 
@@ -78,7 +86,10 @@ class RequestBuilder:
         check_request(message, self._hand)
         settings = settings_of(message, settings)
         source, now = source_of(message), self._now()
-        found = source.find(SourceInput(message, settings, self.newest, self.views, nanoseconds(now), self._lookup))
+        given = SourceInput(
+            message, settings, self.newest, self.views, nanoseconds(now), self._lookup, self._lookup_in_time
+        )
+        found = source.find(given)
         timeless = nanoseconds(found.stamp) == 0
         return Request(
             request_id,
@@ -90,4 +101,34 @@ class RequestBuilder:
             T_frame_object=found.T_frame_object,
             listener=listener,
             timeless=timeless,
+            object_key=found.key,
+            exclude=tuple(message.exclude),
+            exclude_poses=tuple(
+                (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
+                for stamped in message.exclude_poses
+            ),
         )
+
+    def from_loader(
+        self,
+        request_id: str,
+        source: str,
+        header: Header,
+        settings: Settings,
+        load: Callable[[], Scene],
+        listener: Listener | None,
+    ) -> Request:
+        """An object that is read already, in the frame of a header; an empty one is `mesh_frame`."""
+        timeless = nanoseconds(header.stamp) == 0
+        stamp = self._now() if timeless else header.stamp
+        frame = header.frame_id or settings.mesh_frame
+        return Request(request_id, source, frame, stamp, settings, load, listener=listener, timeless=timeless)
+
+    def from_cluster(
+        self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
+    ) -> Request:
+        """A cloud that shows one object, in the frame of a header. Raises RequestError: it is too large or too old."""
+        seen = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
+        seen.check_age(nanoseconds(self._now()), settings.cloud_max_age)
+        load = frame_loader(seen, settings, place_of(settings), self._lookup_in_time)
+        return self.from_loader(request_id, "grasp_planning", header, settings, load, listener)

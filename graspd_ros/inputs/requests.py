@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose
-from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
+from graspd_msgs.msg import Grasp, GraspArray, GraspProgress, GraspRequest
 from jaxtyping import Float
 
 from graspd_core import Scene, preset_names
@@ -20,6 +20,7 @@ from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
 
 MOST_ID = 128
+MOST_EXCLUDED = 256
 MOST_CLOUD_BYTES = 2**27  # 128 MiB: 4 million points of 32 bytes
 _ID = re.compile(rf"[A-Za-z0-9_.:@+-]{{1,{MOST_ID}}}")
 _FARTHEST = 1e3  # metres; what is farther away is a mistake, and costs precision
@@ -29,6 +30,7 @@ class Listener(Protocol):
     """One more who wants to know of one request, beside the topics; called in the thread that publishes."""
 
     def progressed(self, message: GraspProgress) -> None: ...
+    def found(self, message: Grasp) -> None: ...
     def ended(self, message: GraspArray) -> None: ...
 
 
@@ -47,6 +49,9 @@ class Request:
         only_newest: whether a newer request of this kind takes its place while it waits.
         listener: who is told of it beside the topics; None where nobody is.
         timeless: whether it came without a time of its own: then the newest transforms are meant.
+        object_key: same for requests of the very same object, as it is or was seen then; empty: none is the same.
+        exclude: ids of grasps that the answer must not be like.
+        exclude_poses: the same by frame and pose of the base link in it.
         accepted: when the request came, by the monotonic clock [s].
     """
 
@@ -60,6 +65,9 @@ class Request:
     only_newest: bool = False
     listener: Listener | None = None
     timeless: bool = False
+    object_key: str = ""
+    exclude: tuple[str, ...] = ()
+    exclude_poses: tuple[tuple[str, Float[np.ndarray, "4 4"]], ...] = ()
     accepted: float = field(default_factory=time.monotonic)
 
     @property
@@ -102,6 +110,21 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise _bad(f"cloud: {len(message.cloud.data)} bytes; at most {MOST_CLOUD_BYTES} are taken")
     if message.use_target_point:
         point_of(message)
+    check_camera_and_mask(message)
+    if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
+        raise _bad(f"exclude: {len(message.exclude)} ids, {len(message.exclude_poses)} poses; valid: {MOST_EXCLUDED}")
+
+
+def check_camera_and_mask(message: GraspRequest) -> None:
+    """Refuse a view point that is no place, and a mask beside another wish. Raises RequestError."""
+    place = [message.view_point.x, message.view_point.y, message.view_point.z]
+    if message.use_view_point and not (np.abs(place) <= _FARTHEST).all():
+        raise _bad(f"view_point: {place}; it must be finite, within {_FARTHEST:g} m")
+    if message.target_mask.height and (message.use_target_point or message.alone):
+        other = "target_point" if message.use_target_point else "alone"
+        raise _bad(f"target_mask: {other} is given too; give one of target_point, target_mask and alone")
+    if message.target_mask.height and message.source not in (GraspRequest.CLOUD, GraspRequest.LATEST_CLOUD):
+        raise _bad(f"target_mask: with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
@@ -113,6 +136,7 @@ def settings_of(message: GraspRequest, settings: Settings) -> Settings:
         seed=settings.seed if message.seed < 0 else message.seed,
         deadline=message.time_budget or settings.deadline,
         mesh_scale=message.mesh_scale or 1.0,
+        segment=settings.segment and not message.alone,
     )
 
 
@@ -124,17 +148,17 @@ def point_of(message: GraspRequest) -> Float[np.ndarray, "3"]:
     return point
 
 
-def pose_matrix(pose: Pose) -> Float[np.ndarray, "4 4"]:
+def pose_matrix(pose: Pose, name: str = "object_pose") -> Float[np.ndarray, "4 4"]:
     """A pose as a matrix; an all-zero quaternion turns nothing. Raises RequestError: no pose within 1 km."""
     position = np.array([pose.position.x, pose.position.y, pose.position.z])
     if not (np.abs(position) <= _FARTHEST).all():
-        raise _bad(f"object_pose: position {position.tolist()}; it must be finite, within {_FARTHEST:g} m")
+        raise _bad(f"{name}: position {position.tolist()}; it must be finite, within {_FARTHEST:g} m")
     turn = pose.orientation
     length = float(np.linalg.norm([turn.w, turn.x, turn.y, turn.z]))
     if length == 0:
         pose = Pose(position=pose.position)
     elif not abs(length - 1) < 0.01:
-        raise _bad(f"object_pose: a quaternion of length {length:.3g}; it must be 1 (or 0, for no turn)")
+        raise _bad(f"{name}: a quaternion of length {length:.3g}; it must be 1 (or 0, for no turn)")
     return matrix_of_pose(pose)
 
 

@@ -7,18 +7,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core import PointCloud, Scene, Target, cloud_from_depth, scene_from_views
-from graspd_core.bags.messages import points_from_message
+from graspd_core.bags.messages import pixels_from_message, points_from_message
 from graspd_core.config import load_scene_config
+from graspd_core.pointcloud.camera import camera_rays
 from graspd_core.pointcloud.point_cloud import transform_cloud
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.inputs.depth_stream import frame_of
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings
+
+CLOUD = "cloud"  # the kind of frame whose camera the message does not name
+Pixels = Float[np.ndarray, "height width 3"]
 
 MOST_VIEWS = 64
 MOST_VIEW_POINTS = 200_000  # kept of each view: 64 views take 300 MB at most
@@ -33,7 +37,8 @@ class SensorFrame:
         frame: the frame it was seen in.
         stamp: when it was seen, by the sensor's word; zero where it has none.
         arrived: when it came, by the node's clock [ns].
-        read: its points, in its frame; takes some milliseconds, may raise a CloudError.
+        read: its points, in its frame, seen from its origin; takes some milliseconds, may raise a CloudError.
+        pixels: all of its points in their pixels, NaN where nothing was seen; may raise a CloudError.
     """
 
     kind: str
@@ -41,6 +46,7 @@ class SensorFrame:
     stamp: Time
     arrived: int
     read: Callable[[], PointCloud]
+    pixels: Callable[[], Pixels] | None = None
 
     def check_age(self, now: int, limit: float) -> None:
         """Refuse what is older than `limit` seconds at `now` [ns]; 0 is no limit. Raises RequestError."""
@@ -54,7 +60,7 @@ class SensorFrame:
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """A cloud message; it is read only when it is used. The camera is taken to stand at the origin of its frame.
+    """A cloud message; it is read only when it is used. `seen_by_camera` says where its camera stood.
 
     Raises:
         RequestError: it is too large to keep.
@@ -64,7 +70,12 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
         raise RequestError(ErrorCode.BAD_CLOUD, told)
     header = message.header
     return SensorFrame(
-        "cloud", header.frame_id, header.stamp, arrived, lambda: _origin_view(points_from_message(message))
+        CLOUD,
+        header.frame_id,
+        header.stamp,
+        arrived,
+        read=lambda: PointCloud(points_from_message(message), np.zeros(3)),
+        pixels=lambda: pixels_from_message(message),
     )
 
 
@@ -75,7 +86,11 @@ def depth_sensor_frame(image: Image, info: CameraInfo, arrived: int) -> SensorFr
         frame = frame_of(image, info)
         return cloud_from_depth(frame.depth, frame.camera)
 
-    return SensorFrame("depth image", image.header.frame_id, image.header.stamp, arrived, read)
+    def pixels() -> Pixels:
+        frame = frame_of(image, info)
+        return camera_rays(frame.camera) * np.where(frame.depth > 0, frame.depth, np.nan)[..., None]
+
+    return SensorFrame("depth image", image.header.frame_id, image.header.stamp, arrived, read, pixels)
 
 
 @dataclass(frozen=True)
@@ -87,12 +102,17 @@ class Views:
     clouds: tuple[PointCloud, ...] = ()
 
     def add(
-        self, sensor_frame: SensorFrame, settings: Settings, lookup: Callable[[str, str, Time], np.ndarray]
+        self,
+        sensor_frame: SensorFrame,
+        cloud: PointCloud,
+        settings: Settings,
+        lookup: Callable[[str, str, Time], np.ndarray],
     ) -> Views:
         """With one more view, moved to the frame of the others (the settings' fixed_frame, or that of the first).
 
         Args:
             sensor_frame: the view.
+            cloud: what it shows, from where its camera stood.
             settings: workspace, thinning and frame.
             lookup: `T_target_source` of two frames at a time; may raise a TransformError.
 
@@ -103,7 +123,7 @@ class Views:
         if len(self.clouds) >= MOST_VIEWS:
             raise RequestError(ErrorCode.BAD_REQUEST, f"{MOST_VIEWS} views are kept already; call ~/reset_views first")
         frame = self.frame or settings.fixed_frame or sensor_frame.frame
-        cloud = trimmed(sensor_frame.read(), settings)
+        cloud = trimmed(cloud, settings)
         if len(cloud.points) > MOST_VIEW_POINTS:
             every = -(-len(cloud.points) // MOST_VIEW_POINTS)
             cloud = PointCloud(cloud.points[::every], cloud.viewpoint, cloud.forward)
@@ -112,8 +132,8 @@ class Views:
         return Views(frame, sensor_frame.stamp, (*self.clouds, cloud))
 
 
-def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Float[np.ndarray, "3"] | None) -> Scene:
-    """The scene that clouds in one frame show; `target` is a point of the object meant, in that frame [m].
+def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Target | None) -> Scene:
+    """The scene that clouds in one frame show; `target` says which object is meant, in that frame.
 
     Raises:
         GraspdError: the clouds show no usable object, or the file of the settings has changed and cannot be used.
@@ -121,7 +141,7 @@ def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Fl
     return run_isolated(
         scene_from_views,
         views,
-        target=None if target is None else Target(point=target),
+        target=target,
         alone=not settings.segment,
         settings=load_scene_config(settings.scene_config) if settings.scene_config else None,
         mass=settings.mass,
@@ -131,8 +151,7 @@ def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Fl
 
 def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
     """The points inside the workspace, one a voxel where the settings give a voxel its size."""
-    low, high = np.array(settings.roi_min), np.array(settings.roi_max)
-    points = cloud.points[((cloud.points >= low) & (cloud.points <= high)).all(1)]
+    points = cloud.points[within(cloud.points, settings)]
     if not len(points):
         raise RequestError(
             ErrorCode.BAD_CLOUD,
@@ -143,10 +162,12 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 
+def within(points: Float[np.ndarray, "n 3"], settings: Settings) -> Bool[np.ndarray, "n"]:
+    """Which points lie in the workspace; NaN does not."""
+    low, high = np.array(settings.roi_min), np.array(settings.roi_max)
+    return np.asarray(((points >= low) & (points <= high)).all(1))
+
+
 def nanoseconds(stamp: Time) -> int:
     """A stamp as one number."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
-
-
-def _origin_view(points: Float[np.ndarray, "n 3"]) -> PointCloud:
-    return PointCloud(points, np.zeros(3))

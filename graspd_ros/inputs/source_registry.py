@@ -4,20 +4,32 @@ in `GraspRequest.msg`; nothing else is edited."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 from jaxtyping import Float
+from sensor_msgs.msg import Image
 
-from graspd_core import Scene, load_scene
+from graspd_core import Scene, Target, load_scene
 from graspd_core.runtime.worker_process import run_isolated
+from graspd_ros.inputs.camera_place import CameraPlace, masked_cloud, place_of, seen_by_camera
 from graspd_ros.inputs.mesh_path import resolve_mesh
 from graspd_ros.inputs.requests import point_of, pose_matrix
-from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, scene_of_views, trimmed
+from graspd_ros.inputs.sensor_frames import (
+    SensorFrame,
+    Views,
+    cloud_frame,
+    nanoseconds,
+    scene_of_views,
+    trimmed,
+    within,
+)
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings
+
+Lookup = Callable[[str, str, Time], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +43,7 @@ class SourceInput:
         views: the frames that were kept.
         now: the node's clock [ns].
         lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
+        lookup_in_time: the same for the worker's thread; waits for what comes late.
     """
 
     message: GraspRequest
@@ -38,7 +51,8 @@ class SourceInput:
     newest: SensorFrame | None
     views: Views
     now: int
-    lookup: Callable[[str, str, Time], np.ndarray]
+    lookup: Lookup
+    lookup_in_time: Lookup
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +64,14 @@ class SourceObject:
         stamp: when it was as it was given; zero where the source does not say.
         load: reads the object; slow, may raise a GraspdError.
         T_frame_object: pose of the object's own frame in `frame`; None where they are one.
+        key: same for the very same object, as it is or was seen then; empty where nobody can tell.
     """
 
     frame: str
     stamp: Time
     load: Callable[[], Scene]
     T_frame_object: Float[np.ndarray, "4 4"] | None = None
+    key: str = ""
 
 
 @dataclass(frozen=True)
@@ -86,9 +102,41 @@ def mesh_loader(uri: str, settings: Settings) -> Callable[[], Scene]:
     return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
 
 
-def frame_loader(frame: SensorFrame, settings: Settings, target: Float[np.ndarray, "3"] | None) -> Callable[[], Scene]:
-    """A function that makes a scene of one frame; `target` says which object is meant, in the cloud's frame [m]."""
-    return lambda: scene_of_views((trimmed(frame.read(), settings),), settings, target)
+def mesh_key(uri: str, settings: Settings) -> str:
+    """Same for the same mesh in the same size, as long as the file is not written again."""
+    changed = resolve_mesh(uri, settings.mesh_roots).stat().st_mtime_ns
+    return f"mesh {uri} {changed} {settings.mesh_scale} {settings.mass} {settings.friction}"
+
+
+def frame_loader(
+    frame: SensorFrame,
+    settings: Settings,
+    place: CameraPlace,
+    lookup: Lookup,
+    point: Float[np.ndarray, "3"] | None = None,
+    mask: Image | None = None,
+) -> Callable[[], Scene]:
+    """A function that makes a scene of one frame.
+
+    Args:
+        frame: what a camera showed.
+        settings: workspace, thinning, and whether the object is alone.
+        place: where the camera stood.
+        lookup: for the worker's thread.
+        point: on or near the object meant, in the frame's own frame [m].
+        mask: its pixels that show the object meant; checked on loading.
+    """
+
+    def load() -> Scene:
+        cloud = seen_by_camera(frame, place, lookup, alone=not settings.segment)
+        if mask is None:
+            target = None if point is None else Target(point=point)
+            return scene_of_views((trimmed(cloud, settings),), settings, target)
+        cloud, shown = masked_cloud(frame, cloud, mask)
+        inside = within(cloud.points, settings)
+        return scene_of_views((replace(cloud, points=cloud.points[inside]),), settings, Target(mask=shown[inside]))
+
+    return load
 
 
 def _from_cloud(given: SourceInput) -> SourceObject:
@@ -100,7 +148,8 @@ def _from_cloud(given: SourceInput) -> SourceObject:
 def _from_mesh(given: SourceInput) -> SourceObject:
     header = given.message.header
     frame, pose = header.frame_id or given.settings.mesh_frame, pose_matrix(given.message.object_pose)
-    return SourceObject(frame, header.stamp, mesh_loader(given.message.mesh_uri, given.settings), pose)
+    load = mesh_loader(given.message.mesh_uri, given.settings)
+    return SourceObject(frame, header.stamp, load, pose, mesh_key(given.message.mesh_uri, given.settings))
 
 
 def _from_latest_cloud(given: SourceInput) -> SourceObject:
@@ -111,7 +160,8 @@ def _from_views(given: SourceInput) -> SourceObject:
     views, settings = given.views, given.settings
     if not views.clouds:
         raise RequestError(ErrorCode.NO_CLOUD, "no view is kept: call ~/add_view while clouds come")
-    target = _target(given, views.frame)
+    point = _target(given, views.frame)
+    target = None if point is None else Target(point=point)
     return SourceObject(views.frame, views.stamp, lambda: scene_of_views(views.clouds, settings, target))
 
 
@@ -132,8 +182,12 @@ def source_of(message: GraspRequest) -> Source:
 
 
 def _of_frame(given: SourceInput, frame: SensorFrame) -> SourceObject:
-    target = _target(given, frame.frame)
-    return SourceObject(frame.frame, frame.stamp, frame_loader(frame, given.settings, target))
+    message, place = given.message, place_of(given.settings, given.message)
+    point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
+    load = frame_loader(frame, given.settings, place, given.lookup_in_time, point, mask)
+    meant = "" if mask is not None else f"{point} {place} {given.settings.segment}"
+    key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
+    return SourceObject(frame.frame, frame.stamp, load, key=key)
 
 
 def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:

@@ -28,6 +28,7 @@ class ErrorCode(StrEnum):
     STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
     NO_TRANSFORM = "NO_TRANSFORM"  # /tf does not connect the frames
     WRONG_HAND = "WRONG_HAND"  # another hand than the node's
+    NOT_FOUND = "NOT_FOUND"  # a cancel of a request that has ended, or never was
     DUPLICATE_ID = "DUPLICATE_ID"  # a request of this id is waiting or running
     BUSY = "BUSY"  # refused under busy_policy, or the queue is full
     SHUTTING_DOWN = "SHUTTING_DOWN"  # the node is ending

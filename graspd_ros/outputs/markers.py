@@ -1,12 +1,12 @@
 """A result for RViz: the hand at its grasp, where it touches, the axes of its base link, and what it is worth.
 
-Namespaces are `hand`, `contacts`, `axes` and `text`, so that each can be switched off in RViz; ids start at
-`IDS_OF_A_GRASP` times the rank. Markers stay until the next result deletes them.
+Namespaces are the names of `PARTS`, so that each can be switched off in RViz; ids start at `IDS_OF_A_GRASP` times the
+rank. Markers stay until the next result deletes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -17,11 +17,16 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from graspd_core import HandModel
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.types import Contact, Grasp, Verdict
+from graspd_core.types import Contact, Grasp, Posture, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
 from graspd_ros.outputs.status_json import pose_of
 
 IDS_OF_A_GRASP = 1000
+# What can be shown. Of the best grasps: the hand at the grasp, before it and where its squeeze aims at (faint), its
+# contacts, the axes of its base link, its figures. Of those that failed a trial: where they are, and why they failed.
+PARTS = ("hand", "pregrasp", "squeeze", "contacts", "axes", "text", "rejected")
+USUAL_PARTS = ("hand", "contacts", "axes", "text")
+_FAINT = 0.25
 COLOURS = {
     Verdict.VERIFIED: (0.20, 0.70, 0.30),
     Verdict.UNVERIFIED: (0.95, 0.70, 0.15),
@@ -36,29 +41,61 @@ _TEXT_ABOVE = 0.12
 Matrix = Float[np.ndarray, "4 4"]
 
 
-def result_markers(grasps: Sequence[Grasp], hand: HandModel, frame: str, stamp: Time, shown: int = 1) -> MarkerArray:
-    """The best `shown` grasps; the first marker deletes what was shown before, so none leaves an empty scene."""
+def result_markers(
+    grasps: Sequence[Grasp],
+    hand: HandModel,
+    frame: str,
+    stamp: Time,
+    *,
+    shown: int = 1,
+    parts: Sequence[str] = USUAL_PARTS,
+) -> MarkerArray:
+    """Parts of the best `shown` grasps; the first marker deletes what was shown before: none leave an empty scene."""
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
-    for rank, grasp in enumerate(grasps[:shown]):
-        T_frame_base = matrix_of_pose(pose_of(grasp.grasp))
-        colour = COLOURS[grasp.verdict]
-        for namespace, made in (
-            ("hand", _hand(hand, grasp, T_frame_base, colour)),
-            ("contacts", (_contact(contact) for contact in grasp.contacts)),
-            ("axes", _axes(T_frame_base)),
-            ("text", [_text(grasp, rank, T_frame_base)]),
-        ):
-            for number, marker in enumerate(made):
+    for rank, grasp in enumerate(grasps):
+        made = _parts_of(grasp, rank, hand) if rank < shown else {}
+        if grasp.verdict is Verdict.FAILED:
+            made["rejected"] = lambda grasp=grasp, rank=rank: _rejected(grasp, rank)
+        for namespace in parts:
+            for number, marker in enumerate(made[namespace]() if namespace in made else ()):
                 marker.header, marker.action, marker.ns = header, Marker.ADD, namespace
                 marker.id = rank * IDS_OF_A_GRASP + number
                 markers.append(marker)
     return MarkerArray(markers=markers)
 
 
-def _hand(hand: HandModel, grasp: Grasp, T_frame_base: Matrix, colour: tuple[float, float, float]) -> Iterator[Marker]:
+def _parts_of(grasp: Grasp, rank: int, hand: HandModel) -> dict[str, Callable[[], Iterable[Marker]]]:
+    T_frame_base, colour = matrix_of_pose(pose_of(grasp.grasp)), COLOURS[grasp.verdict]
+    return {
+        "hand": lambda: _hand(hand, grasp.grasp, colour),
+        "pregrasp": lambda: _faint(_hand(hand, grasp.pregrasp, colour)),
+        "squeeze": lambda: _faint(_hand(hand, grasp.squeeze, colour)),
+        "contacts": lambda: map(_contact, grasp.contacts),
+        "axes": lambda: _axes(T_frame_base),
+        "text": lambda: [_text(grasp, rank, T_frame_base)],
+    }
+
+
+def _faint(markers: Iterable[Marker]) -> Iterator[Marker]:
+    for marker in markers:
+        marker.color.a = _FAINT
+        yield marker
+
+
+def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
+    """The way that the hand would have come, in red, and what the trial said."""
+    start, end = grasp.pregrasp.position, grasp.grasp.position
+    yield _arrow(np.asarray(start), np.asarray(end), COLOURS[Verdict.FAILED])
+    text = _text(grasp, rank, matrix_of_pose(pose_of(grasp.grasp)))
+    text.color = _colour(COLOURS[Verdict.FAILED], 1.0)
+    yield text
+
+
+def _hand(hand: HandModel, posture: Posture, colour: tuple[float, float, float]) -> Iterator[Marker]:
     """The collision solids; a capsule is a cylinder and two balls."""
-    rotations, translations = link_poses(hand, grasp.grasp.joint_positions)
+    T_frame_base = matrix_of_pose(pose_of(posture))
+    rotations, translations = link_poses(hand, posture.joint_positions)
     for solid in hand.primitives:
         T_base_link = _matrix(rotations[solid.link], translations[solid.link])
         T = T_frame_base @ T_base_link @ _matrix(solid.rotation, solid.translation)

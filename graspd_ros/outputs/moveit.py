@@ -1,4 +1,4 @@
-"""A grasp as a moveit_msgs/Grasp, for MoveIt's pick pipelines. moveit_msgs is imported on use: it is not on PyPI.
+"""A grasp as a moveit_msgs/Grasp, for MoveIt's pick pipelines. A ROS installation or `make setup` brings moveit_msgs.
 
 MoveIt's `grasp_pose` is that of the end effector's parent link, the last link of the arm, not of a link of the hand:
 `T_parent_base` says where the hand's base link is in it.
@@ -7,6 +7,7 @@ MoveIt's `grasp_pose` is that of the end effector's parent link, the last link o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from importlib import import_module
 from types import ModuleType
@@ -36,6 +37,7 @@ def moveit_grasp(
     retreat_frame: str,
     retreat_distance: float = 0.1,
     T_parent_base: Float[np.ndarray, "4 4"] | None = None,
+    effort: Sequence[float] = (),
     messages: ModuleType | None = None,
 ) -> Any:
     """The moveit_msgs/Grasp of a graspd_msgs/Grasp.
@@ -47,6 +49,7 @@ def moveit_grasp(
         retreat_distance: how far to lift [m].
         T_parent_base: pose of the hand's base link in the end effector's parent link; None: as the hand is mounted by
             its description, and where that has no mount, they are one.
+        effort: most that each joint of the trajectory may press with, in its order [N·m] or [N]; empty: not told.
         messages: module with the message classes; None: moveit_msgs.msg.
 
     Raises:
@@ -65,6 +68,8 @@ def moveit_grasp(
     if T_parent_base is not None:
         pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ np.linalg.inv(T_parent_base))
     first, *closing = deepcopy(grasp.trajectory.points)
+    for point in closing:
+        point.effort = list(effort)
     quality = next((metric.value for metric in grasp.metrics if metric.name == "epsilon"), 0.0)
     return messages.Grasp(
         id=grasp.id,

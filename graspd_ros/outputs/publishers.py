@@ -12,6 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from graspd_ros.outputs import status_json as convert
@@ -19,6 +20,7 @@ from graspd_ros.outputs import status_json as convert
 SHOWN = {
     JointState: "~/joint_states",
     PoseStamped: "~/grasp_pose",
+    JointTrajectory: "~/trajectory",
     MarkerArray: "~/markers",
 }
 # Late joiners get the last of these.

@@ -6,6 +6,7 @@ Clouds that come unasked are the exception: those that gave way to a newer one b
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 import traceback
 
@@ -16,7 +17,7 @@ from std_msgs.msg import Header
 
 from graspd_core import HandModel
 from graspd_core.errors import GraspdError
-from graspd_core.types import Progress, ProgressHook
+from graspd_core.types import Progress, ProgressHook, Stage
 from graspd_ros.counters import Counters
 from graspd_ros.inputs.requests import MOST_ID, Listener, Request
 from graspd_ros.outputs import messages
@@ -75,8 +76,13 @@ class Responses:
 
     def not_made(self, request_id: str, source: str, error: Exception, listener: Listener | None = None) -> None:
         """A message that is no valid request."""
-        self.tell_error(request_id[:MOST_ID], source, error)
-        ending = messages.AnswerEnding(GraspArray.REFUSED, code_of(error), sentence_of(error))
+        code, message = code_of(error), sentence_of(error)
+        if code is ErrorCode.INTERNAL:
+            self.tell_error(request_id[:MOST_ID], source, error)
+        else:
+            self.publishers.tell("refused", request_id[:MOST_ID], source, code=code, message=message)
+            self._log().warning(f"{request_id[:MOST_ID] or source}: refused: {message}")
+        ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
         header = Header(stamp=self._now())
         self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
 
@@ -102,15 +108,29 @@ class Responses:
 
     def progress_hook(self, request: Request) -> ProgressHook:
         """Tells of the request's progress, not too often."""
+        lowest = math.inf
 
         def tell(progress: Progress) -> None:
+            nonlocal lowest
             elapsed = request.elapsed()
+            if progress.stage is Stage.OPTIMISE and progress.step:
+                lowest = min(lowest, progress.best)
+            progress = dataclasses.replace(progress, best=lowest if math.isfinite(lowest) else 0.0)
             event = {**convert.progress_event(progress), "elapsed": elapsed}
             self.publishers.tell("progress", request.id, request.source, **event)
             message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
             self._report(request, message)
 
-        return limited(tell, request.settings.progress_rate)
+        limited_tell = limited(tell, request.settings.progress_rate)
+
+        def hook(progress: Progress) -> None:
+            if progress.found is not None and request.listener is not None:
+                rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
+                found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
+                request.listener.found(found)
+            limited_tell(progress)
+
+        return hook
 
     def _report(self, request: Request, message: GraspProgress) -> None:
         self.publishers.publish(message)
@@ -159,8 +179,11 @@ class Responses:
         if best is not None:
             shown.append(convert.joint_message(best.grasp, hand, request.stamp))
             shown.append(convert.pose_message(best, request.frame_out, request.stamp))
+            shown.append(next(iter(answer.grasps)).trajectory)
         if request.settings.publish_markers and planned.worked_on:
-            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp))
+            settings = request.settings
+            look = {"shown": settings.marker_grasps, "parts": settings.marker_parts}
+            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp, **look))
         for message in shown:
             self.publishers.publish(message)
         self.publishers.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
@@ -169,10 +192,8 @@ class Responses:
         self._publish(answer, request.listener)
 
     def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
-        settings = request.settings
-        pace = Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
-        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, pace)
+        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, _pace(request))
 
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
         self.counters.answered(message)
@@ -184,6 +205,12 @@ class Responses:
                 self._log().error(f"{message.request_id}: {''.join(traceback.format_exception(error))}")
 
     # Events.
+
+    def nothing_to_cancel(self, request_id: str) -> None:
+        """A cancel that came after the end, or for a request that never was: common, and no fault."""
+        message = f"cancel: no request {request_id!r} is waiting or running"
+        self.publishers.tell("error", request_id, "cancel", kind="NotFound", code=ErrorCode.NOT_FOUND, message=message)
+        self._log().debug(message)
 
     def tell_error(self, request_id: str, source: str, error: BaseException) -> None:
         """An error on ~/status and in the log."""
@@ -205,3 +232,8 @@ class Responses:
 
     def _log(self):
         return self._node.get_logger()
+
+
+def _pace(request: Request) -> Pace:
+    settings = request.settings
+    return Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)

@@ -50,7 +50,8 @@ def presentable(result: GraspResult) -> Grasp | None:
 
 def progress_event(progress: Progress) -> dict[str, Any]:
     """A progress report; `fraction` is that of its stage."""
-    return {**dataclasses.asdict(progress), "fraction": fraction_of(progress)}
+    told = {name: value for name, value in vars(progress).items() if name != "found"}
+    return {**told, "fraction": fraction_of(progress)}
 
 
 def fraction_of(progress: Progress) -> float:

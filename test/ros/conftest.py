@@ -36,7 +36,7 @@ from graspd_ros.parameters import Settings
 
 PATIENCE = 200.0  # seconds until what is waited for is held to never come; a test's own limit is 300
 
-READ_ONLY = {"hand", "device", "torch_threads", "queue_size"}
+READ_ONLY = {"hand", "hand_prefix", "device", "torch_threads", "queue_size"}
 DEFAULTS = {n: v for n, v in dataclasses.asdict(Settings()).items() if n not in READ_ONLY} | {"output_dir": "out"}
 TERMINAL = {"result", "error", "cancelled", "superseded"}
 
@@ -196,8 +196,11 @@ class Client:
 class NodeProcess:
     """`graspd_node` as a user starts it, with parameters; or a module that does as it does."""
 
-    def __init__(self, domain: int, directory: Path, parameters: dict[str, Any], module: Path | None = None) -> None:
+    def __init__(
+        self, domain: int, directory: Path, parameters: dict[str, Any], module: Path | None = None, namespace: str = ""
+    ) -> None:
         arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+        arguments += ["-r", f"__ns:={namespace}"] if namespace else []
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(directory / "log")}
         self.directory = directory
         self.log = directory / "node.log"
@@ -322,5 +325,23 @@ def start_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Itera
         return started[-1]
 
     yield start
+    for process in started:
+        process.stop()
+
+
+@pytest.fixture
+def spawn_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
+    """Starts nodes under namespaces, side by side; `sphere.obj` and `mug.obj` are in the test's directory."""
+    shared_node.stop()
+    save_shapes(tmp_path)
+    started: list[NodeProcess] = []
+
+    def spawn(namespace: str, **parameters: Any) -> NodeProcess:
+        directory = tmp_path / namespace.strip("/")
+        directory.mkdir()
+        started.append(NodeProcess(client.domain, directory, parameters, namespace=namespace))
+        return started[-1]
+
+    yield spawn
     for process in started:
         process.stop()

@@ -13,6 +13,7 @@ from rclpy.action.client import ActionClient
 from rclpy.action.server import RCLError
 
 from graspd_ros.action_server import Goal as OurGoal
+from graspd_ros.action_server import SynthesizeMessages
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
@@ -60,7 +61,7 @@ def test_a_goal_that_is_cancelled_in_the_moment_that_it_begins_still_ends():
 
     handle: Any = Handle()
     node: Any = SimpleNamespace(executor=None)
-    goal = OurGoal(node, handle, on_end=lambda: None)
+    goal = OurGoal(node, handle, SynthesizeMessages(), on_end=lambda: None)
     goal.ended(GraspArray())
     assert handle.tried == 2
 
@@ -117,3 +118,16 @@ def test_a_goal_that_is_refused_or_superseded_is_aborted_and_told_why(client, no
     client.send_cancel("")  # not by its own client: rcl knows no cancelled state for that
     status, result = second.end()
     assert (status, result.status) == (GoalStatus.STATUS_ABORTED, GraspArray.CANCELLED)
+
+
+def test_each_goal_of_a_burst_gets_its_reply_and_its_result(client, node, actions):
+    """Ten requests at a time are kept by a service as rclpy makes it; of fifty, most got no reply."""
+    goals = [SynthesizeGrasps.Goal(request=GraspRequest(**SPHERE, **FEW, id=f"burst-{k}")) for k in range(50)]
+    sent = [actions.send_goal_async(goal) for goal in goals]
+    client.spin_until(lambda: all(future.done() for future in sent), "replies to 50 goals")
+    handles = [future.result() for future in sent]
+    assert all(handle.accepted for handle in handles)
+    ends = [handle.get_result_async() for handle in handles]
+    client.spin_until(lambda: all(future.done() for future in ends), "results of 50 goals")
+    codes = [future.result().result.result.error_code for future in ends]
+    assert {code for code in codes if code} == {"BUSY"}

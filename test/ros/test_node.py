@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 
 import numpy as np
@@ -37,7 +38,9 @@ def test_a_mesh_becomes_progress_and_a_grasp(client, node):
     assert result["outcome"] == "succeeded"
     assert result["verified"] == 2
     assert result["best"]["verdict"] == "verified"
-    assert (node.directory / result["file"]).is_file()
+    written = json.loads((node.directory / result["file"]).read_text())
+    assert written["frame"] == "object"
+    assert written["stamp"] > 0
     client.spin_until(lambda: client.joints and client.poses, "grasp messages")
     (joints,), (pose,) = client.joints, client.poses
     assert len(joints.name) == len(joints.position) == 16
@@ -85,14 +88,19 @@ def test_bad_input_is_named_and_the_node_lives_on(client, node, make_cloud):
     for send, culprit in cases:
         client.forget()
         send()
-        error = client.event(event="error")
+        # Refused before any work, or found out at it.
+        told = lambda: next((e for e in client.events if e["event"] in ("refused", "error")), None)  # noqa: E731
+        error = client.spin_until(told, culprit)
         assert culprit in error["message"]
         assert "\n" not in error["message"]
+    assert (error["event"], error["code"]) == ("error", "NOT_FOUND")
     assert node.alive()
     client.forget()
     client.send_mesh("sphere.obj")
     assert client.event(event="result")["verified"] == 2
-    assert "Traceback" not in node.log.read_text()
+    log = node.log.read_text()
+    assert "Traceback" not in log
+    assert "mesh-99" not in log, "a late cancel is no error"
 
 
 def test_a_busy_node_queues_up_to_its_size_and_refuses_the_rest(client, node):

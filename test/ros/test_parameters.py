@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
+from rclpy.context import Context
 from rclpy.parameter import Parameter
 
 from graspd_core import PointCloud
 from graspd_ros.inputs.sensor_frames import scene_of_views
-from graspd_ros.parameters import Settings, check_parameters
+from graspd_ros.parameters import Settings, check_parameters, declare_settings, doubts
 
 
 @pytest.mark.parametrize(
@@ -24,6 +26,10 @@ from graspd_ros.parameters import Settings, check_parameters
         ("scene_config", "none.yaml", "none.yaml: No such file"),
         ("roi_min", [0.0, 1.0], "three finite numbers"),
         ("roi_max", [0.0, 1.0, math.nan], "three finite numbers"),
+        ("view_point", "here", "three finite numbers"),
+        ("deadline", "soon", "'soon' is no number"),
+        ("deadline", True, "True is no number"),
+        ("deadline", 0, "0.0; valid: 0.1 to 3600"),
     ],
 )
 def test_what_is_no_choice_is_refused_by_name(name, value, culprit):
@@ -41,6 +47,8 @@ def test_what_is_no_choice_is_refused_by_name(name, value, culprit):
         ("scene_config", ""),
         ("roi_min", [-1.0, -1.0, 0.0]),
         ("use_sim_time", True),
+        ("deadline", 5),
+        ("roi_min", [-1, -1, 0]),
     ],
 )
 def test_choices_are_taken(name, value):
@@ -58,3 +66,32 @@ def test_a_scene_file_sets_the_reconstruction_and_is_refused_by_its_key(tmp_path
     path.write_text("reconstruction: {most_faces: 300}")
     answer = check_parameters([Parameter("scene_config", value=str(path))])
     assert answer.reason.startswith("parameter scene_config: scene.yaml.reconstruction: unknown key 'most_faces'")
+
+
+def started(*arguments: str) -> tuple[Settings, list[str]]:
+    """What a node makes of its arguments, and what it warns of."""
+    context = Context()
+    rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))], context=context)
+    node = rclpy.create_node("parameters", context=context)
+    try:
+        settings = declare_settings(node)
+        return settings, doubts(node, settings)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(tmp_path: Path):
+    settings, told = started(
+        "deadline:=5", "roi_min:=[-1, -1, 0]", f"mesh_roots:=[{tmp_path}]", "view_point:=[0, 0, 1]"
+    )
+    assert (settings.deadline, settings.roi_min, settings.view_point) == (5.0, [-1.0, -1.0, 0.0], [0.0, 0.0, 1.0])
+    assert isinstance(settings.deadline, float)
+    assert told == []
+    _, told = started("num_grasp:=3", "nothing_like_it:=1", "roi_min:=[20.0, 0.0, 0.0]", "mesh_roots:=[/no/such/place]")
+    assert told[:2] == [
+        "parameter num_grasp: there is none; is num_grasps meant?",
+        "parameter nothing_like_it: there is none; it is ignored",
+    ]
+    assert "is above roi_max" in told[2]
+    assert told[3] == "mesh_roots: '/no/such/place' is no directory"

@@ -21,13 +21,14 @@ from bag_writer import (
     write_bag,
 )
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core.bags.messages import cloud_from_depth_message, points_from_message
 from graspd_core.errors import BagError
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
-from graspd_ros.player import main, play
+from graspd_ros.player import _shifted, main, play
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5, (0.1, -0.05))
 DEPTH = np.linspace(0.4, 0.8, 24 * 32).reshape(24, 32)
@@ -109,6 +110,14 @@ def test_the_pace_is_the_recorded_one_times_the_rate(client, tmp_path):
     # At the recorded pace it would take an hour, and the test's time would be over.
     assert play(client.node, tmp_path / "hour", rate=18_000.0) == 2
     assert time.monotonic() - begun >= 3600 / 18_000
+
+
+def test_at_another_rate_each_stamp_is_the_time_that_it_is_due():
+    cloud = PointCloud2()
+    cloud.header.stamp.sec, cloud.header.stamp.nanosec = divmod(START + 10 * SECOND, SECOND)
+    data = serialize_message(cloud)
+    moved = _shifted(data, PointCloud2, START, 5000 * SECOND, 4.0).header.stamp
+    assert (moved.sec, moved.nanosec) == (5002, SECOND // 2)
 
 
 def test_stamps_can_be_those_of_now(client, bag, heard):

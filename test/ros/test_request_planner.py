@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,10 +15,14 @@ from builtin_interfaces.msg import Time
 from graspd_core.errors import MeshError, TransformError
 from graspd_core.hands.library import load_hand
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.types import Outcome, Progress, Stage, Verdict
+from graspd_core.types import GraspResult, Outcome, Progress, Stage, Verdict
 from graspd_ros import request_planner as planning
+from graspd_ros.inputs.frames import matrix_of_pose
 from graspd_ros.inputs.requests import Request
+from graspd_ros.outputs.error_codes import RequestError
+from graspd_ros.outputs.status_json import pose_of
 from graspd_ros.parameters import Settings
+from graspd_ros.recovery import unlike
 from graspd_ros.request_planner import Planner, limited
 
 SETTINGS = Settings(num_grasps=1, preset="fast", deadline=100.0)
@@ -129,3 +134,40 @@ def test_reports_are_limited_by_their_rate(monkeypatch: pytest.MonkeyPatch):
     late = limited(lambda progress: passed.append(-1), rate=32.0, since=next(clock))
     late(Progress(Stage.OPTIMISE, 0, 10, 0.0, 0, 0.0))
     assert -1 not in passed
+
+
+def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(hand):
+    loaded: list[bool] = []
+
+    def load():
+        loaded.append(True)
+        return load_scene("shape:sphere")
+
+    def ask(name: str, *exclude: str, key: str = "mesh sphere", wanted: int = 1, poses=()) -> GraspResult:
+        settings = replace(SETTINGS, num_grasps=wanted)
+        asked = replace(request(load, settings), id=name, object_key=key, exclude=exclude, exclude_poses=poses)
+        return plans.plan(asked, never, lambda _: None).result
+
+    plans = planner(hand)
+    first = ask("first", wanted=3)
+    assert first.outcome is Outcome.SUCCEEDED
+    began = time.perf_counter()
+    second = ask("second", "first/0")
+    assert time.perf_counter() - began < 0.25, "a run takes seconds"
+    assert len(loaded) == 1
+    assert second.grasps == first.grasps[1:2]
+    pose = matrix_of_pose(pose_of(first.grasps[1].grasp))
+    third = ask("third", "first/0", poses=(("object", pose),))
+    assert third.grasps == first.grasps[2:3]
+    # When all are lost, another run begins, and gives none like them.
+    fourth = ask("fourth", "first/0", "second/0", "third/0")
+    assert len(loaded) == 2
+    assert fourth.outcome is Outcome.SUCCEEDED
+    lost = [matrix_of_pose(pose_of(grasp.grasp)) for grasp in first.grasps]
+    assert unlike(fourth.grasps, lost) == list(fourth.grasps)
+    # Seen anew, the object is another: a run, and still none like the lost one.
+    fifth = ask("fifth", "first/0", key="cloud 2")
+    assert len(loaded) == 3
+    assert unlike(fifth.grasps, lost[:1]) == list(fifth.grasps)
+    with pytest.raises(RequestError, match="exclude: no grasp 'nobody/0' in the last 16 runs; kept: first, second"):
+        ask("sixth", "nobody/0")

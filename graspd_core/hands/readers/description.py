@@ -17,7 +17,7 @@ from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
 
-_KEYS = ("name", "urdf", "palm", "approach", "effort", "open", "closed", "mount")
+_KEYS = ("name", "urdf", "root", "palm", "approach", "effort", "open", "closed", "mount")
 _PALM_KEYS, _MOUNT_KEYS = ("link", "center", "normal"), ("parent", "position", "quaternion_wxyz")
 # No length, angle or torque of a hand is larger, in any unit.
 _LARGEST = 1e9
@@ -117,6 +117,7 @@ class HandDescription:
         effort: one greatest torque for all joints, or some by name, or None for the URDF's [N·m].
         open, closed: joint values by joint name [rad] or [m]; None where they are to be guessed.
         mount: where the base link sits on an arm; None where the file does not say.
+        root: the link that the hand begins at, where the URDF holds a whole robot; None: all of it is the hand.
     """
 
     source: Source
@@ -130,6 +131,7 @@ class HandDescription:
     open: dict[str, float] | None
     closed: dict[str, float] | None
     mount: Mount | None = None
+    root: str | None = None
 
 
 def _is_number(value: object) -> bool:
@@ -171,6 +173,7 @@ def read_description(path: Path) -> HandDescription:
         open=checked("open", source.by_joint),
         closed=checked("closed", source.by_joint),
         mount=source.mount(root["mount"]) if "mount" in root else None,
+        root=checked("root", source.text),
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind
 from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
 from graspd_core.hands.readers.joint_limits import JointSpec
@@ -67,6 +68,27 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
         dropped.append(f"no <collision>, so the <visual> is taken: {', '.join(shown)}")
     name = str(root.get("name") or path.stem)
     return assemble(path, name, bodies, specs, read_couplings(path, joints), tuple(dropped))
+
+
+def below_link(path: Path, root: ET.Element, link: str) -> None:
+    """Drop all links and joints of a robot but those from `link` on. Raises HandError: no such link in a URDF."""
+    links = {str(element.get("name")): element for element in root.findall("link")}
+    if link not in links:
+        raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, it is no URDF'}")
+    ends = [(end.find("parent"), end.find("child"), end) for end in root.findall("joint")]
+    ends = [("" if p is None else p.get("link"), "" if c is None else c.get("link"), e) for p, c, e in ends]
+    kept, waiting = {link}, [link]
+    while waiting:
+        parent = waiting.pop()
+        below = [str(child) for above, child, _ in ends if above == parent and child not in kept]
+        kept.update(below)
+        waiting += below
+    for name, element in links.items():
+        if name not in kept:
+            root.remove(element)
+    for parent, _, element in ends:
+        if parent not in kept:
+            root.remove(element)
 
 
 def _refuse_xacro(path: Path, root: ET.Element) -> None:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,6 +26,7 @@ from graspd_ros.parameters import MOST_GRASPS, Settings
 
 NOW = Time(sec=1000)
 HAND = "allegro_right"
+FAR = Pose(position=Point(x=math.inf))
 
 
 def intake(lookup=lambda target, source, stamp: np.eye(4)) -> RequestBuilder:
@@ -190,13 +191,13 @@ def test_views_are_gathered_in_one_frame():
 
 def test_the_number_of_views_and_their_size_are_bounded():
     views, settings, crowd = Views(), Settings(), sensor_frame(np.random.default_rng(0).normal(size=(500_000, 3)))
-    views = views.add(crowd, settings, lambda *_: np.eye(4))
+    views = views.add(crowd, crowd.read(), settings, lambda *_: np.eye(4))
     assert len(views.clouds[0].points) <= 200_000
     few = sensor_frame(np.zeros((3, 3)))
     for _ in range(MOST_VIEWS - 1):
-        views = views.add(few, settings, lambda *_: np.eye(4))
+        views = views.add(few, few.read(), settings, lambda *_: np.eye(4))
     with pytest.raises(RequestError, match="64 views are kept already"):
-        views.add(few, settings, lambda *_: np.eye(4))
+        views.add(few, few.read(), settings, lambda *_: np.eye(4))
 
 
 @given(
@@ -269,3 +270,22 @@ def test_every_trouble_has_its_code():
     }
     assert [code_of(error) for error in cases] == list(cases.values())
     assert sentence_of(ValueError("two\nlines")) == "internal error: ValueError: two lines"
+
+
+def test_what_was_lost_and_which_object_it_was_of_reach_the_worker(tmp_path):
+    (tmp_path / "can.obj").touch()
+    mesh = {"source": GraspRequest.MESH, "mesh_uri": str(tmp_path / "can.obj")}
+    settings = Settings(mesh_roots=[str(tmp_path)])
+    lost = PoseStamped(header=Header(frame_id="base"), pose=Pose(position=Point(x=1.0)))
+    asked = GraspRequest(**mesh, exclude=["can-1/0"], exclude_poses=[lost])
+    request = intake().from_message("r", settings, asked)
+    assert request.exclude == ("can-1/0",)
+    ((frame, pose),) = request.exclude_poses
+    assert (frame, pose[0, 3]) == ("base", 1.0)
+    again = intake().from_message("s", settings, GraspRequest(**mesh, object_pose=Pose(position=Point(z=2.0))))
+    assert again.object_key == request.object_key != ""
+    larger = intake().from_message("t", settings, GraspRequest(**mesh, mesh_scale=2.0))
+    assert larger.object_key != request.object_key
+    assert "exclude: 257 ids, 0 poses; valid: 256" in str(refusal(exclude=["a/0"] * 257))
+    with pytest.raises(RequestError, match="exclude_poses: position"):
+        intake().from_message("u", settings, GraspRequest(**mesh, exclude_poses=[PoseStamped(pose=FAR)]))

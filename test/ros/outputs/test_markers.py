@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import yaml
 from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,9 +16,10 @@ from visualization_msgs.msg import Marker
 
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.library import load_hand
+from graspd_core.paths import config_dir
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose
-from graspd_ros.outputs.markers import COLOURS, IDS_OF_A_GRASP, result_markers
+from graspd_ros.outputs.markers import COLOURS, IDS_OF_A_GRASP, PARTS, result_markers
 
 HAND = load_hand("allegro_right")
 
@@ -34,7 +36,7 @@ def grasp(verdict: Verdict = Verdict.VERIFIED, seed: int = 0) -> Grasp:
 
 
 def markers(*grasps: Grasp, shown: int = 1) -> list[Marker]:
-    message = result_markers(grasps, HAND, "camera", Time(sec=7), shown)
+    message = result_markers(grasps, HAND, "camera", Time(sec=7), shown=shown)
     serialize_message(message)  # every field is of its type
     return list(message.markers)
 
@@ -150,3 +152,24 @@ def test_every_marker_stays_has_a_frame_and_an_id_of_its_own():
     for marker in found[1:]:
         assert matrix_of_pose(marker.pose)[3, 3] == 1
         assert marker.type == Marker.TEXT_VIEW_FACING or min(marker.scale.x, marker.scale.y, marker.scale.z) > 0
+
+
+def test_every_part_can_be_asked_for_and_left_out():
+    good, bad = grasp(), grasp(Verdict.FAILED, seed=1)
+    every = list(result_markers((good, bad), HAND, "camera", Time(), parts=PARTS).markers)
+    assert {marker.ns for marker in every} - {""} == set(PARTS)
+    for part in PARTS:
+        only = list(result_markers((good, bad), HAND, "camera", Time(), parts=(part,)).markers)
+        assert {marker.ns for marker in only} - {""} == {part}
+    # Before and after the grasp the hand is faint; who was rejected has a reason and a way.
+    assert all(marker.color.a < 0.5 for marker in [*of(every, "pregrasp"), *of(every, "squeeze")])
+    arrow, text = of(every, "rejected")
+    assert (arrow.type, text.type) == (Marker.ARROW, Marker.TEXT_VIEW_FACING)
+    assert "turned 40°" in text.text
+    assert len({(marker.ns, marker.id) for marker in every[1:]}) == len(every) - 1
+
+
+def test_the_ready_display_listens_to_the_markers_and_has_a_switch_for_each_part():
+    display = yaml.safe_load((config_dir() / "graspd.rviz").read_text())["Visualization Manager"]["Displays"][-1]
+    assert display["Topic"]["Value"] == "/graspd/markers"
+    assert set(display["Namespaces"]) == set(PARTS)

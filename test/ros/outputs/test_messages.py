@@ -71,7 +71,10 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert (hold.name, hold.passed, hold.reason) == ("hold", True, "")
     assert 0 <= hold.displacement < 0.02
     assert {p.request_id for p in client.progress} == {"mine-1"}
-    assert {p.stage for p in client.progress} >= {"load", "optimise", "verify"}
+    # Ten reports a second at most: a stage may take less than that.
+    stages = {p.stage for p in client.progress}
+    assert "load" in stages
+    assert stages & {"optimise", "verify"}
     assert all(0 <= p.fraction <= 1 and p.message for p in client.progress)
     elapsed = [p.elapsed for p in client.progress]
     assert elapsed == sorted(elapsed)

@@ -1,0 +1,163 @@
+"""Clouds that are not in their camera's frame: whose place counts, what is refused, and which object a mask means."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
+from graspd_msgs.msg import GraspRequest
+from sensor_msgs.msg import Image, PointCloud2, PointField
+
+from graspd_core.errors import CloudError, TransformError
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.pointcloud.camera import PinholeCamera, camera_rays
+from graspd_core.rendering.depth_noise import DEFAULT
+from graspd_core.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_ros.inputs.camera_place import CameraPlace, place_of, seen_by_camera
+from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.inputs.sensor_frames import cloud_frame
+from graspd_ros.outputs.error_codes import ErrorCode, RequestError, code_of
+from graspd_ros.parameters import Settings
+
+CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
+OPTICAL, BASE = "camera_depth_optical_frame", "base_link"
+NOW = Time(sec=1000)
+HEIGHT = float(np.ptp(make_shape("bottle").vertices[:, 2]))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A bottle and a box on a table; what a camera sees, and its pose in base_link, half a metre beside the bottle."""
+    shown = tabletop("bottle", obstacles=[("box", 0.0, 0.16)])
+    T_world_camera = ring_poses(1, elevation=0.7, azimuth=0.3)[0]
+    depth, label = depth_views(shown, CAMERA, [T_world_camera], DEFAULT, seed=3)[0]
+    T_base_camera = T_world_camera.copy()
+    T_base_camera[:3, 3] += [0.5, 0.0, 0.0]
+    return camera_rays(CAMERA) * np.where(depth > 0, depth, np.nan)[..., None], label, T_base_camera
+
+
+def message(grid: np.ndarray, frame: str, organised: bool) -> PointCloud2:
+    points = grid if organised else grid.reshape(1, -1, 3)[:, np.isfinite(grid.reshape(-1, 3)).all(1)]
+    fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate("xyz")]
+    height, width = points.shape[:2]
+    cloud = PointCloud2(height=height, width=width, fields=fields, point_step=12, row_step=12 * width)
+    cloud.header.frame_id = frame
+    cloud.data = array.array("B", points.astype("<f4").tobytes())
+    return cloud
+
+
+def builder(T_base_camera: np.ndarray) -> RequestBuilder:
+    def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
+        if (target, source) != (BASE, OPTICAL):
+            raise TransformError(f"{source} -> {target}: not connected")
+        return T_base_camera
+
+    return RequestBuilder("allegro_right", lambda: NOW, lookup)
+
+
+def in_base(grid: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
+    return grid @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
+
+
+@pytest.mark.parametrize("organised", [True, False])
+def test_a_cloud_of_another_frame_is_refused_unless_somebody_says_where_its_camera_stood(scene, organised):
+    grid, _, T = scene
+    cloud, taker, near = message(in_base(grid, T), BASE, organised), builder(T), Settings(cloud_max_age=0.0)
+    at = {"use_target_point": True, "target_point": Point(x=0.5, z=0.1), "cloud": cloud}
+    with pytest.raises(CloudError, match="its camera did not stand at the origin of its frame") as refused:
+        taker.from_message("r", near, GraspRequest(**at)).load()
+    assert code_of(refused.value) is ErrorCode.BAD_CLOUD
+    x, y, z = map(float, T[:3, 3])
+    for said in ({"sensor_frame": OPTICAL}, {"use_view_point": True, "view_point": Point(x=x, y=y, z=z)}):
+        loaded = taker.from_message("r", near, GraspRequest(**at, **said)).load()
+        assert loaded.support is not None
+        np.testing.assert_allclose(loaded.support.normal, [0, 0, 1], atol=0.02)
+        assert np.ptp(loaded.object.mesh.vertices[:, 2]) == pytest.approx(HEIGHT, abs=0.012)
+    with pytest.raises(TransformError, match="not connected"):
+        taker.from_message("r", near, GraspRequest(**at, sensor_frame="elbow")).load()
+    # In its own frame the same cloud needs no word.
+    own = message(grid, OPTICAL, organised)
+    assert taker.from_message("r", near, GraspRequest(cloud=own)).load().support is not None
+
+
+def test_the_request_goes_before_the_parameters_and_a_point_before_a_frame():
+    settings = Settings(sensor_frame="head", view_point=[0.0, 0.0, 1.0])
+    assert place_of(Settings()) == CameraPlace()
+    assert place_of(settings) == CameraPlace((0.0, 0.0, 1.0), "head")
+    assert place_of(settings, GraspRequest()) == place_of(settings)
+    assert place_of(settings, GraspRequest(sensor_frame="wrist")) == CameraPlace(sensor_frame="wrist")
+    said = GraspRequest(sensor_frame="wrist", use_view_point=True)
+    assert place_of(settings, said) == CameraPlace((0.0, 0.0, 0.0))
+
+
+def test_a_cloud_that_came_unasked_is_seen_from_where_the_parameters_say(scene):
+    grid, _, T = scene
+    frame, taker = cloud_frame(message(in_base(grid, T), BASE, False), 0), builder(T)
+    with pytest.raises(CloudError, match="did not stand"):
+        taker.from_sensor_frame("r", Settings(cloud_max_age=0.0), frame).load()
+    settings = Settings(cloud_max_age=0.0, sensor_frame=OPTICAL)
+    assert taker.from_sensor_frame("r", settings, frame).load().support is not None
+    seen = seen_by_camera(frame, place_of(settings), lambda *_: T, alone=False)
+    assert seen.forward is not None
+    np.testing.assert_array_equal(np.r_[seen.viewpoint, seen.forward], np.r_[T[:3, 3], T[:3, 2]])
+    taker.newest = frame
+    with pytest.raises(CloudError, match="did not stand"):
+        taker.add_view(Settings(cloud_max_age=0.0))
+    taker.add_view(settings)
+    assert len(taker.views.clouds) == 1
+
+
+def mask_of(shown: np.ndarray, **fields) -> Image:
+    height, width = shown.shape
+    image = Image(height=height, width=width, encoding="mono8", step=width)
+    image.data = array.array("B", (255 * shown).astype(np.uint8).tobytes())
+    for name, value in fields.items():
+        setattr(image, name, value)
+    return image
+
+
+def test_a_mask_says_which_object_is_meant(scene):
+    grid, label, T = scene
+    cloud, taker, settings = message(grid, OPTICAL, True), builder(T), Settings(cloud_max_age=0.0, voxel_size=0.01)
+    # In the camera's frame the two are 16 cm apart.
+    for number in (0, 1):
+        truth = np.nanmean(grid[label == number], axis=0)
+        asked = GraspRequest(cloud=cloud, target_mask=mask_of(label == number))
+        middle = taker.from_message("r", settings, asked).load().object.mesh.vertices.mean(0)
+        assert np.linalg.norm(middle - truth) < 0.06
+    for bad, culprit in (
+        (mask_of(label == 0, encoding="rgb8"), "320 x 240 'rgb8'; valid: mono8 of 320 x 240"),
+        (mask_of((label == 0)[:100]), "320 x 100 'mono8'"),
+        (mask_of(label == 0, data=array.array("B", [1])), "1 bytes, step 320, are too few"),
+    ):
+        with pytest.raises(RequestError, match=culprit) as refused:
+            taker.from_message("r", settings, GraspRequest(cloud=cloud, target_mask=bad)).load()
+        assert refused.value.code is ErrorCode.BAD_REQUEST
+
+
+@pytest.mark.parametrize(
+    ("fields", "culprit"),
+    [
+        ({"use_view_point": True, "view_point": Point(x=float("nan"))}, "view_point: [nan"),
+        ({"target_mask": Image(height=1), "alone": True}, "target_mask: alone is given too"),
+        ({"target_mask": Image(height=1), "use_target_point": True}, "target_mask: target_point is given too"),
+        ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: with source 1"),
+    ],
+)
+def test_wishes_that_cannot_be_meant_are_refused_by_name(fields, culprit):
+    with pytest.raises(RequestError) as refused:
+        builder(np.eye(4)).from_message("r", Settings(), GraspRequest(**fields))
+    assert culprit in str(refused.value)
+
+
+def test_a_cloud_of_the_object_alone_is_taken_whole(scene):
+    grid, label, T = scene
+    bottle = np.where((label == 0)[..., None], grid, np.nan)
+    asked = GraspRequest(cloud=message(bottle, OPTICAL, False), alone=True)
+    loaded = builder(T).from_message("r", Settings(cloud_max_age=0.0), asked).load()
+    assert loaded.support is None
+    assert not loaded.obstacles
+    assert np.linalg.norm(loaded.object.mesh.vertices.mean(0) - np.nanmean(bottle, axis=(0, 1))) < 0.06

@@ -1,0 +1,159 @@
+"""The action GraspPlanning end to end: a mesh, a primitive and a cluster in, MoveIt's grasps out, feedback before."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose
+from grasping_msgs.action import GraspPlanning
+from grasping_msgs.msg import Object
+from rclpy.action.client import ActionClient
+from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
+
+from graspd_core.errors import GraspdError
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.pointcloud.depth_image import cloud_from_depth
+from graspd_core.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
+from graspd_ros.grasp_planning import request_from_goal
+from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.outputs.error_codes import code_of
+from graspd_ros.parameters import Settings
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "moveit_client.py"
+TABLE = Plane(coef=[0.0, 0.0, 1.0, 0.0])
+FEW = {"num_grasps": 2, "preset": "fast", "deadline": 100.0}
+
+pytestmark = pytest.mark.timeout(300)
+
+
+def box(*sizes: float, z: float = 0.0, **fields: Any) -> Object:
+    pose = Pose(position=Point(z=z))
+    solid = SolidPrimitive(type=SolidPrimitive.BOX, dimensions=list(sizes))
+    return Object(primitives=[solid], primitive_poses=[pose], **fields)
+
+
+def mug() -> Object:
+    shape = make_shape("mug")
+    vertices = [Point(x=x, y=y, z=z) for x, y, z in shape.vertices.tolist()]
+    faces = [MeshTriangle(vertex_indices=face) for face in shape.faces.tolist()]
+    return Object(meshes=[Mesh(vertices=vertices, triangles=faces)], mesh_poses=[Pose()])
+
+
+def cluster(make_cloud) -> Object:
+    """What a camera sees of a bottle, cut out, in the camera's frame."""
+    scene = tabletop("bottle")
+    pose = ring_poses(1, elevation=0.7)[0]
+    depth, label = depth_views(scene, CAMERA, [pose])[0]
+    seen = cloud_from_depth(np.where(label == 0, depth, 0.0), CAMERA)
+    return Object(point_cluster=make_cloud(seen.points, "camera_depth_optical_frame"))
+
+
+@pytest.fixture
+def planning(client, node):
+    actions = ActionClient(client.node, GraspPlanning, "/graspd/grasp_planning")
+    client.spin_until(actions.server_is_ready, "action server")
+    client.set_parameters(**FEW)
+    yield actions
+    actions.destroy()
+
+
+def ask(client, planning, target: Object, group: str = "") -> tuple[int, list, list]:
+    """How a goal ended, its grasps, and how many each feedback told of before."""
+    feedback: list[int] = []
+    goal = GraspPlanning.Goal(object=target, group_name=group)
+    sent = planning.send_goal_async(goal, feedback_callback=lambda m: feedback.append(len(m.feedback.grasps)))
+    handle = client.spin_until(lambda: sent.done() and sent.result(), "answer to a goal")
+    asked = handle.get_result_async()
+    ended = client.spin_until(lambda: asked.done() and asked.result(), "result")
+    return ended.status, list(ended.result.grasps), feedback
+
+
+@pytest.mark.parametrize("kind", ["mesh", "primitive", "cluster"])
+def test_each_kind_of_object_gets_grasps_and_feedback_before(client, planning, make_cloud, kind):
+    target = {"mesh": mug, "primitive": lambda: box(0.05, 0.05, 0.12), "cluster": lambda: cluster(make_cloud)}[kind]()
+    status, grasps, feedback = ask(client, planning, target, "allegro_right")
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    assert len(grasps) == 2
+    assert feedback[:1] == [1]
+    best = grasps[0]
+    assert best.grasp_pose.header.frame_id == ("camera_depth_optical_frame" if kind == "cluster" else "object")
+    assert len(best.pre_grasp_posture.points) == 1
+    assert len(best.grasp_posture.points) == 2
+    assert all(effort > 0 for point in best.grasp_posture.points for effort in point.effort)
+    assert len(best.grasp_posture.points[0].effort) == len(best.grasp_posture.joint_names)
+    assert best.pre_grasp_approach.desired_distance > 0
+    assert best.post_grasp_retreat.direction.header.frame_id == best.grasp_pose.header.frame_id
+
+
+def test_a_group_that_is_no_hand_and_an_object_without_shape_are_aborted_and_told_on_status(client, planning):
+    status, grasps, _ = ask(client, planning, box(0.05, 0.05, 0.12), "left_arm")
+    assert (status, grasps) == (GoalStatus.STATUS_ABORTED, [])
+    refused = client.event(event="refused", code="WRONG_HAND")
+    assert "group_name: 'left_arm' is no hand here; this node plans for 'allegro_right'" in refused["message"]
+    assert ask(client, planning, Object())[0] == GoalStatus.STATUS_ABORTED
+    assert "object: no meshes" in client.event(event="refused", code="BAD_REQUEST")["message"]
+
+
+def test_the_client_of_the_docs_gets_grasps_in_a_process_of_its_own(client, planning):
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(client.domain)}
+    done = subprocess.run([sys.executable, EXAMPLE], env=environment, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    first, *_ = done.stdout.splitlines()
+    assert first == "1 grasps found thus far"
+    assert "in table" in done.stdout
+
+
+def loaded(target: Object):
+    builder = RequestBuilder("allegro_right", lambda: Time(sec=1), lambda *_: np.eye(4))
+    goal = GraspPlanning.Goal(object=target)
+    return request_from_goal(builder, "allegro_right", "r", Settings(cloud_max_age=0.0), goal).load()
+
+
+def test_the_surface_is_what_the_object_stands_on_whichever_way_it_is_written():
+    for coefficients in ([0.0, 0.0, 2.0, 0.2], [0.0, 0.0, -1.0, -0.1]):
+        scene = loaded(box(0.04, 0.05, 0.06, z=-0.07, surface=Plane(coef=coefficients)))
+        np.testing.assert_allclose(np.ptp(scene.object.mesh.vertices, axis=0), [0.04, 0.05, 0.06], atol=1e-6)
+        assert scene.support is not None
+        np.testing.assert_allclose(scene.support.normal, [0, 0, 1])
+        assert scene.support.offset == pytest.approx(-0.1)
+    assert loaded(box(0.04, 0.05, 0.06)).support is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "dimensions", "extents"),
+    [
+        (SolidPrimitive.SPHERE, [0.03], [0.06, 0.06, 0.06]),
+        (SolidPrimitive.CYLINDER, [0.1, 0.03], [0.06, 0.06, 0.1]),
+        (SolidPrimitive.CONE, [0.1, 0.03], [0.06, 0.06, 0.1]),
+    ],
+)
+def test_solids_have_the_sizes_of_the_message_and_stand_about_their_middle(kind, dimensions, extents):
+    vertices = loaded(Object(primitives=[SolidPrimitive(type=kind, dimensions=dimensions)])).object.mesh.vertices
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), extents, rtol=0.02)
+    np.testing.assert_allclose(vertices.min(0) + vertices.max(0), 0.0, atol=2e-3)
+
+
+BAD = {
+    "primitives: dimensions [0.1], valid: 3": box(0.1),
+    "primitives: dimensions [-1.0, 1.0, 1.0]": box(-1.0, 1.0, 1.0),
+    "primitives: type 9": Object(primitives=[SolidPrimitive(type=9)]),
+    "primitive_poses: 2 poses of 1 shapes": Object(primitives=[SolidPrimitive()], primitive_poses=[Pose(), Pose()]),
+    "meshes: 0 vertices and 0 triangles": Object(meshes=[Mesh()]),
+    "surface: [0.0, 0.0, 0.0, 1.0] is no plane": box(0.1, 0.1, 0.1, surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])),
+}
+
+
+@pytest.mark.parametrize("culprit", BAD)
+def test_an_object_that_cannot_be_meant_is_refused_by_name(culprit):
+    with pytest.raises(GraspdError) as refused:
+        loaded(BAD[culprit])
+    assert culprit.replace(", valid", "; valid") in str(refused.value)
+    assert code_of(refused.value) == "BAD_REQUEST"
