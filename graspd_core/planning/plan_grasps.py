@@ -113,7 +113,7 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     view = next_view(scene.evidence, scene.object.mesh, far)
     told = f"{held} grasps hold on the likeliest shape, none is sure enough, since a part of the object was guessed"
     if view is not None:
-        told += "; a view from ({:.2f}, {:.2f}, {:.2f}) m would show most of it".format(*view[:3, 3])
+        told += "; one more view, from next_view, would show most of it"
     return replace(result, message=told, next_view=view)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Vector3
+from geometry_msgs.msg import Point, PoseStamped, Vector3
 from graspd_msgs.msg import Contact as ContactMessage
 from graspd_msgs.msg import Grasp as GraspMessage
 from graspd_msgs.msg import GraspArray, GraspProgress, Metric
@@ -19,6 +19,7 @@ from std_msgs.msg import Header
 
 from graspd_core import HandModel
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Progress, Stage, TrialResult, Verdict
+from graspd_ros.inputs.frames import pose_of_matrix
 from graspd_ros.outputs import status_json as convert
 from graspd_ros.outputs.error_codes import ErrorCode
 from graspd_ros.outputs.mount import parent_pose
@@ -82,6 +83,8 @@ def array_message(
     if ending.result is not None:
         message.outcome = ending.result.outcome.name.lower()
         message.warnings = list(ending.result.warnings)
+        if ending.result.next_view is not None:
+            message.next_view = PoseStamped(header=header, pose=pose_of_matrix(ending.result.next_view))
         message.grasps = [
             grasp_message(grasp, rank, request_id, header, hand, pace)
             for rank, grasp in enumerate(ending.result.grasps)
@@ -111,6 +114,7 @@ def grasp_message(
         grasp_joints=joints[1],
         squeeze_joints=joints[2],
         score=_number(grasp.score),
+        probability=-1.0 if grasp.probability is None else grasp.probability,
         metrics=[
             Metric(name=name, value=value)
             for name, value in (grasp.metrics or {}).items()

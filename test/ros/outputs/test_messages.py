@@ -15,7 +15,14 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from graspd_core.hands.library import load_hand
 from graspd_core.methods.plan_config import preset_names
+from graspd_core.types import HYPOTHESES, GraspResult, Outcome, Posture, Timing, TrialResult
+from graspd_core.types import Grasp as CoreGrasp
+from graspd_ros.inputs.frames import moved_result
+from graspd_ros.outputs.messages import array_message, ending_of
+from graspd_ros.outputs.status_json import presentable
+from graspd_ros.outputs.trajectory import Pace
 
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
@@ -67,6 +74,7 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     metrics = {metric.name: metric.value for metric in best.metrics}
     assert metrics["epsilon"] > 0
     assert "robustness" not in metrics, "what was not measured is left out"
+    assert (best.probability, answer.next_view.header.frame_id) == (-1.0, ""), "nothing was guessed of a mesh"
     (hold,) = best.trials
     assert (hold.name, hold.passed, hold.reason) == ("hold", True, "")
     assert 0 <= hold.displacement < 0.02
@@ -237,3 +245,21 @@ def test_an_output_frame_that_nothing_connects_is_named_before_any_work(client, 
     answer = client.answer("nowhere")
     assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_TRANSFORM")
     assert {p.stage for p in client.progress if p.request_id == "nowhere"} <= {"queued", "load"}
+
+
+def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented():
+    hand = load_hand("parallel_gripper")
+    posture = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(len(hand.joint_names)))
+    trials = (TrialResult("hold", True, 0.0, 0.0), TrialResult(HYPOTHESES, False, 0.0, 0.0, "fails under 3"))
+    grasp = CoreGrasp(posture, posture, posture, trials=trials, probability=0.51)
+    view, T_table_camera = np.eye(4), np.eye(4)
+    view[2, 3], T_table_camera[0, 3] = 0.5, 1.0
+    result = GraspResult(Outcome.TOO_FEW, (grasp,), Timing(), 0, "closed_form", next_view=view)
+    assert presentable(result) is None
+    ending = ending_of(moved_result(result, T_table_camera))
+    message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Pace())
+    assert message.status == GraspArray.PARTIAL
+    (told,) = message.grasps
+    assert (told.verdict, told.probability, told.reason) == (Grasp.UNVERIFIED, 0.51, "fails under 3")
+    assert message.next_view.header.frame_id == "table"
+    assert place(message.next_view.pose) == pytest.approx([1.0, 0.0, 0.5])
