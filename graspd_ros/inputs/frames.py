@@ -117,7 +117,7 @@ def pose_of_matrix(T: Float[np.ndarray, "4 4"]) -> Pose:
 
 
 def moved_result(result: GraspResult, T_new_old: Float[np.ndarray, "4 4"]) -> GraspResult:
-    """A result in another frame: every posture's base pose, every contact, the support and the next view; all else has no frame."""
+    """A result in another frame: postures, contacts, the support and the next view; all else has no frame."""
     return replace(
         result,
         grasps=tuple(moved_grasp(grasp, T_new_old) for grasp in result.grasps),
