@@ -32,6 +32,8 @@ SURFACE_NEIGHBOURS, AGREEING_SHARE = 8, 0.75
 HIDDEN_DEPTH, HIDDEN_DEPTH_SHARE = 0.03, 0.05  # [m], and of the distance
 # A plane that holds this share of the points is a table; things on it are no farther from it than that [m].
 PLANE_SHARE, PLANE_TRIALS, PLANE_TOLERANCE, THING_HEIGHT = 0.25, 200, 0.01, 0.35
+# Root mean square of a table seen by a camera [m]; points all through the slab would have 0.0058.
+PLANE_NOISE = 0.004
 # Singular values of the camera matrix's equations: the two least are as far apart where the points are not in a plane.
 MIN_CONDITION = 100.0
 
@@ -112,13 +114,19 @@ def things_behind(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray,
     normal = normals[best] * (1.0 if (viewpoint - corners[best, 0]) @ normals[best] > 0 else -1.0)
     height = (points - corners[best, 0]) @ normal
     on = np.abs(height) < PLANE_TOLERANCE
-    if on.mean() < PLANE_SHARE:
+    if on.mean() < PLANE_SHARE or not _flat(points[on]):
         return False
     first = perpendicular(normal)
     flat = points @ np.column_stack([first, np.cross(normal, first)])
     over = Delaunay(flat[on]).find_simplex(flat) >= 0
     near, far = (over & (side > 1.5 * PLANE_TOLERANCE) & (side < THING_HEIGHT) for side in (height, -height))
     return bool(far.mean() > MAX_HIDDEN_SHARE and far.sum() > near.sum())
+
+
+def _flat(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether points are of a plane, seen with a camera's noise, and not of a slice of something round."""
+    offset = points - points.mean(0)
+    return bool(np.linalg.svd(offset, compute_uv=False)[2] < PLANE_NOISE * np.sqrt(len(points)))
 
 
 def _some(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3"]:
