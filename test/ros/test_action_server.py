@@ -11,6 +11,7 @@ from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspRequest
 from rclpy.action.client import ActionClient
 from rclpy.action.server import RCLError
+from rclpy.qos import QoSProfile
 
 from graspd_ros.action_server import Goal as OurGoal
 from graspd_ros.action_server import SynthesizeMessages
@@ -120,8 +121,17 @@ def test_a_goal_that_is_refused_or_superseded_is_aborted_and_told_why(client, no
     assert (status, result.status) == (GoalStatus.STATUS_ABORTED, GraspArray.CANCELLED)
 
 
-def test_each_goal_of_a_burst_gets_its_reply_and_its_result(client, node, actions):
-    """Ten requests at a time are kept by a service as rclpy makes it; of fifty, most got no reply."""
+def test_each_goal_of_a_burst_gets_its_reply_and_its_result(client, node):
+    """Ten requests at a time are kept by a service as rclpy makes it, and ten replies by a client: of fifty, some go."""
+    deep = QoSProfile(depth=500)
+    actions = ActionClient(
+        client.node,
+        SynthesizeGrasps,
+        "/graspd/synthesize",
+        goal_service_qos_profile=deep,
+        result_service_qos_profile=deep,
+    )
+    client.spin_until(actions.server_is_ready, "action server")
     goals = [SynthesizeGrasps.Goal(request=GraspRequest(**SPHERE, **FEW, id=f"burst-{k}")) for k in range(50)]
     sent = [actions.send_goal_async(goal) for goal in goals]
     client.spin_until(lambda: all(future.done() for future in sent), "replies to 50 goals")
@@ -131,3 +141,4 @@ def test_each_goal_of_a_burst_gets_its_reply_and_its_result(client, node, action
     client.spin_until(lambda: all(future.done() for future in ends), "results of 50 goals")
     codes = [future.result().result.result.error_code for future in ends]
     assert {code for code in codes if code} == {"BUSY"}
+    actions.destroy()
