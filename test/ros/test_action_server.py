@@ -122,7 +122,7 @@ def test_a_goal_that_is_refused_or_superseded_is_aborted_and_told_why(client, no
 
 
 def test_each_goal_of_a_burst_gets_its_reply_and_its_result(client, node):
-    """Ten requests at a time are kept by a service as rclpy makes it, and ten replies by a client: of fifty, some go."""
+    """A service as rclpy makes it keeps ten requests at a time, and a client ten replies: of fifty, some go."""
     deep = QoSProfile(depth=500)
     actions = ActionClient(
         client.node,
