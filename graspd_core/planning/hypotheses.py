@@ -61,7 +61,7 @@ def hypotheses_of(
 ) -> Hypotheses | None:
     """Those that a grasp must hold under to be as sure as asked for, cheapest first; None where none is needed.
 
-    The shapes are made by a thread of their own, from now on: trials wait for each when they need it.
+    The shapes are made by a thread of their own, one ahead of the trials, which wait for each that they need.
     """
     allowed = sum(held >= probability for held in HELD_AFTER) - 1
     if scene.evidence is None or allowed + 1 == len(HELD_AFTER):
