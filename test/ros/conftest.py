@@ -317,11 +317,11 @@ def start_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Itera
     save_shapes(tmp_path)
     started: list[NodeProcess] = []
 
-    def start(ready: bool = True, **parameters: Any) -> NodeProcess:
+    def start(ready: bool = True, module: Path | None = None, **parameters: Any) -> NodeProcess:
         if ready:
-            started.append(start_ready(client, tmp_path, **parameters))
+            started.append(start_ready(client, tmp_path, module, **parameters))
         else:
-            started.append(NodeProcess(client.domain, tmp_path, parameters))
+            started.append(NodeProcess(client.domain, tmp_path, parameters, module))
         return started[-1]
 
     yield start

@@ -19,6 +19,7 @@ SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 256, "preset": "accurate", "time_budget": 600.0}
 SABOTEUR = Path(__file__).with_name("saboteur.py")
+SLOW_START = Path(__file__).with_name("slow_start.py")
 # Starts the node again and again in one process, each time with other arguments, until one does not end at once.
 STARTS = """
 import contextlib, io, json, sys
@@ -51,20 +52,30 @@ def test_a_signal_ends_a_busy_node_cleanly(client, shared_node, number):
     actions.destroy()
 
 
-def handles_signals(pid: int) -> bool:
-    """Whether a process has taken SIGTERM into its own hands, as the node does before its imports."""
-    (caught,) = [line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("SigCgt:")]
-    return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
-
-
-@pytest.mark.parametrize("moment", ["imports", "warm-up"])
-def test_a_signal_during_the_start_ends_the_node_cleanly(client, start_node, moment):
-    process = start_node(ready=False)
-    while not handles_signals(process.process.pid):
+def wait_for_signal_handler(pid: int) -> None:
+    """Until a process has taken SIGTERM into its own hands, as the node does before its imports."""
+    status, caught = Path(f"/proc/{pid}/status"), 0
+    while not caught >> (signal.SIGTERM - 1) & 1:
         time.sleep(0.01)
-    if moment == "warm-up":  # the node is there, and has not said that it is ready
-        client.spin_until(lambda: "graspd" in client.node.get_node_names(), "node")
-        assert not [event for event in client.events if event["event"] == "ready"]
+        (line,) = [line for line in status.read_text().splitlines() if line.startswith("SigCgt:")]
+        caught = int(line.split()[1], 16)
+
+
+def test_a_signal_during_the_imports_ends_the_node_cleanly(start_node):
+    process = start_node(ready=False)
+    wait_for_signal_handler(process.process.pid)
+    status, log = process.stop()
+    assert status == 0
+    assert "Traceback" not in log
+
+
+def test_a_signal_during_the_warm_up_ends_the_node_cleanly(client, start_node):
+    """The warm-up of this node has no end of its own (slow_start.py): it is not ready, however late it is heard of."""
+    client.forget()
+    process = start_node(ready=False, module=SLOW_START)
+    wait_for_signal_handler(process.process.pid)
+    client.spin_until(lambda: "graspd" in client.node.get_node_names(), "node")
+    assert not [event for event in client.events if event["event"] == "ready"]
     status, log = process.stop()
     assert status == 0
     assert "Traceback" not in log
