@@ -190,26 +190,6 @@ def test_a_mask_or_box_parts_two_that_touch(kind):
     assert share_near(found.obstacles[0], scene.obstacles[0], 2e-3) > 0.95
 
 
-def test_a_cup_is_one_thing_though_its_near_wall_hides_how_it_goes_on():
-    scene = tabletop("mug")
-    for elevation in (0.3, 0.6, 0.9, 1.2, 1.5):
-        view, label = seen(scene.meshes, ring_poses(1, elevation=elevation)[0])
-        found = segment([view])
-        clear = (label == 0) & (view.points[:, 2] > 0.005)
-        assert share_found(found, view.points[clear]) > 0.98, elevation
-        assert not found.obstacles
-
-
-# From where the box's foot is seen; behind the bowl (3.0) nothing tells it from the bowl's own far side.
-@pytest.mark.parametrize("turn", [0.0, 1.0, 2.0])
-def test_a_bowl_that_overhangs_its_foot_does_not_join_what_is_beside_it(turn):
-    scene = tabletop("bowl", obstacles=[("box", 0.115, 0.0)])
-    view, _ = seen(scene.meshes, ring_poses(1, elevation=0.9, azimuth=turn)[0], LEVELS["default"])
-    found = segment([view], target=Target(point=np.array([0.0, 0.0, 0.01])))
-    assert share_near(found.views[0].points, scene.truth, 0.009) > 0.99
-    assert len(found.obstacles) == 1
-
-
 def test_flying_pixels_are_left_out():
     scene = tabletop("box")
     depth, label = render_scene(scene.meshes, CAMERA, POSE)
