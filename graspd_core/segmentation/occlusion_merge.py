@@ -21,8 +21,8 @@ MAX_PIECES = 40
 # What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
 FLOATING_LINKS, HIDDEN_FOOT_SHARE = 0.5, 0.5
 # What ends above the support may stand there by itself, its foot hidden, if it has this share of the other's surface,
-# and if it is seen over this share of its height or ends at another height than the other [m]. Handles fall short of the
-# first, walls of cups of both others.
+# and if it is seen over this share of its height or ends at another height than the other [m]. Handles fall short of
+# the first, walls of cups of both others.
 OWN_SURFACE_SHARE, SEEN_HEIGHT_SHARE, LEVEL_TOPS_M = 0.12, 0.5, 0.01
 # It is part of the other nevertheless if it is so many link lengths from it.
 NEAR_LINKS = 1.5

@@ -1,4 +1,4 @@
-"""A node like any other, but for its warm-up: it is done again until the node stops. Started by test_node_process.py."""
+"""A node like any other, but it warms up again and again until it stops. Started by test_node_process.py."""
 
 from __future__ import annotations
 
