@@ -215,8 +215,8 @@ def _confidence(
     """1 near seen points, less the farther from them."""
     from scipy.spatial import KDTree
 
-    distance, _ = KDTree(seen).query(mesh.vertices)
     far = settings.guessed_distance
+    distance, _ = KDTree(seen).query(mesh.vertices, distance_upper_bound=far)
     return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
 
 

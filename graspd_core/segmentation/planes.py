@@ -15,6 +15,8 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.types import Plane
 
+# So many points, evenly taken, show which plane has most of them.
+RANSAC_POINTS = 10_000
 # Residuals of a plane gather in the middle of the slab in which it is searched: their median is this share of it at
 # most, and the tolerance they need is not much wider. Those of a curved surface fill the slab, and the next again.
 MAX_MEDIAN_RESIDUAL_SHARE, MAX_GATE_GROWTH = 0.4, 1.5
@@ -93,21 +95,22 @@ def find_planes(
     for _ in range(MAX_PLANES):
         if len(left) < max(50, (settings.support_size / 0.02) ** 2):
             break
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
-        part, close = None, []
+        some = left[:: 1 + len(left) // RANSAC_POINTS]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[some]))
+        part, guess, gate = None, np.zeros(4), wide
         # A step in a table lies within the wide gate, which then takes both levels for one slope.
         for gate in (wide, min(settings.plane_tolerance, 0.5 * wide)):
             # All trials, whatever they find: threads that may stop early give another plane each time.
             o3d.utility.random.seed(0)
-            guess, close = cloud.segment_plane(gate, 3, settings.ransac_trials, 1.0)
-            part = _refine(points, distance, left, np.asarray(guess), viewpoints.mean(0), gate, settings)
+            guess = np.asarray(cloud.segment_plane(gate, 3, settings.ransac_trials, 1.0)[0])
+            part = _refine(points, distance, left, guess, viewpoints.mean(0), gate, settings)
             if part is not None:
                 break
         if part is not None and part.sides[1] >= settings.support_size:
             parts.append(part)
             left = left[~part.inliers[left]]
         else:
-            left = np.delete(left, np.asarray(close, dtype=int))
+            left = left[np.abs(points[left] @ guess[:3] + guess[3]) >= gate]
     return parts
 
 
