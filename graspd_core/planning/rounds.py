@@ -43,7 +43,8 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
 
 # How far apart the seeds of two rounds are.
 _SEED_STEP = 1_000_003
-# Where so many grasps are asked for, so few are sought first: an answer need not wait until all are found.
+# Where so many grasps are asked for, so few are sought first: an answer need not wait until all are found. Where the
+# first round finds none at all, as many are sought, however few are asked for.
 _MANY, _FIRST_BATCH = 8, 2
 
 
@@ -117,9 +118,9 @@ def run_rounds(
     for attempt, (config, most) in enumerate(batches):
         wanted, good, began = min(most, count - state.good), state.good, time.perf_counter()
         asked = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
-        asked["seed"] = seed + _SEED_STEP * attempt
-        with enough_memory(f"{wanted} grasps at once"):
-            candidates, refused = restrictions.admit(find_candidates(scene, hand, count=wanted, **asked).grasps)
+        asked |= {"seed": seed + _SEED_STEP * attempt, "count": wanted if good or not attempt else max(wanted, _MANY)}
+        with enough_memory(f"{asked['count']} grasps at once"):
+            candidates, refused = restrictions.admit(find_candidates(scene, hand, **asked).grasps)
         state = replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
         state = replace(state, refused=state.refused + refused)
         tried = TriedGrasps()

@@ -9,8 +9,12 @@ import pytest
 import torch
 
 from graspd_core.config import RoundsConfig
+from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
+from graspd_core.methods.candidates import Candidates
 from graspd_core.methods.plan_config import PlanConfig, load_preset
+from graspd_core.planning import rounds as planning_rounds
+from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Obstacle, Scene
@@ -46,3 +50,18 @@ def test_rounds_are_a_setting(scene):
     assert rounds_of(scene, steady, "standard") == [steady, steady]
     for name in ("fast", "accurate"):
         assert rounds_of(scene, load_preset(name), "standard")[0] == load_preset(name)
+
+
+def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, monkeypatch):
+    asked = []
+
+    def none_found(scene, hand, *, count, **settings):
+        asked.append(count)
+        return Candidates((), "")
+
+    monkeypatch.setattr(planning_rounds, "find_candidates", none_found)
+    plan_grasps(scene, load_hand("parallel_gripper"), count=1)
+    assert asked == [1, 8, 8]
+    asked.clear()
+    plan_grasps(scene, load_hand("parallel_gripper"), count=20)
+    assert asked == [2, 20, 20, 20]
