@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_core.hands.model import HandModel
+from graspd_core.methods.aimed_starts import Aim
 from graspd_core.scene.far_objects import moved_grasp
-from graspd_core.scene.scene import Scene
+from graspd_core.scene.scene import Obstacle, Scene, moved_obstacle
 from graspd_core.types import Grasp
 
 
@@ -52,6 +53,16 @@ class BoundRestriction(Protocol):
         """Why no grasp at all can be admitted, as a sentence; empty where one may be. Nothing is searched then."""
         return ""
 
+    @property
+    def aim(self) -> Aim | None:
+        """Where initial poses are drawn; None: anywhere. Of several aims the first counts."""
+        return None
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What the search keeps the hand off, beside the scene's own obstacles; no trial knows of it."""
+        return ()
+
     def starts(
         self,
         positions: Float[np.ndarray, "batch 3"],
@@ -86,6 +97,17 @@ class BoundRestrictions:
     def impossible(self) -> str:
         """Why the first restriction that admits nothing does so; empty where each may admit something."""
         return next((one.impossible for one in self.each if one.impossible), "")
+
+    @property
+    def aim(self) -> Aim | None:
+        """Where initial poses are drawn; None: anywhere."""
+        aim = next((one.aim for one in self.each if one.aim is not None), None)
+        return None if aim is None else aim.moved(-self.origin)
+
+    def searched(self, scene: Scene) -> Scene:
+        """The scene as the search sees it, in the frame of `origin`: with what restrictions keep the hand off."""
+        obstacles = tuple(moved_obstacle(o, -self.origin) for one in self.each for o in one.obstacles)
+        return replace(scene, obstacles=(*scene.obstacles, *obstacles)) if obstacles else scene
 
     def starts(
         self,
