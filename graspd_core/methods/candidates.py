@@ -58,7 +58,7 @@ def find_candidates(
 
     The restrictions shape the starts alone: who asked for them refuses candidates.
     """
-    task = PlannerInput(restrictions.searched(scene), hand, count, seed, config, hooks, device, dtype, restrictions)
+    task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
     found = METHODS[config.method].plan(task)
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)

@@ -41,8 +41,7 @@ class Restriction(Protocol):
         ...
 
 
-@runtime_checkable
-class BoundRestriction(Protocol):
+class BoundRestriction:
     """A restriction for one scene and one hand. What a class that derives from this leaves out, admits everything.
 
     All poses are `T_object_base`, in the object frame of the scene that `plan_grasps` was given.
@@ -52,6 +51,11 @@ class BoundRestriction(Protocol):
     def impossible(self) -> str:
         """Why no grasp at all can be admitted, as a sentence; empty where one may be. Nothing is searched then."""
         return ""
+
+    @property
+    def asked(self) -> str:
+        """What is asked for, by name, where nothing at all was found under it."""
+        return type(self).__name__
 
     @property
     def aim(self) -> Aim | None:
@@ -137,12 +141,20 @@ class BoundRestrictions:
 UNRESTRICTED = BoundRestrictions()
 
 
-def refusals_in_words(refused: Mapping[str, int], held: int) -> str:
+def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str, int], held: int, tried: int) -> str:
     """What the restrictions of a run refused, most frequent reason first; empty where they refused nothing.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
+
+    Args:
+        restrictions: of the run.
+        refused: candidates by reason.
+        held: how many grasps are as good as was asked for.
+        tried: how many candidates were admitted.
     """
-    if not refused:
-        return ""
-    reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))
-    return f"{held} candidates held, {sum(refused.values())} refused: {reasons}"
+    if refused:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))
+        return f"{held} candidates held, {sum(refused.values())} refused: {reasons}"
+    if restrictions.each and not tried:
+        return f"no candidate was found under {', '.join(one.asked for one in restrictions.each)}"
+    return ""

@@ -15,6 +15,9 @@ from scipy.spatial import KDTree
 from graspd_core.errors import ConfigError, shown
 from graspd_core.se3 import rotation_from_quaternion
 
+# A few numbers, as a caller may write them.
+Numbers = Sequence[float | int] | np.ndarray
+
 
 def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
     """So many finite numbers. Raises ConfigError: they are not, by the name of what was given."""
@@ -40,15 +43,16 @@ class Box:
         ConfigError: a number is not finite, an edge not longer than 0, the quaternion 0.
     """
 
-    center: Sequence[float]
-    size: Sequence[float]
-    quaternion_wxyz: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
+    center: Numbers
+    size: Numbers
+    quaternion_wxyz: Numbers = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        numbers("box center", self.center, 3)
-        if min(numbers("box size", self.size, 3)) <= 0:
+        for name, count in (("center", 3), ("size", 3), ("quaternion_wxyz", 4)):
+            object.__setattr__(self, name, numbers(f"box {name}", getattr(self, name), count))
+        if min(self.size) <= 0:
             raise ConfigError(f"box size: {shown(self.size)}; valid: three lengths above 0, in metres")
-        if not np.any(numbers("box quaternion_wxyz", self.quaternion_wxyz, 4)):
+        if not any(self.quaternion_wxyz):
             raise ConfigError("box quaternion_wxyz: all 0; valid: w, x, y, z, not all 0")
 
     @cached_property
@@ -78,11 +82,11 @@ class Sphere:
         ConfigError: a number is not finite, or the radius not above 0.
     """
 
-    center: Sequence[float]
-    radius: float
+    center: Numbers
+    radius: float | int
 
     def __post_init__(self) -> None:
-        numbers("sphere center", self.center, 3)
+        object.__setattr__(self, "center", numbers("sphere center", self.center, 3))
         if not np.isfinite(self.radius) or self.radius <= 0:
             raise ConfigError(f"sphere radius: {self.radius} m; valid: above 0")
 

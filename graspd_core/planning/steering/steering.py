@@ -16,10 +16,11 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.aimed_starts import Aim, Roll
 from graspd_core.methods.initial_poses import closing_axis, depth_of_starts
+from graspd_core.methods.obstacle_distance import RETREAT
 from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.methods.restrictions import BoundRestriction, BoundRestrictions, Refusal
 from graspd_core.planning.steering.avoided_boxes import boxes_in_reach, entered
-from graspd_core.planning.steering.regions import Box, Near, Region, Sphere, numbers
+from graspd_core.planning.steering.regions import Box, Near, Numbers, Region, Sphere, numbers
 from graspd_core.planning.steering.untouched_part import untouched_part
 from graspd_core.scene.scene import Obstacle, Scene
 from graspd_core.se3 import rotation_from_quaternion
@@ -61,12 +62,12 @@ class Steering:
         ConfigError: a value is out of its range, not finite, or contradicts another.
     """
 
-    approach_direction: Sequence[float] | None = None
-    approach_angle: float = np.pi / 6
+    approach_direction: Numbers | None = None
+    approach_angle: float | int = np.pi / 6
     region: Region | None = None
     avoid: Sequence[Box] = ()
-    roll: float | None = None
-    roll_tolerance: float = np.pi / 12
+    roll: float | int | None = None
+    roll_tolerance: float | int = np.pi / 12
 
     def __post_init__(self) -> None:
         if self.approach_direction is not None:
@@ -114,6 +115,13 @@ class BoundSteering(BoundRestriction):
     wanted: Aim
 
     @property
+    def asked(self) -> str:
+        """The wishes that there are, by name."""
+        given = {name: getattr(self.steering, name) is not None for name in ("approach_direction", "region", "roll")}
+        given["avoid"] = len(self.steering.avoid) > 0
+        return ", ".join(name for name, there in given.items() if there)
+
+    @property
     def aim(self) -> Aim | None:
         """Where starts are drawn, if a place, a direction or a roll is asked for."""
         asked = self.wanted.direction is not None or self.wanted.places is not None
@@ -138,6 +146,19 @@ class BoundSteering(BoundRestriction):
             f"approach_direction: nothing is left of it, since on its way the hand would reach {depth * 100:.0f} cm "
             "into what the object stands on; ask for a direction from the free side, or a wider approach_angle"
         )
+
+    def starts(
+        self,
+        positions: Float[np.ndarray, "batch 3"],
+        quaternions: Float[np.ndarray, "batch 4"],
+        joints: Float[np.ndarray, "batch joints"],
+    ) -> Bool[np.ndarray, "batch"]:
+        """Hands whose palm lies in no avoided box, there and at the retreat; their aim sees to all else."""
+        if not self.steering.avoid:
+            return np.ones(len(positions), dtype=bool)
+        turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
+        palms = [positions + turns @ (self.hand.palm_center - back * self.hand.approach) for back in (0.0, RETREAT)]
+        return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
         """The candidates that are as asked for; the first wish that one misses is why it is refused."""
@@ -194,8 +215,10 @@ def outside_region(region: Region, grasp: Grasp) -> float:
 
 def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
     """Unit direction that rolls are measured by, square to the approach, base frame; see `Steering`."""
-    positions = link_poses(hand, hand.open_posture)[1]
-    tips = [positions[np.flatnonzero(hand.link_group == group)[-1]] for group in fingertip_groups(hand)]
+    rotations, translations = link_poses(hand, hand.open_posture)
+    links = hand.candidate_link
+    points = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
+    tips = [points[hand.link_group[links] == group].mean(0) for group in fingertip_groups(hand)]
     ahead = np.mean(tips, axis=0) - hand.palm_center
     side = ahead - (ahead @ hand.approach) * hand.approach
     if np.linalg.norm(side) < _ALONG * np.linalg.norm(ahead):

@@ -15,7 +15,7 @@ from graspd_core.planning.steering.regions import Region
 from graspd_core.scene.scene import Obstacle, Scene
 
 # The untouched part begins so far outside the region, and links keep so far off its surface [m].
-_BEGINS, _SKIN = 0.003, 0.002
+_BEGINS, _SKIN = 0.003, 0.004
 
 
 def untouched_part(scene: Scene, region: Region) -> Obstacle:
@@ -25,7 +25,7 @@ def untouched_part(scene: Scene, region: Region) -> Obstacle:
     axes = [float(x) + spacing * np.arange(n) for x, n in zip(sdf.origin, field.shape[1:], strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     left = _BEGINS - region.distance(nodes.reshape(-1, 3)).reshape(nodes.shape[:-1])
-    slope = np.stack(np.gradient(left, spacing))
+    slope = np.array(np.gradient(left, spacing))
     slope = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-9)
     phi = field[0] - _SKIN
     values = np.where(phi > left, np.concatenate([phi[None], field[1:]]), np.concatenate([left[None], slope]))
