@@ -34,7 +34,7 @@ def plan(task: PlannerInput) -> PlannerOutput:
     tries = allowed_of(task, draw_approaches(problem, hand, count * settings.rounds, task.seed))
     kept, interrupted = tries[torch.arange(0, device=task.device)], ""
     for rows in torch.arange(len(tries.joints), device=task.device).split(count):
-        if interrupted or len(kept.joints) >= count:
+        if interrupted or len(kept.joints) >= count or len(rows) == 0:
             break
         solution = minimise(closing, problem, advance(problem, closing, hand, tries[rows]), task.hooks)
         interrupted = solution.interrupted

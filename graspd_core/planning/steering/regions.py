@@ -96,7 +96,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, eq=False)
-class Near:
+class NearPoints:
     """What lies near to points, as those that a mask of an image shows.
 
     Attributes:
@@ -125,4 +125,4 @@ class Near:
         return self._tree.query(points)[0] - self.radius
 
 
-Region = Box | Sphere | Near
+Region = Box | Sphere | NearPoints

@@ -20,7 +20,7 @@ from graspd_core.methods.obstacle_distance import RETREAT
 from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.methods.restrictions import BoundRestriction, BoundRestrictions, Refusal
 from graspd_core.planning.steering.avoided_boxes import boxes_in_reach, entered
-from graspd_core.planning.steering.regions import Box, Near, Numbers, Region, Sphere, numbers
+from graspd_core.planning.steering.regions import Box, NearPoints, Numbers, Region, Sphere, numbers
 from graspd_core.planning.steering.untouched_part import untouched_part
 from graspd_core.scene.scene import Obstacle, Scene
 from graspd_core.se3 import rotation_from_quaternion
@@ -52,7 +52,7 @@ class Steering:
     Attributes:
         approach_direction: direction of approach that is wanted, of any length but 0; (0, 0, -1) is from above.
         approach_angle: greatest angle between it and a grasp's approach, above 0, at most π [rad].
-        region: a `Box`, a `Sphere` or points (`Near`); every contact lies in it, or at most 5 mm outside.
+        region: a `Box`, a `Sphere` or points (`NearPoints`); every contact lies in it, or at most 5 mm outside.
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
         roll: turn of the hand's side about the approach, right-handed [rad]; at 0 it points along z, or along x
             where the wanted approach is within 18° of vertical. It needs an approach direction, and an angle below π/2.
@@ -77,8 +77,8 @@ class Steering:
         for name in ("approach_angle", "roll_tolerance"):
             if not 0 < getattr(self, name) <= np.pi:
                 raise ConfigError(f"{name}: {getattr(self, name):.4g} rad; valid: above 0, at most pi (180 degrees)")
-        if self.region is not None and not isinstance(self.region, Box | Sphere | Near):
-            raise ConfigError(f"region: {type(self.region).__name__}; valid: Box, Sphere, Near")
+        if self.region is not None and not isinstance(self.region, Box | Sphere | NearPoints):
+            raise ConfigError(f"region: {type(self.region).__name__}; valid: Box, Sphere, NearPoints")
         if any(not isinstance(box, Box) for box in self.avoid):
             raise ConfigError("avoid: not all are a Box")
         if self.roll is None:

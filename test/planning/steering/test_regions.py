@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.errors import ConfigError
-from graspd_core.planning.steering.regions import Box, Near, Sphere
+from graspd_core.planning.steering.regions import Box, NearPoints, Sphere
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 
@@ -22,7 +22,7 @@ def test_a_turned_box_has_signed_distances():
 def test_a_ball_and_what_is_near_have_signed_distances():
     at = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
     assert np.allclose(Sphere((0.0, 0.0, 0.1), 0.2).distance(at), [-0.1, np.hypot(0.3, 0.1) - 0.2])
-    near = Near(np.array([[0.0, 0.0, 0.0], [0.31, 0.0, 0.0], [np.nan, 0.0, 0.0]]), radius=0.02)
+    near = NearPoints(np.array([[0.0, 0.0, 0.0], [0.31, 0.0, 0.0], [np.nan, 0.0, 0.0]]), radius=0.02)
     assert np.allclose(near.distance(at), [-0.02, -0.01])
 
 
@@ -43,9 +43,9 @@ def test_distances_never_change_faster_than_the_point(values: list[float]):
         (lambda: Box((0, 0, 0), (1, 1, 1), (0, 0, 0, 0)), "quaternion_wxyz: all 0"),
         (lambda: Sphere((0, 0, 0), 0.0), "sphere radius: 0.0 m"),
         (lambda: Sphere((0, 0, 0), float("nan")), "sphere radius"),
-        (lambda: Near(np.full((2, 3), np.nan)), "none is finite"),
-        (lambda: Near(np.zeros((0, 3))), "none is finite"),
-        (lambda: Near(np.zeros((1, 3)), radius=-1.0), "region radius"),
+        (lambda: NearPoints(np.full((2, 3), np.nan)), "none is finite"),
+        (lambda: NearPoints(np.zeros((0, 3))), "none is finite"),
+        (lambda: NearPoints(np.zeros((1, 3)), radius=-1.0), "region radius"),
     ],
 )
 def test_what_is_no_region_is_refused(make, said):

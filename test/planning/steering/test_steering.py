@@ -17,7 +17,7 @@ from graspd_core.methods.aimed_starts import Roll
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.restrictions import BoundRestrictions, Refusal
 from graspd_core.planning.steering.avoided_boxes import entered
-from graspd_core.planning.steering.regions import Box, Near, Sphere
+from graspd_core.planning.steering.regions import Box, NearPoints, Sphere
 from graspd_core.planning.steering.steering import (
     CONTACT_TOLERANCE,
     Steering,
@@ -108,7 +108,7 @@ def test_contacts_lie_in_the_region_whatever_kind_it_is(bottle, hand):
     low, high = bottle.object.mesh.vertices.min(0), bottle.object.mesh.vertices.max(0)
     top = Box((low + high) / 2 - (high - low)[2] / 4 * DOWN, (1.0, 1.0, (high - low)[2] / 2))
     seen = bottle.object.mesh.vertices[top.distance(bottle.object.mesh.vertices) <= 0]
-    for region in (top, Sphere(top.center, 0.08), Near(seen, 0.02)):
+    for region in (top, Sphere(top.center, 0.08), NearPoints(seen, 0.02)):
         found = plan(bottle, hand, Steering(region=region))
         good = [grasp for grasp in found.grasps if grasp.verdict is Verdict.VERIFIED]
         assert good, found.message
