@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, shown
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
@@ -35,6 +35,8 @@ _SURFACE, _MOST_PLACES = 20_000, 400
 _ALONG = 0.3
 # From so near to the vertical a roll is measured from x: cosine of the angle.
 _VERTICAL = 0.95
+# Directions with a lesser angle's sine are along each other.
+_PARALLEL = 1e-3
 # Starts that are looked at, and how deep the best of them is in the support where none can come from there [m].
 _PROBES, _TOO_DEEP = 8, 0.06
 
@@ -56,6 +58,7 @@ class Steering:
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
         roll: turn of the hand's side about the approach, right-handed [rad]; at 0 it points along z, or along x
             where the wanted approach is within 18° of vertical. It needs an approach direction, and an angle below π/2.
+        roll_zero: where the hand's side points at a roll of 0, once made square to the approach; None: as `roll` says.
         roll_tolerance: greatest difference from `roll` either way, above 0, at most π [rad].
 
     Raises:
@@ -68,6 +71,7 @@ class Steering:
     avoid: Sequence[Box] = ()
     roll: float | int | None = None
     roll_tolerance: float | int = np.pi / 12
+    roll_zero: Numbers | None = None
 
     def __post_init__(self) -> None:
         if self.approach_direction is not None:
@@ -87,6 +91,10 @@ class Steering:
             raise ConfigError(f"roll: {self.roll} rad; valid: a finite number")
         if self.approach_direction is None or self.approach_angle >= np.pi / 2:
             raise ConfigError("roll: needs approach_direction, and approach_angle below pi/2 (90 degrees)")
+        if self.roll_zero is not None:
+            zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
+            if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):
+                raise ConfigError(f"roll_zero: {shown(zero)}; valid: a direction that is not along approach_direction")
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundSteering:
         """Steering of this hand in this scene.
@@ -99,7 +107,9 @@ class Steering:
             direction = direction / np.linalg.norm(direction)
         roll = None
         if direction is not None and self.roll is not None:
-            roll = Roll(hand_side(hand), _zero_of_roll(direction), self.roll, self.roll_tolerance)
+            zero = zero_of_roll(direction) if self.roll_zero is None else np.array(self.roll_zero, dtype=float)
+            zero = zero - (zero @ direction) * direction
+            roll = Roll(hand_side(hand), zero / np.linalg.norm(zero), self.roll, self.roll_tolerance)
         places = None if self.region is None else _part_of_object(scene, self.region, self.avoid)
         aim = Aim(direction, self.approach_angle, roll, places)
         return BoundSteering(self, scene, hand, aim)
@@ -229,8 +239,8 @@ def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
     return side / np.linalg.norm(side)
 
 
-def _zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Where a hand's side points at a roll of 0: unit, square to the wanted approach."""
+def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Where a hand's side points at a roll of 0 where nobody says: unit, square to the wanted unit approach."""
     up = np.eye(3)[0 if abs(direction[2]) > _VERTICAL else 2]
     square = up - (up @ direction) * direction
     return square / np.linalg.norm(square)
