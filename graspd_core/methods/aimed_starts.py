@@ -18,7 +18,7 @@ _JOINT_NOISE = 0.1
 # A palm stays off what lies so near to its axis [m].
 _PALM_RADIUS = 0.04
 # Starts use so much of the cone and of the tolerance of the roll: the search turns them a little.
-_INNER = 0.7
+_INNER = 0.8
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ _STEPS = 60
 # A gap narrower than this is none [m].
 _TOUCH = 1e-5
 _GRID_RESOLUTION = 32
+# The search keeps so far off a box [m]: it allows a little depth in obstacles, and a squeeze closes the fingers more.
+_PAD = 0.004
 
 
 def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) -> Bool[np.ndarray, "postures"]:
@@ -89,7 +91,7 @@ def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple
     found = []
     for box in boxes:
         middle, half = box.local(scene.object.center_of_mass), np.asarray(box.size) / 2
-        low, high = np.maximum(-half, middle - reach), np.minimum(half, middle + reach)
+        low, high = np.maximum(-half - _PAD, middle - reach), np.minimum(half + _PAD, middle + reach)
         if (low < high).all():
             mesh = _box_mesh(box, low, high)
             found.append(Obstacle(mesh, build_sdf(mesh, resolution=_GRID_RESOLUTION, padding=0.02)))
