@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -56,14 +56,10 @@ def steering_of(options: argparse.Namespace) -> tuple[Steering, ...]:
     if options.roll is None:
         _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
     angles = {"approach_angle": options.approach_angle, "roll": options.roll, "roll_tolerance": options.roll_tolerance}
-    return (
-        Steering(
-            approach_direction=options.approach,
-            region=None if options.region is None else _region(options.region),
-            avoid=[Box(values[:3], values[3:]) for values in options.avoid],
-            **{name: float(np.radians(value)) for name, value in angles.items() if value is not None},
-        ),
-    )
+    wishes: dict[str, Any] = {name: float(np.radians(value)) for name, value in angles.items() if value is not None}
+    region = None if options.region is None else _region(options.region)
+    avoid = [Box(values[:3], values[3:]) for values in options.avoid]
+    return (Steering(approach_direction=options.approach, region=region, avoid=avoid, **wishes),)
 
 
 def _refuse_alone(name: str, value: float | None, other: str) -> None:
