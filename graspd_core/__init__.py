@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     from graspd_core.metrics.metric_registry import Metric as Metric
     from graspd_core.planning.plan_grasps import plan_grasps as plan_grasps
     from graspd_core.planning.plan_grasps import warm_up as warm_up
+    from graspd_core.planning.steering.regions import Box as Box
+    from graspd_core.planning.steering.regions import NearPoints as NearPoints
+    from graspd_core.planning.steering.regions import Sphere as Sphere
+    from graspd_core.planning.steering.steering import Steering as Steering
     from graspd_core.planning.verify_grasps import verify_grasps as verify_grasps
     from graspd_core.pointcloud.camera import PinholeCamera as PinholeCamera
     from graspd_core.pointcloud.depth_image import cloud_from_depth as cloud_from_depth
@@ -72,6 +76,8 @@ _MODULES = {
     "hands.model": "HandModel",
     "hands.hand_mesh": "hand_mesh",
     "planning.plan_grasps": "plan_grasps warm_up",
+    "planning.steering.steering": "Steering",
+    "planning.steering.regions": "Box NearPoints Sphere",
     "methods.plan_config": "PlanConfig load_preset override preset_names",
     "methods.problem": "build_problem",
     "planning.verify_grasps": "verify_grasps",

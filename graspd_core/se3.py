@@ -125,3 +125,25 @@ class SE3:
 def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "count 3 3"]:
     """Uniform random rotations (normalised Gaussian quaternions)."""
     return rotation_from_quaternion(torch.randn(count, 4, generator=generator, dtype=dtype))
+
+
+def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
+    """Rotations that turn unit vector `source` onto each unit target (any roll), through a Householder pair."""
+    # Two reflections make a rotation; the first maps source to its mirror, the second maps that to the target.
+    helper = torch.eye(3, dtype=targets.dtype)[source.abs().argmin()]
+    middle = torch.linalg.cross(source, helper)
+    middle = middle / middle.norm()
+    return reflection_onto(middle.expand_as(targets), targets) @ reflection_onto(
+        source.expand_as(targets), middle.expand_as(targets)
+    )
+
+
+def reflection_onto(a: Float[Tensor, "batch 3"], b: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
+    """Householder reflections that swap unit vectors a and b; the identity's mirror where they agree."""
+    v = a - b
+    same = v.norm(dim=-1, keepdim=True) < 1e-9
+    # Where a = b any mirror plane that contains a will do.
+    fallback = torch.linalg.cross(a, torch.eye(3, dtype=a.dtype)[a.abs().argmin(-1)])
+    v = torch.where(same, fallback, v)
+    v = v / v.norm(dim=-1, keepdim=True)
+    return torch.eye(3, dtype=a.dtype) - 2 * v[..., :, None] * v[..., None, :]

@@ -93,7 +93,9 @@ class Planner:
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
         newest = Time()
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
-        result, file = self._runs.next_best(request, excluded) if excluded else None, ""
+        # Earlier runs were not asked for the place and direction that this request may ask for.
+        known = excluded and request.steering is None
+        result, file = self._runs.next_best(request, excluded) if known else None, ""
         if result is None:
             poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
             result, file = self._search(request, excluded, stop, lambda progress: tell(_placed(progress, poses)))
@@ -109,6 +111,7 @@ class Planner:
         settings = request.settings
         config = load_preset(settings.preset)
         scene = request.load()
+        restrictions = [] if request.steering is None else [request.steering()]
         result = plan_grasps(
             scene,
             self._hand,
@@ -119,6 +122,7 @@ class Planner:
             verify=settings.verify,
             deadline=max(request.time_left(), 1e-3),
             device=settings.device,
+            restrictions=restrictions,
             progress=tell,
             stop=stop,
         )

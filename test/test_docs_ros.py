@@ -281,7 +281,7 @@ def test_the_table_of_parameters_is_that_of_the_code():
 
 
 def test_constants_are_those_of_the_messages():
-    sources, statuses, codes, _ = tables("Requests and answers")
+    sources, statuses, codes, *_ = tables("Requests and answers")
     for rows, kind, text in (
         (sources, GraspRequest, "GraspRequest.msg"),
         (statuses, GraspArray, "GraspArray.msg"),

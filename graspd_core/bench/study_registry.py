@@ -15,6 +15,7 @@ from graspd_core.bench.studies import (
     robust_ranking,
     seen_objects,
     simulators,
+    steered,
 )
 from graspd_core.bench.study import Study
 
@@ -118,6 +119,15 @@ STUDIES: dict[str, Study] = {
         _PLANS,
         lambda case: 2.0 + 2.5 * case.count,
         usual=bullet_available(),
+    ),
+    "steered": Study(
+        "grasps with a wish for direction, place and roll against the same without",
+        steered.steered_cases,
+        steered.run_steered,
+        steered.steered_sections,
+        ("studies/steered.py", "object_case.py"),
+        _PLANS,
+        lambda case: 3.0,
     ),
     "mano": Study(
         "a human hand of the user's, in the units of the Grasp'D paper",

@@ -103,13 +103,18 @@ def extreme_points(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
     """Points in link frames [m] and radii [m] of balls whose convex hull is each solid, and their links."""
-    points, radii, links = [], [], []
+    solids = extreme_points_of_solids(hand)
+    points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
+    return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
+
+
+def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
+    """For each solid of the hand the points of `extreme_points` and their radius [m], and its link."""
+    found = []
     for primitive in hand.primitives:
         at, radius = _extremes(primitive)
-        points.append(at @ primitive.rotation.T + primitive.translation)
-        radii.append(np.full(len(at), radius))
-        links.append(np.full(len(at), primitive.link))
-    return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
+        found.append((at @ primitive.rotation.T + primitive.translation, radius, primitive.link))
+    return found
 
 
 def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:

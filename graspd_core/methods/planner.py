@@ -58,11 +58,19 @@ class PlannerInput:
 
 def problem_of(task: PlannerInput) -> Problem:
     """The problem in which every method's poses are made into grasps and ranked."""
-    return build_problem(
-        task.scene, task.hand, task.config.problem, seed=task.seed, device=task.device, dtype=task.dtype
-    )
+    scene = task.restrictions.searched(task.scene)
+    return build_problem(scene, task.hand, task.config.problem, seed=task.seed, device=task.device, dtype=task.dtype)
 
 
 def initial_poses_of(task: PlannerInput, count: int) -> Poses:
     """`count` seeded poses on the object's hull; fewer, perhaps none, where the restrictions leave no more."""
     return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, restrictions=task.restrictions)
+
+
+def allowed_of(task: PlannerInput, starts: Poses) -> Poses:
+    """Those initial poses that the restrictions allow, for a method that draws its own."""
+    if not task.restrictions.each:
+        return starts
+    turns = starts.quaternion / starts.quaternion.norm(dim=-1, keepdim=True)
+    given = (values.double().cpu().numpy() for values in (starts.translation, turns, starts.joints))
+    return starts[torch.as_tensor(task.restrictions.starts(*given), device=starts.joints.device)]

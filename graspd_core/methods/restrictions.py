@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_core.hands.model import HandModel
+from graspd_core.methods.aimed_starts import Aim
 from graspd_core.scene.far_objects import moved_grasp
-from graspd_core.scene.scene import Scene
+from graspd_core.scene.scene import Obstacle, Scene, moved_obstacle
 from graspd_core.types import Grasp
 
 
@@ -40,8 +41,7 @@ class Restriction(Protocol):
         ...
 
 
-@runtime_checkable
-class BoundRestriction(Protocol):
+class BoundRestriction:
     """A restriction for one scene and one hand. What a class that derives from this leaves out, admits everything.
 
     All poses are `T_object_base`, in the object frame of the scene that `plan_grasps` was given.
@@ -51,6 +51,21 @@ class BoundRestriction(Protocol):
     def impossible(self) -> str:
         """Why no grasp at all can be admitted, as a sentence; empty where one may be. Nothing is searched then."""
         return ""
+
+    @property
+    def asked(self) -> str:
+        """What is asked for, by name, where nothing at all was found under it."""
+        return type(self).__name__
+
+    @property
+    def aim(self) -> Aim | None:
+        """Where initial poses are drawn; None: anywhere. Of several aims the first counts."""
+        return None
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What the search keeps the hand off, beside the scene's own obstacles; no trial knows of it."""
+        return ()
 
     def starts(
         self,
@@ -87,6 +102,17 @@ class BoundRestrictions:
         """Why the first restriction that admits nothing does so; empty where each may admit something."""
         return next((one.impossible for one in self.each if one.impossible), "")
 
+    @property
+    def aim(self) -> Aim | None:
+        """Where initial poses are drawn; None: anywhere."""
+        aim = next((one.aim for one in self.each if one.aim is not None), None)
+        return None if aim is None else aim.moved(-self.origin)
+
+    def searched(self, scene: Scene) -> Scene:
+        """The scene as the search sees it, in the frame of `origin`: with what restrictions keep the hand off."""
+        obstacles = tuple(moved_obstacle(o, -self.origin) for one in self.each for o in one.obstacles)
+        return replace(scene, obstacles=(*scene.obstacles, *obstacles)) if obstacles else scene
+
     def starts(
         self,
         positions: Float[np.ndarray, "batch 3"],
@@ -115,12 +141,20 @@ class BoundRestrictions:
 UNRESTRICTED = BoundRestrictions()
 
 
-def refusals_in_words(refused: Mapping[str, int], held: int) -> str:
+def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str, int], held: int, tried: int) -> str:
     """What the restrictions of a run refused, most frequent reason first; empty where they refused nothing.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
+
+    Args:
+        restrictions: of the run.
+        refused: candidates by reason.
+        held: how many grasps are as good as was asked for.
+        tried: how many candidates were admitted.
     """
-    if not refused:
-        return ""
-    reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))
-    return f"{held} candidates held, {sum(refused.values())} refused: {reasons}"
+    if refused:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))
+        return f"{held} candidates held, {sum(refused.values())} refused: {reasons}"
+    if restrictions.each and not tried:
+        return f"no candidate was found under {', '.join(one.asked for one in restrictions.each)}"
+    return ""

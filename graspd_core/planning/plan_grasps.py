@@ -18,7 +18,7 @@ from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import PlanConfig, load_preset
-from graspd_core.methods.restrictions import BoundRestrictions, Restriction, refusals_in_words
+from graspd_core.methods.restrictions import BoundRestrictions, Restriction, restrictions_in_words
 from graspd_core.planning.feasibility import out_of_reach
 from graspd_core.planning.planning_scene import planning_scene
 from graspd_core.planning.planning_worker import start_planning_worker
@@ -78,7 +78,8 @@ def plan_grasps(
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
     found = run_rounds(run, scene, hand, rounds, parts, bound.moved(run.origin), measure=measure, **request)
     result = _result(run, scene, replace(found, grasps=_ranked(run, found, config, seed)), config, seed, count)
-    result = replace(result, message=message or result.message, support=support)
+    told = "" if run.over() else restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
+    result = replace(result, message=message or told, support=support)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 
@@ -91,7 +92,6 @@ def _result(run: Run, scene: Scene, found: RoundsResult, config: PlanConfig, see
         _timing(run, scene, found),
         seed,
         config.method,
-        refusals_in_words(found.refused, found.good),
         warnings=scene.object.warnings,
         audits=found.audits,
         refused=found.refused,

@@ -75,8 +75,10 @@ def seen_by_camera(
     return cloud
 
 
-def masked_cloud(frame: SensorFrame, cloud: PointCloud, mask: Image) -> tuple[PointCloud, Bool[np.ndarray, "points"]]:
-    """The cloud with a point for every pixel, NaN where none was seen, and which of them the mask shows.
+def masked_cloud(
+    frame: SensorFrame, cloud: PointCloud, mask: Image, name: str = "target_mask"
+) -> tuple[PointCloud, Bool[np.ndarray, "points"]]:
+    """The cloud with a point for every pixel, NaN where none was seen, and which of them the mask of this name shows.
 
     Raises:
         RequestError: the mask is no mono8 image of the cloud's size.
@@ -87,11 +89,11 @@ def masked_cloud(frame: SensorFrame, cloud: PointCloud, mask: Image) -> tuple[Po
     if mask.encoding not in ("mono8", "8UC1") or (mask.height, mask.width) != (height, width):
         raise RequestError(
             ErrorCode.BAD_REQUEST,
-            f"target_mask: {mask.width} x {mask.height} {mask.encoding[:16]!r}; valid: mono8 of {width} x {height} "
+            f"{name}: {mask.width} x {mask.height} {mask.encoding[:16]!r}; valid: mono8 of {width} x {height} "
             f"pixels, as the {frame.kind} has",
         )
     if mask.step < width or len(mask.data) < (height - 1) * mask.step + width:
-        told = f"target_mask: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
+        told = f"{name}: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
         raise RequestError(ErrorCode.BAD_REQUEST, told)
     shown = np.ndarray((height, width), np.uint8, memoryview(mask.data), 0, (mask.step, 1)) > 0
     return replace(cloud, points=np.where(np.isfinite(pixels), pixels, np.nan).reshape(-1, 3)), shown.reshape(-1)

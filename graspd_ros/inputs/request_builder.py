@@ -7,16 +7,26 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from graspd_core import Scene
+from graspd_core import Scene, Steering
 from graspd_ros.inputs.camera_place import place_of, seen_by_camera
 from graspd_ros.inputs.requests import Listener, Request, check_request, pose_matrix, settings_of
 from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, nanoseconds
-from graspd_ros.inputs.source_registry import Lookup, SourceInput, frame_loader, latest_frame, mesh_loader, source_of
+from graspd_ros.inputs.source_registry import (
+    Lookup,
+    SourceInput,
+    SourceObject,
+    frame_loader,
+    latest_frame,
+    mesh_loader,
+    source_of,
+)
+from graspd_ros.inputs.steering_wishes import asks_for_any, steering_of
 from graspd_ros.parameters import Settings
 
 
@@ -90,6 +100,7 @@ class RequestBuilder:
             message, settings, self.newest, self.views, nanoseconds(now), self._lookup, self._lookup_in_time
         )
         found = source.find(given)
+        steering = self._steering(message, found)
         timeless = nanoseconds(found.stamp) == 0
         return Request(
             request_id,
@@ -107,7 +118,19 @@ class RequestBuilder:
                 (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
                 for stamped in message.exclude_poses
             ),
+            steering=steering,
         )
+
+    def _steering(self, message: GraspRequest, found: SourceObject) -> Callable[[], Steering] | None:
+        """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
+        if not asks_for_any(message):
+            return None
+        named = message.header.frame_id
+        T = np.eye(4) if named in ("", found.frame) else self._lookup(found.frame, named, message.header.stamp)
+        if found.T_frame_object is not None:
+            T = np.linalg.inv(found.T_frame_object) @ T
+        steering = steering_of(message, T)
+        return (lambda: steering_of(message, T, found.shown)) if message.region_mask.height else (lambda: steering)
 
     def from_loader(
         self,

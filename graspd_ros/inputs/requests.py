@@ -14,7 +14,7 @@ from geometry_msgs.msg import Pose
 from graspd_msgs.msg import Grasp, GraspArray, GraspProgress, GraspRequest
 from jaxtyping import Float
 
-from graspd_core import Scene, preset_names
+from graspd_core import Scene, Steering, preset_names
 from graspd_ros.inputs.frames import matrix_of_pose
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
@@ -52,6 +52,8 @@ class Request:
         object_key: same for requests of the very same object, as it is or was seen then; empty: none is the same.
         exclude: ids of grasps that the answer must not be like.
         exclude_poses: the same by frame and pose of the base link in it.
+        steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
+            GraspdError. None where nothing is asked.
         accepted: when the request came, by the monotonic clock [s].
     """
 
@@ -68,6 +70,7 @@ class Request:
     object_key: str = ""
     exclude: tuple[str, ...] = ()
     exclude_poses: tuple[tuple[str, Float[np.ndarray, "4 4"]], ...] = ()
+    steering: Callable[[], Steering] | None = None
     accepted: float = field(default_factory=time.monotonic)
 
     @property

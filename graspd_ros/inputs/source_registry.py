@@ -65,6 +65,7 @@ class SourceObject:
         load: reads the object; slow, may raise a GraspdError.
         T_frame_object: pose of the object's own frame in `frame`; None where they are one.
         key: same for the very same object, as it is or was seen then; empty where nobody can tell.
+        shown: reads the points that the request's region_mask shows, in `frame` [m]; None where there is no image.
     """
 
     frame: str
@@ -72,6 +73,7 @@ class SourceObject:
     load: Callable[[], Scene]
     T_frame_object: Float[np.ndarray, "4 4"] | None = None
     key: str = ""
+    shown: Callable[[], Float[np.ndarray, "points 3"]] | None = None
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,12 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> SourceObject:
     load = frame_loader(frame, given.settings, place, given.lookup_in_time, point, mask)
     meant = "" if mask is not None else f"{point} {place} {given.settings.segment}"
     key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
-    return SourceObject(frame.frame, frame.stamp, load, key=key)
+    return SourceObject(frame.frame, frame.stamp, load, key=key, shown=lambda: _shown(frame, message.region_mask))
+
+
+def _shown(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
+    cloud, shown = masked_cloud(frame, frame.read(), mask, "region_mask")
+    return cloud.points[shown & np.isfinite(cloud.points).all(1)]
 
 
 def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:

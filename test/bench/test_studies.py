@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = {
     "rgbd": ("rgbd", "docs/clouds.md"),
     "robust": ("robust", "docs/stress.md"),
+    "steered": ("steered", "docs/usage.md"),
     "early": ("early-ends", "docs/bench.md"),
     "simulators": ("simulators", "docs/metrics.md"),
     "stress": ("stress", "docs/stress.md"),

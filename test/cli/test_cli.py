@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -66,6 +67,17 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--method", "magic"], "invalid choice: 'magic' (choose from"),
     (["--device", "abacus"], "device: 'abacus'; valid on this machine: cpu"),
     (["--threads", "0"], "threads: 0; at least 1"),
+    (["--approach", "0", "0", "0"], "approach_direction: (0, 0, 0) is no direction"),
+    (["--approach", "0", "nan", "0"], "approach_direction: [0.0, nan, 0.0]; valid: 3 finite numbers"),
+    (["--approach", "0", "0", "-1", "--approach-angle", "200"], "approach_angle: 3.491 rad; valid: above 0"),
+    (["--approach-angle", "20"], "--approach-angle: it needs --approach"),
+    (["--roll-tolerance", "20"], "--roll-tolerance: it needs --roll"),
+    (["--roll", "20"], "roll: needs approach_direction"),
+    (["--region", "cube", "0"], "--region: cube 0; valid: box X Y Z SX SY SZ"),
+    (["--region", "box", "0", "0", "0"], "--region: box 0 0 0; valid: box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"),
+    (["--region", "sphere", "0", "0", "0", "wide"], "--region: sphere 0 0 0 wide; valid: box"),
+    (["--region", "sphere", "1", "0", "0", "0.1"], "region: no part of the object lies in it; the object goes from"),
+    (["--avoid", "0", "0", "0", "1", "1", "0"], "box size: (1.0, 1.0, 0.0); valid: three lengths above 0"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
 ]
 
@@ -182,6 +194,22 @@ def test_every_outcome_has_its_status(
     monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: ended)
     assert main(["synthesize", "shape:box"]) == status
     assert outcome.value in capsys.readouterr().out
+
+
+def test_grasps_come_from_where_they_are_asked_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    np.save(tmp_path / "top.npy", make_shape("bottle").vertices)
+    out = tmp_path / "grasps.json"
+    asked = ["--approach", "0", "0", "-1", "--approach-angle", "40", "--roll", "90", "--roll-tolerance", "60"]
+    asked += ["--region", str(tmp_path / "top.npy"), "0.05", "--avoid", "0", "0", "-0.2", "1", "1", "0.1"]
+    status = main(["synthesize", "shape:bottle", "-n", "2", "--preset", "fast", *asked, "--out", str(out)])
+    assert status in (EXIT_OK, EXIT_TOO_FEW)
+    grasps = json.loads(out.read_text())["grasps"]
+    assert grasps
+    for grasp in grasps:
+        w, x, y, z = grasp["quaternion_wxyz"]
+        # The third row of the rotation: where allegro's approach, x, goes.
+        assert 2 * (x * z - w * y) < -np.cos(np.radians(40)) + 1e-6
+    assert "candidates held" in capsys.readouterr().out or json.loads(out.read_text())["refused"] == {}
 
 
 def test_the_first_interrupt_ends_the_run_and_the_second_the_process():

@@ -13,14 +13,12 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import BOWL_RADIUS, make_shape
 from graspd_core.methods.initial_poses import (
-    aligning_rotation,
     closing_axis,
     convex_hull,
     draw_starts,
     half_widths,
-    reflection_onto,
 )
-from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.se3 import aligning_rotation, reflection_onto, rotation_from_quaternion
 from graspd_core.types import TriangleMesh
 
 EYE = torch.eye(3, dtype=torch.float64)

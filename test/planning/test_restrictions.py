@@ -18,7 +18,7 @@ from graspd_core.methods.restrictions import (
     BoundRestriction,
     BoundRestrictions,
     Refusal,
-    refusals_in_words,
+    restrictions_in_words,
 )
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Grasp, Outcome
@@ -139,6 +139,9 @@ def test_a_malformed_restriction_is_refused(scene, hand):
 
 
 def test_refusals_are_told_most_frequent_first():
-    assert refusals_in_words({}, 3) == ""
-    told = refusals_in_words({"outside the approach cone": 2, "out of reach": 7}, 12)
+    sides = BoundRestrictions((Side(),))
+    assert restrictions_in_words(UNRESTRICTED, {}, 0, 0) == ""
+    assert restrictions_in_words(sides, {}, 3, 3) == ""
+    assert restrictions_in_words(sides, {}, 0, 0) == "no candidate was found under Side"
+    told = restrictions_in_words(sides, {"outside the approach cone": 2, "out of reach": 7}, 12, 14)
     assert told == "12 candidates held, 9 refused: 7 out of reach, 2 outside the approach cone"

@@ -61,6 +61,8 @@ def filled(cls: Any, count: Iterator[int]) -> Any:
         if kind.typename == "boolean":
             return True
         number = next(count)
+        if kind.typename == "float":
+            return 1 / 2 ** (number % 100)
         # The largest of its kind, less a running number: a narrower type on the way would cut it.
         return 1 / number if kind.typename == "double" else (INTEGERS[kind.typename] - 1 - number % 100)
 

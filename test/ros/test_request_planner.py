@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 
+from graspd_core import Steering
 from graspd_core.errors import MeshError, TransformError
 from graspd_core.hands.library import load_hand
 from graspd_core.scene.load_scene import load_scene
@@ -46,6 +47,19 @@ def planner(hand) -> Planner:
 
 def never() -> bool:
     return False
+
+
+def test_a_request_is_steered_and_earlier_runs_do_not_answer_it(hand):
+    plans, scene = planner(hand), load_scene("shape:bottle")
+    asked = replace(request(lambda: scene), id="free", object_key="bottle")
+    free = plans.plan(asked, never, lambda _: None).result
+    steering = Steering(approach_direction=(0.0, 0.0, -1.0), approach_angle=0.5)
+    again = replace(asked, id="steered", exclude=("free/0",), steering=lambda: steering)
+    found = plans.plan(again, never, lambda _: None).result
+    assert found.outcome is Outcome.SUCCEEDED
+    for grasp in found.grasps:
+        assert matrix_of_pose(pose_of(grasp.grasp))[:3, :3][2] @ hand.approach < -np.cos(0.5) + 1e-6
+    assert unlike(found.grasps, [matrix_of_pose(pose_of(free.grasps[0].grasp))]) == list(found.grasps)
 
 
 def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):

@@ -28,7 +28,7 @@ from graspd_core.methods.graspd2022.initial_poses_published import published_sta
 from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, allowed_of, initial_poses_of, problem_of
 from graspd_core.methods.poses import Poses, pack, unpack
 from graspd_core.methods.problem import OBSTACLE_MARGIN, Problem, hand_forward, least_distance
 from graspd_core.methods.problem_tensors import PointSet
@@ -243,6 +243,7 @@ def plan(task: PlannerInput) -> PlannerOutput:
     drawn = max(1, round(task.count * settings.initial.starts_per_grasp))
     if settings.initial.kind == "published":
         starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
+        starts = allowed_of(task, starts)
     else:
         starts = initial_poses_of(task, drawn)
     if len(starts.joints) == 0:

@@ -9,11 +9,10 @@ import torch
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.initial_poses import aligning_rotation
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem, hand_forward
 from graspd_core.scene.scene import Scene
-from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle
+from graspd_core.se3 import aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
 
 # Places drawn for each start kept: those where the hand would touch are drawn again, as the released code does.
 _POOL = 4

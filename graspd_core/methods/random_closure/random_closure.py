@@ -16,7 +16,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.methods.finger_closing import Closing, link_gaps, make_closing
 from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import hand_reach, obstacle_gaps
-from graspd_core.methods.planner import PlannerInput, PlannerOutput, problem_of
+from graspd_core.methods.planner import PlannerInput, PlannerOutput, allowed_of, problem_of
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
@@ -31,10 +31,10 @@ def plan(task: PlannerInput) -> PlannerOutput:
     problem = problem_of(task)
     closing = make_closing(problem, hand, settings.close_steps)
     least = min(settings.touching, int(hand.link_group.max()) + 1)
-    tries = draw_approaches(problem, hand, count * settings.rounds, task.seed)
+    tries = allowed_of(task, draw_approaches(problem, hand, count * settings.rounds, task.seed))
     kept, interrupted = tries[torch.arange(0, device=task.device)], ""
     for rows in torch.arange(len(tries.joints), device=task.device).split(count):
-        if interrupted or len(kept.joints) >= count:
+        if interrupted or len(kept.joints) >= count or len(rows) == 0:
             break
         solution = minimise(closing, problem, advance(problem, closing, hand, tries[rows]), task.hooks)
         interrupted = solution.interrupted

@@ -138,6 +138,23 @@ def test_a_mask_says_which_object_is_meant(scene):
         assert refused.value.code is ErrorCode.BAD_REQUEST
 
 
+def test_a_mask_shows_where_contacts_may_be(scene):
+    grid, label, T = scene
+    cloud, taker, settings = message(grid, OPTICAL, True), builder(T), Settings(cloud_max_age=0.0)
+    asked = taker.from_message("r", settings, GraspRequest(cloud=cloud, region_mask=mask_of(label == 1))).steering
+    assert asked is not None
+    region = asked().region
+    assert region is not None
+    seen, other = (grid[label == number].reshape(-1, 3) for number in (1, 0))
+    assert (region.distance(seen[np.isfinite(seen).all(1)]) < 0).all()
+    assert region.distance(np.nanmean(other, axis=0)[None])[0] > 0.05
+    bad = GraspRequest(cloud=cloud, region_mask=mask_of(label == 1, encoding="rgb8"))
+    steering = taker.from_message("r", settings, bad).steering
+    assert steering is not None
+    with pytest.raises(RequestError, match="region_mask: 320 x 240 'rgb8'; valid: mono8"):
+        steering()
+
+
 @pytest.mark.parametrize(
     ("fields", "culprit"),
     [
