@@ -1,0 +1,108 @@
+"""Inverse kinematics of many poses at once: damped least squares within the joint limits.
+
+The damping is the error's own square (T. Sugihara, Solvability-unconcerned inverse kinematics by the
+Levenberg-Marquardt method, IEEE T-RO 2011): strong far away and near singular postures, none at the end, where steps
+are Newton's. A joint at its limit that the step would push beyond is held there and the step is found without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from graspd_core.arms.arm import Arm, arm_links, tip_jacobian
+from graspd_core.se3 import SE3, quaternion_from_rotation
+
+# A pose is reached when it is this near [m], [rad].
+POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
+# One radian counts as so many metres.
+RADIAN = 0.3
+# Damping that is left where the error is none [m²].
+_LEAST_DAMPING = 1e-7
+# No joint turns farther in one step [rad].
+_LONGEST_STEP = 0.6
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Joint values, and how far the tip is from where it should be.
+
+    Attributes:
+        q: joint values within the limits, the nearest that were found [rad] or [m].
+        reached: whether they bring the tip there.
+        error: the length of position error and turning error, one radian as `RADIAN` metres [m].
+    """
+
+    q: Float[Tensor, "batch joints"]
+    reached: Bool[Tensor, "batch"]
+    error: Float[Tensor, "batch"]
+
+
+def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
+    """What moves and turns the tip to the target, base frame [m], [rad]."""
+    return torch.cat([target.translation - tip.translation, rotation_vector(target.rotation, tip.rotation)], -1)
+
+
+def rotation_vector(
+    target: Float[Tensor, "batch 3 3"], current: Float[Tensor, "batch 3 3"]
+) -> Float[Tensor, "batch 3"]:
+    """Axis times angle of the turn from one orientation to the other, base frame [rad]."""
+    quaternion = quaternion_from_rotation(target @ current.transpose(-1, -2))
+    length = quaternion[..., 1:].norm(dim=-1)
+    # sin(x)/x at the end, where axis and angle vanish together.
+    factor = torch.where(length > 1e-9, 2.0 * torch.atan2(length, quaternion[..., 0]) / length.clamp_min(1e-9), 2.0)
+    return factor[..., None] * quaternion[..., 1:]
+
+
+@torch.no_grad()
+def solve(
+    arm: Arm, target: SE3, start: Float[Tensor, "batch joints"], steps: int, *, limited: bool = True
+) -> Solutions:
+    """Follow the error from each start to its target, `T_base_tip`; rows that have arrived wait for the others.
+
+    Args:
+        steps: at most so many.
+        limited: whether joints are kept within their limits.
+    """
+    lower, upper = (torch.as_tensor(limit).to(start) for limit in (arm.lower, arm.upper))
+    q, error = start.clone(), start.new_full((len(start),), torch.inf)
+    reached = torch.zeros(len(start), dtype=torch.bool)
+    rows = torch.arange(len(start))
+    for step in range(steps + 1):
+        links = arm_links(arm, q[rows])
+        wrong = pose_error(target[rows], links[:, arm.tip])
+        error[rows] = (wrong * wrong.new_tensor([1.0] * 3 + [RADIAN] * 3)).norm(dim=-1)
+        there = (wrong[:, :3].norm(dim=-1) < POSITION_TOLERANCE) & (wrong[:, 3:].norm(dim=-1) < ROTATION_TOLERANCE)
+        reached[rows[there]] = True
+        ahead = ~there
+        rows, links, wrong = rows[ahead], links[ahead], wrong[ahead]
+        if step == steps or not len(rows):
+            break
+        change = _step(tip_jacobian(arm, links), wrong, q[rows], (lower, upper) if limited else None)
+        q[rows] = q[rows] + change
+        if limited:
+            q[rows] = q[rows].clamp(lower, upper)
+    return Solutions(q, reached, error)
+
+
+def _step(
+    jacobian: Float[Tensor, "batch 6 joints"],
+    wrong: Float[Tensor, "batch 6"],
+    q: Float[Tensor, "batch joints"],
+    limits: tuple[Tensor, Tensor] | None,
+) -> Float[Tensor, "batch joints"]:
+    """`Jᵀ (J Jᵀ + λ I)⁻¹ e` with rows of turning weighted, without joints that would leave their limits."""
+    weight = wrong.new_tensor([1.0] * 3 + [RADIAN] * 3)
+    jacobian, wrong = jacobian * weight[:, None], wrong * weight
+    if limits is not None:
+        downhill = (jacobian * wrong[..., None]).sum(1)
+        held = ((q <= limits[0]) & (downhill < 0)) | ((q >= limits[1]) & (downhill > 0))
+        jacobian = torch.where(held[:, None], 0.0, jacobian)
+    damping = 0.5 * (wrong * wrong).sum(-1) + _LEAST_DAMPING
+    matrix = jacobian @ jacobian.transpose(1, 2) + damping[:, None, None] * torch.eye(6, dtype=q.dtype)
+    solved = torch.linalg.solve_ex(matrix, wrong)[0]
+    change = (jacobian * solved[..., None]).sum(1)
+    return change / (change.abs().amax(-1, keepdim=True) / _LONGEST_STEP).clamp_min(1.0)
