@@ -286,7 +286,8 @@ class GraspResult:
 
     `support` is what the object stood on, None where it floated. `audits` counts checks of trials that stop early.
     `next_view` is `T_object_camera` [m] of one more view that would show most of the hidden side, where grasps hold on
-    the likeliest shape and none is sure enough.
+    the likeliest shape and none is sure enough. `refused` counts by reason the candidates that no trial was spent on,
+    because a restriction of the request did not admit them.
     """
 
     outcome: Outcome
@@ -299,3 +300,4 @@ class GraspResult:
     support: Plane | None = None
     audits: AuditCount = AuditCount()
     next_view: Float[np.ndarray, "4 4"] | None = None
+    refused: Mapping[str, int] = field(default_factory=dict)

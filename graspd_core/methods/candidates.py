@@ -19,6 +19,7 @@ from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
+from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.methods.stages.contact_set import ContactSet, find_contacts, self_overlap
 from graspd_core.methods.stages.pregrasp import approach_depth, find_pregrasp
 from graspd_core.methods.stages.squeeze import Squeeze, squeeze
@@ -51,9 +52,14 @@ def find_candidates(
     hooks: Hooks,
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
+    restrictions: BoundRestrictions = UNRESTRICTED,
 ) -> Candidates:
-    """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless."""
-    found = METHODS[config.method].plan(PlannerInput(scene, hand, count, seed, config, hooks, device, dtype))
+    """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless.
+
+    The restrictions shape the starts alone: who asked for them refuses candidates.
+    """
+    task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
+    found = METHODS[config.method].plan(task)
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
     return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)

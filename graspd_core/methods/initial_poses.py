@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem_tensors import fingertip_groups
+from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
@@ -28,54 +29,112 @@ _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
 # Among obstacles more places are drawn; how deep a hand reaches into one [m] that makes its place e times rarer, and
 # how far a hand is lifted off the support to stay above it [m].
 _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
+# Pools drawn at most where restrictions forbid starts, and how far apart the seeds of two pools are.
+_MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
 # The slab of the object that a hand closes around [m].
 _SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
 
 
-def draw_starts(scene: Scene, hand: HandModel, count: int, seed: int, device: str, dtype: torch.dtype) -> Poses:
+def draw_starts(
+    scene: Scene,
+    hand: HandModel,
+    count: int,
+    seed: int,
+    device: str,
+    dtype: torch.dtype,
+    *,
+    restrictions: BoundRestrictions = UNRESTRICTED,
+) -> Poses:
     """`count` seeded starts with the palm on the object's convex hull, preferring places that the hand can span.
 
     After the published initialisation of Grasp'D (a random surface point, palm towards it, random roll), but on the
     hull, so that no palm starts inside a hollow, and with place and roll drawn in favour of narrow cross-sections.
     Where there are obstacles, hands that would reach into them, or could not have come there, are drawn last.
+    Restrictions have starts drawn until there are enough that they allow, or `_MOST_POOLS` times as many were drawn:
+    then there are fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     pool = (_POOL if obstacles is None else _POOL_AMONG_OBSTACLES) * count
-    points, normals = surface_samples(convex_hull(scene.object.mesh), pool, seed)
-
-    def uniform(low: float, high: float) -> Float[Tensor, "pool"]:
-        return low + (high - low) * torch.rand(pool, generator=generator, dtype=torch.float64)
-
-    outward = torch.as_tensor(normals)
-    tilt_axis = torch.linalg.cross(outward, torch.randn(pool, 3, generator=generator, dtype=torch.float64))
-    tilt_axis = tilt_axis / tilt_axis.norm(dim=-1, keepdim=True)
-    facing = (rotation_from_axis_angle(tilt_axis, uniform(-_TILT, _TILT)) @ outward[..., None]).squeeze(-1)
-    rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -facing)
-    rotation = rotation_from_axis_angle(facing, uniform(-np.pi, np.pi)) @ rotation
-    palm = torch.as_tensor(points) + uniform(*_STANDOFF)[:, None] * outward
-    translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
-    spread = torch.as_tensor(hand.upper - hand.lower)
-    noise = _JOINT_NOISE * (torch.rand(pool, len(spread), generator=generator, dtype=torch.float64) - 0.5)
-    joints = torch.as_tensor(hand.open_posture) + noise * spread
-    joints = joints.clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
-
-    blocked = torch.zeros(pool, dtype=torch.float64)
+    hull = convex_hull(scene.object.mesh)
+    drawn = _draw_pool(hull, hand, pool, seed, generator)
+    if restrictions.each:
+        drawn = _allowed(drawn, hull, hand, pool, seed, generator, restrictions)
+    blocked = torch.zeros(len(drawn.joints), dtype=torch.float64)
     if obstacles is not None:
-        links = forward(make_kinematics(hand, dtype=torch.float64), joints)
-        raised, blocked = raise_clear(obstacles, SE3(rotation, translation), links)
-        palm, translation = palm + raised - translation, raised
+        links = forward(make_kinematics(hand, dtype=torch.float64), drawn.joints)
+        raised, blocked = raise_clear(obstacles, SE3(drawn.rotation, drawn.translation), links)
+        drawn = replace(drawn, palm=drawn.palm + raised - drawn.translation, translation=raised)
 
     surface, _ = surface_samples(scene.object.mesh, _SPAN_POINTS, seed)
-    half_width = half_widths(torch.as_tensor(surface), palm, rotation, hand)
+    half_width = half_widths(torch.as_tensor(surface), drawn.palm, drawn.rotation, hand)
     # Gumbel noise makes the best `count` a draw without replacement with weights exp(−half width / scale).
-    gumbel = -torch.log(-torch.log(uniform(1e-12, 1.0)))
-    chosen = (gumbel - half_width / _SPAN_SCALE - blocked / _DEPTH_SCALE).topk(count).indices
+    gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
+    preference = gumbel - half_width / _SPAN_SCALE - blocked / _DEPTH_SCALE
+    chosen = preference.topk(min(count, len(preference))).indices
     return Poses(
-        translation[chosen].to(device, dtype),
-        quaternion_from_rotation(rotation[chosen]).to(device, dtype),
-        joints[chosen].to(device, dtype),
+        drawn.translation[chosen].to(device, dtype),
+        quaternion_from_rotation(drawn.rotation[chosen]).to(device, dtype),
+        drawn.joints[chosen].to(device, dtype),
     )
+
+
+@dataclass(frozen=True)
+class _Pool:
+    """Hands that starts are chosen from: middle of the palm and origin of the base [m], turn, joints [rad]."""
+
+    palm: Float[Tensor, "batch 3"]
+    rotation: Float[Tensor, "batch 3 3"]
+    translation: Float[Tensor, "batch 3"]
+    joints: Float[Tensor, "batch joints"]
+
+    def __getitem__(self, rows: Tensor) -> _Pool:
+        return _Pool(*(values[rows] for values in vars(self).values()))
+
+
+def _uniform(low: float, high: float, count: int, generator: torch.Generator) -> Float[Tensor, "count"]:
+    return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
+
+
+def _draw_pool(hull: TriangleMesh, hand: HandModel, count: int, seed: int, generator: torch.Generator) -> _Pool:
+    """Open hands whose palms face random points of the hull, rolled at random."""
+    points, normals = surface_samples(hull, count, seed)
+    outward = torch.as_tensor(normals)
+    tilt_axis = torch.linalg.cross(outward, torch.randn(count, 3, generator=generator, dtype=torch.float64))
+    tilt_axis = tilt_axis / tilt_axis.norm(dim=-1, keepdim=True)
+    tilt = _uniform(-_TILT, _TILT, count, generator)
+    facing = (rotation_from_axis_angle(tilt_axis, tilt) @ outward[..., None]).squeeze(-1)
+    rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -facing)
+    rotation = rotation_from_axis_angle(facing, _uniform(-np.pi, np.pi, count, generator)) @ rotation
+    palm = torch.as_tensor(points) + _uniform(*_STANDOFF, count, generator)[:, None] * outward
+    translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
+    spread = torch.as_tensor(hand.upper - hand.lower)
+    noise = _JOINT_NOISE * (torch.rand(count, len(spread), generator=generator, dtype=torch.float64) - 0.5)
+    joints = torch.as_tensor(hand.open_posture) + noise * spread
+    joints = joints.clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
+    return _Pool(palm, rotation, translation, joints)
+
+
+def _allowed(
+    drawn: _Pool,
+    hull: TriangleMesh,
+    hand: HandModel,
+    wanted: int,
+    seed: int,
+    generator: torch.Generator,
+    restrictions: BoundRestrictions,
+) -> _Pool:
+    """The hands that the restrictions allow, and so many more drawn alike until there are `wanted`."""
+    kept: list[_Pool] = []
+    for again in range(1, _MOST_POOLS + 1):
+        quaternions = quaternion_from_rotation(drawn.rotation)
+        allowed = restrictions.starts(drawn.translation.numpy(), quaternions.numpy(), drawn.joints.numpy())
+        kept.append(drawn[torch.as_tensor(allowed)])
+        if sum(len(pool.joints) for pool in kept) >= wanted or again == _MOST_POOLS:
+            break
+        drawn = _draw_pool(hull, hand, wanted, seed + again * _POOL_SEED_STEP, generator)
+    columns = zip(*(vars(pool).values() for pool in kept), strict=True)
+    return _Pool(*(torch.cat(values)[:wanted] for values in columns))
 
 
 def raise_clear(

@@ -12,6 +12,7 @@ from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem, build_problem
+from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.scene.scene import Scene
 
 
@@ -41,6 +42,7 @@ class PlannerInput:
         config: settings of the run.
         hooks: how the run is followed and ended.
         device, dtype: of the tensors.
+        restrictions: what the initial poses must allow.
     """
 
     scene: Scene
@@ -51,6 +53,7 @@ class PlannerInput:
     hooks: Hooks
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
+    restrictions: BoundRestrictions = UNRESTRICTED
 
 
 def problem_of(task: PlannerInput) -> Problem:
@@ -61,5 +64,5 @@ def problem_of(task: PlannerInput) -> Problem:
 
 
 def initial_poses_of(task: PlannerInput, count: int) -> Poses:
-    """`count` seeded poses on the object's hull."""
-    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype)
+    """`count` seeded poses on the object's hull; fewer, perhaps none, where the restrictions leave no more."""
+    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, restrictions=task.restrictions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import PlanConfig, load_preset
+from graspd_core.methods.restrictions import BoundRestrictions, Restriction, refusals_in_words
 from graspd_core.planning.feasibility import out_of_reach
 from graspd_core.planning.planning_scene import planning_scene
 from graspd_core.planning.planning_worker import start_planning_worker
@@ -40,6 +42,7 @@ def plan_grasps(
     verify: str = "standard",
     deadline: float | None = None,
     device: str = "cpu",
+    restrictions: Sequence[Restriction] = (),
     measure: bool = True,
     progress: ProgressHook | None = None,
     stop: StopHook | None = None,
@@ -56,43 +59,56 @@ def plan_grasps(
         verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
+        restrictions: what grasps must be like beside that they hold; what they refuse is counted in `refused`.
         measure: whether grasps get their metrics, those that failed a trial excepted; it takes longer than a trial.
         progress: called from this thread with `Progress` values.
         watch: called from this thread with the hands that the run works on.
         stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
 
     Raises:
-        ConfigError: count, seed, verify, deadline, device or preset is not valid.
+        ConfigError: count, seed, verify, deadline, device, preset or a restriction is not valid.
         ResourceError: the machine has too little memory for so many grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
     request: dict[str, Any] = {"count": count, "seed": seed, "verify": verify, "device": device}
     check_request(deadline=deadline, **request)
     run = Run(time.perf_counter(), deadline, progress, stop, watch)
-    support = scene.support
-    scene, hand, message, rounds = _prepared(run, scene, hand, config, verify)
+    support, bound = scene.support, BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
+    scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
     parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, parts, measure=measure, **request)
-    moved = tuple(moved_grasp(grasp, run.origin) for grasp in _ranked(run, found, config, seed))
-    outcome, timing = run.outcome(bool(moved), found.good, count), _timing(run, scene, found)
-    result = GraspResult(outcome, moved, timing, seed, config.method, message)
+    found = run_rounds(run, scene, hand, rounds, parts, bound.moved(run.origin), measure=measure, **request)
+    result = _result(run, scene, replace(found, grasps=_ranked(run, found, config, seed)), config, seed, count)
+    result = replace(result, message=message or result.message, support=support)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    result = replace(result, warnings=scene.object.warnings, support=support, audits=found.audits)
     return result if found.good else _less_sure(scene, run.origin, result)
 
 
-def _prepared(
-    run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str
-) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
-    """Scene and hand as they are planned on, why the hand can hold nothing there, and the rounds to run.
+def _result(run: Run, scene: Scene, found: RoundsResult, config: PlanConfig, seed: int, count: int) -> GraspResult:
+    """What the rounds found, in the frame of the scene that was given."""
+    return GraspResult(
+        run.outcome(bool(found.grasps), found.good, count),
+        tuple(moved_grasp(grasp, run.origin) for grasp in found.grasps),
+        _timing(run, scene, found),
+        seed,
+        config.method,
+        refusals_in_words(found.refused, found.good),
+        warnings=scene.object.warnings,
+        audits=found.audits,
+        refused=found.refused,
+    )
 
+
+def _prepared(
+    run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str, bound: BoundRestrictions
+) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
+    """Scene and hand as they are planned on, why nothing can be held there, and the rounds to run.
     A run that is over before it began begins nothing.
     """
     if run.over():
         return scene, hand, "", []
     scene, run.origin = planning_scene(scene, config.resolution)
     hand = with_candidates(hand, config.problem.fine_candidates)
-    message = out_of_reach(scene, hand)
+    message = bound.impossible or out_of_reach(scene, hand)
     return scene, hand, message, [] if message else rounds_of(scene, config, verify)
 
 
@@ -114,7 +130,7 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     told = f"{held} grasps hold on the likeliest shape, none is sure enough, since a part of the object was guessed"
     if view is not None:
         told += "; one more view, from next_view, would show most of it"
-    return replace(result, message=told, next_view=view)
+    return replace(result, message="; ".join(filter(None, (told, result.message))), next_view=view)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 from graspd_core.hands.model import HandModel
@@ -10,6 +11,7 @@ from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.poses import Poses
+from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import (
@@ -56,6 +58,7 @@ class RoundsResult:
         optimise_time: spent in the method [s].
         first: when the first grasp was verified, a `time.perf_counter()` value.
         audits: of its trials.
+        refused: candidates that restrictions did not admit to any trial, by reason.
     """
 
     began: float
@@ -64,6 +67,7 @@ class RoundsResult:
     optimise_time: float = 0.0
     first: float | None = None
     audits: AuditCount = field(default_factory=AuditCount)
+    refused: Counter[str] = field(default_factory=Counter)
 
     @property
     def good(self) -> int:
@@ -76,12 +80,23 @@ def poses_seen(poses: Poses) -> Snapshot:
     return Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values()))
 
 
+def _hooks(run: Run, good: int) -> Hooks:
+    """What follows and ends one optimiser while `good` grasps are known."""
+    return Hooks(
+        report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
+        # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.
+        stop=run.over,
+        watch=None if run.watch is None else lambda poses: run.show(poses_seen(poses)),
+    )
+
+
 def run_rounds(
     run: Run,
     scene: Scene,
     hand: HandModel,
     rounds: list[PlanConfig],
     parts: Parts | None,
+    restrictions: BoundRestrictions = UNRESTRICTED,
     *,
     count: int,
     seed: int,
@@ -92,8 +107,8 @@ def run_rounds(
     """Find candidates and try them, round by round, until `count` of them are good.
 
     Most objects need one round, which begins with a small batch for a first answer. Where too few grasps held, what is
-    missing is sought again from other initial poses.
-    Without `parts`, the object's convex parts, no trial is run.
+    missing is sought again from other initial poses. Candidates that a restriction refuses are not tried; without
+    `parts`, the object's convex parts, none is.
     """
     state = RoundsResult(time.perf_counter())
     batches = [(config, count) for config in rounds]
@@ -101,26 +116,21 @@ def run_rounds(
         batches.insert(0, (rounds[0], _FIRST_BATCH))
     for attempt, (config, most) in enumerate(batches):
         wanted, good, began = min(most, count - state.good), state.good, time.perf_counter()
-        hooks = Hooks(
-            report=lambda step, of, loss, good=good: run.report(Stage.OPTIMISE, step, of, loss, good),
-            # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.
-            stop=run.over,
-            watch=None if run.watch is None else lambda poses: run.show(poses_seen(poses)),
-        )
-        seeded = seed + _SEED_STEP * attempt
+        asked = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
+        asked["seed"] = seed + _SEED_STEP * attempt
         with enough_memory(f"{wanted} grasps at once"):
-            found = find_candidates(scene, hand, count=wanted, seed=seeded, config=config, hooks=hooks, device=device)
+            candidates, refused = restrictions.admit(find_candidates(scene, hand, count=wanted, **asked).grasps)
         state = replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
+        state = replace(state, refused=state.refused + refused)
         tried = TriedGrasps()
         if parts is None:
-            untried = found.grasps[:wanted]
-            tried = TriedGrasps(measured(scene, hand, untried) if measure else untried)
-        elif found.grasps:
+            tried = TriedGrasps(measured(scene, hand, candidates[:wanted]) if measure else candidates[:wanted])
+        elif candidates:
             if state.context is None:
                 context = make_trial_context(run, scene, hand, parts, verify, config.certainty, measure=measure)
                 state = replace(state, context=context)
             if state.context is not None:
-                tried = run_trials(run, state.context, found.grasps, wanted, good)
+                tried = run_trials(run, state.context, candidates, wanted, good)
         grasps = surest_first((*state.grasps, *tried.grasps))
         state = replace(state, grasps=grasps, first=state.first or tried.first, audits=state.audits + tried.audits)
         if state.good >= count or run.over():

@@ -48,6 +48,7 @@ TOP = {
     "versions",
     "timing",
     "audits",
+    "refused",
     "grasps",
 }
 HAND = {"name", "urdf", "base_link", "joint_names", "mimic", "mount"}

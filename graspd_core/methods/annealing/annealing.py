@@ -240,6 +240,8 @@ def plan(task: PlannerInput) -> PlannerOutput:
     problem = problem_of(task)
     annealing = make_annealing(problem, task.hand, settings, task.seed)
     starts = initial_poses_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
+    if len(starts.joints) == 0:
+        return PlannerOutput(problem, starts)
     annealed = minimise(annealing, problem, starts, hooks)
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
     if annealed.interrupted == "cancelled" or len(legal) == 0:

@@ -120,6 +120,8 @@ def plan(task: PlannerInput) -> PlannerOutput:
     problem = problem_of(task)
     count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
     starts = initial_poses_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
+    if len(starts.joints) == 0:
+        return PlannerOutput(problem, starts)
     solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
     compiled = kernel_problem(problem)
     if compiled is None:

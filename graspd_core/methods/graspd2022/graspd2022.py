@@ -245,6 +245,8 @@ def plan(task: PlannerInput) -> PlannerOutput:
         starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
     else:
         starts = initial_poses_of(task, drawn)
+    if len(starts.joints) == 0:
+        return PlannerOutput(problem, starts)
     body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
     solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]
