@@ -49,27 +49,42 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
         base: `T_scene_base`, one.
         links: of `arm_links`.
     """
-    names = [arm.chain.link_names[link] for link in arm.capsules.link]
-    moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
-    start, end, radius = placed(arm.capsules, links)
-    found = []
-    if scene.support is not None:
-        normal = torch.as_tensor(scene.support.normal).to(start)
-        # The plane in the base's frame.
-        local, offset = normal @ base.rotation, scene.support.offset - float(normal @ base.translation)
-        beyond = [k for k in moved if arm.chain.link_group[arm.capsules.link[k]] != _first_moved(arm)]
-        height = torch.minimum(start @ local, end @ local)[:, beyond] - offset - radius[beyond]
-        found.append(Hits(-height, tuple(f"{names[k]} in the table" for k in beyond)))
     solids = [("the object", scene.sdf), *(("an obstacle", obstacle.sdf) for obstacle in scene.obstacles)]
+    moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
     points, padded, owner = _samples(arm)
-    at = base.rotation @ place_points(points, links)[..., None]
-    at = at.squeeze(-1) + base.translation
+    at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
+    found = [hits_of_support(arm, scene, base, links)]
     for what, sdf in solids:
         depth = padded - _distance(sdf, at)
-        worst = torch.full((len(at), len(names)), -torch.inf, dtype=depth.dtype)
-        worst = worst.scatter_reduce(1, torch.as_tensor(owner).expand(len(at), -1), depth, "amax")
-        found.append(Hits(worst[:, moved], tuple(f"{names[k]} in {what}" for k in moved)))
+        worst = _worst_of_each(depth, owner, len(arm.capsules.link))
+        found.append(Hits(worst[:, moved], tuple(f"{_name(arm, k)} in {what}" for k in moved.tolist())))
     return joined(*found)
+
+
+def hits_of_support(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
+    """Depths in the support, if there is one."""
+    if scene.support is None:
+        return Hits(links.translation.new_zeros(len(links.translation), 0), ())
+    start, end, radius = placed(arm.capsules, links)
+    group = arm.chain.link_group[arm.capsules.link]
+    beyond = np.flatnonzero((group != 0) & (group != arm.chain.link_group[arm.moved_link[0]]))
+    normal = torch.as_tensor(scene.support.normal).to(start)
+    # The plane in the base's frame.
+    local, offset = normal @ base.rotation, scene.support.offset - float(normal @ base.translation)
+    height = torch.minimum(start @ local, end @ local)[:, beyond] - offset - radius[beyond]
+    return Hits(-height, tuple(f"{_name(arm, k)} in the table" for k in beyond.tolist()))
+
+
+def _name(arm: Arm, capsule: int) -> str:
+    return arm.chain.link_names[arm.capsules.link[capsule]]
+
+
+def _worst_of_each(
+    depth: Float[Tensor, "batch n"], owner: Int[np.ndarray, "n"], count: int
+) -> Float[Tensor, "batch owners"]:
+    """The greatest depth of the columns that each owner has; minus infinity where it has none."""
+    worst = depth.new_full((len(depth), count), -torch.inf)
+    return worst.scatter_reduce(1, torch.as_tensor(owner).expand(len(depth), -1), depth, "amax")
 
 
 def hits_of_self(arm: Arm, links: SE3) -> Hits:
@@ -77,23 +92,26 @@ def hits_of_self(arm: Arm, links: SE3) -> Hits:
     start, end, radius = placed(arm.capsules, links)
     first, second = _pairs(arm)
     distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
-    name = [arm.chain.link_names[link] for link in arm.capsules.link]
-    what = tuple(f"{name[b]} against {name[a]}" for a, b in zip(first, second, strict=True))
+    what = tuple(
+        f"{_name(arm, b)} against {_name(arm, a)}" for a, b in zip(first.tolist(), second.tolist(), strict=True)
+    )
     return Hits(radius[first] + radius[second] - distance, what)
 
 
 def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
     """Depths of links in the hand at its joint values, but for pairs that touch in the seed posture."""
-    checked = _clear_of_hand(arm, hand)
-    arm_start, arm_end, arm_radius = placed(arm.capsules, links)
+    own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
+    # Links that stay clear of a ball about the hand need no closer look.
+    center = 0.5 * (start + end).mean(1, keepdim=True)
+    ball = torch.maximum((start - center).norm(dim=-1), (end - center).norm(dim=-1)).add(radius).amax(1, keepdim=True)
+    near = segment_distance(own_start, own_end, center, center) < own_radius + ball
+    checked = _clear_of_hand(arm, hand) & near.any(0).numpy()[:, None]
     first, second = np.nonzero(checked)
-    distance = segment_distance(arm_start[:, first], arm_end[:, first], start[:, second], end[:, second])
-    depth = arm_radius[first] + radius[second] - distance
+    distance = segment_distance(own_start[:, first], own_end[:, first], start[:, second], end[:, second])
+    worst = _worst_of_each(own_radius[first] + radius[second] - distance, first, len(checked))
     own = np.flatnonzero(checked.any(1))
-    worst = torch.full((len(depth), len(checked)), -torch.inf, dtype=depth.dtype)
-    worst = worst.scatter_reduce(1, torch.as_tensor(first).expand(len(depth), -1), depth, "amax")
-    return Hits(worst[:, own], tuple(f"{arm.chain.link_names[arm.capsules.link[k]]} against the hand" for k in own))
+    return Hits(worst[:, own], tuple(f"{_name(arm, k)} against the hand" for k in own.tolist()))
 
 
 def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -112,16 +130,11 @@ def capsules_of_hand(hand: HandModel) -> Capsules:
     return capsules_about(hand.primitives)
 
 
-def _first_moved(arm: Arm) -> int:
-    """The group of links that the first joint moves."""
-    return int(arm.chain.link_group[arm.moved_link[0]])
-
-
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
     """Capsules to hold against each other: no neighbours, none that touch in the seed posture."""
     group = arm.chain.link_group[arm.capsules.link]
-    above = np.array([_group_above(arm, g) for g in group])
+    above = np.array([_group_above(arm, g) for g in group.tolist()])
     first, second = np.triu_indices(len(group), 1)
     near = (group[first] == group[second]) | (above[first] == group[second]) | (above[second] == group[first])
     first, second = first[~near], second[~near]

@@ -63,7 +63,7 @@ def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 
 
 def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """A capsule about points: along the direction in which they spread most, as thin and then as short as that allows."""
+    """A capsule about points, along the direction in which they spread most, as thin and then as short as can be."""
     center = 0.5 * (corners.min(0) + corners.max(0))
     local = corners - center
     axis = np.linalg.svd(local, full_matrices=False)[2][0]
@@ -89,10 +89,10 @@ def placed(
 
 
 def segment_distance(
-    a: Float[Tensor, "*batch 3"],
-    b: Float[Tensor, "*batch 3"],
-    c: Float[Tensor, "*batch 3"],
-    d: Float[Tensor, "*batch 3"],
+    a: Float[Tensor, "*#batch 3"],
+    b: Float[Tensor, "*#batch 3"],
+    c: Float[Tensor, "*#batch 3"],
+    d: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*batch"]:
     """Distance [m] of the segments from a to b and from c to d, either of which may be a point.
 

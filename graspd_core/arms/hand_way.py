@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture
@@ -27,32 +28,29 @@ def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Flo
         approach: unit direction in which the hand moves towards an object, hand frame.
         up: unit direction of the lift, scene frame.
     """
-    positions, quaternions = zip(*(_way(grasp, approach, up) for grasp in grasps), strict=True)
-    rotation = rotation_from_quaternion(torch.as_tensor(np.stack(quaternions), dtype=torch.float64))
-    return SE3(rotation, torch.as_tensor(np.stack(positions), dtype=torch.float64))
-
-
-def _way(
-    grasp: Grasp, approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "way 3"], Float[np.ndarray, "way 4"]]:
-    before, there = grasp.pregrasp, grasp.grasp
-    back = -RETREAT * _rotation(before) @ approach
+    before, there = (_stacked([getattr(grasp, stage) for grasp in grasps]) for stage in ("pregrasp", "grasp"))
+    back = -RETREAT * (rotation_from_quaternion(before[1]) @ torch.as_tensor(approach)[:, None]).squeeze(-1)
     # Both signs of a quaternion are one rotation: the nearer is turned to.
-    sign = 1.0 if before.quaternion_wxyz @ there.quaternion_wxyz >= 0 else -1.0
-    turned = sign * np.asarray(there.quaternion_wxyz)
-    corners = [
-        (before.position + back, before.quaternion_wxyz),
-        (before.position, before.quaternion_wxyz),
-        (there.position, turned),
-        (there.position + LIFT * up, turned),
-    ]
-    positions, quaternions = [corners[0][0]], [corners[0][1]]
-    for (p, a), (q, b), steps in zip(corners, corners[1:], STEPS, strict=False):
-        for share in np.arange(1, steps + 1) / steps:
-            positions.append((1 - share) * p + share * q)
-            quaternions.append((1 - share) * a + share * b)
-    return np.stack(positions), np.stack(quaternions)
+    sign = torch.where((before[1] * there[1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    raised = there[0] + LIFT * torch.as_tensor(up)
+    corners = torch.stack([before[0] + back, before[0], there[0], raised], 1)
+    turns = torch.stack([before[1], before[1], sign * there[1], sign * there[1]], 1)
+    shares = torch.as_tensor(_SHARES)
+    return SE3(rotation_from_quaternion(shares @ turns), shares @ corners)
 
 
-def _rotation(posture: Posture) -> Float[np.ndarray, "3 3"]:
-    return rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+    position, quaternion = (
+        torch.as_tensor(np.stack([getattr(posture, key) for posture in postures]), dtype=torch.float64)
+        for key in ("position", "quaternion_wxyz")
+    )
+    return position, quaternion
+
+
+def _shares() -> Float[np.ndarray, "way 4"]:
+    """What each of the four stages contributes to each waypoint."""
+    along = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
+    return np.maximum(1.0 - np.abs(along[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
+
+
+_SHARES = _shares()

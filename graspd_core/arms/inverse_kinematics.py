@@ -1,6 +1,6 @@
 """Inverse kinematics of many poses at once: damped least squares within the joint limits.
 
-The damping is the error's own square (T. Sugihara, Solvability-unconcerned inverse kinematics by the
+The damping follows the error's own square (T. Sugihara, Solvability-unconcerned inverse kinematics by the
 Levenberg-Marquardt method, IEEE T-RO 2011): strong far away and near singular postures, none at the end, where steps
 are Newton's. A joint at its limit that the step would push beyond is held there and the step is found without it.
 """
@@ -14,16 +14,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from graspd_core.arms.arm import Arm, arm_links, tip_jacobian
-from graspd_core.se3 import SE3, quaternion_from_rotation
+from graspd_core.se3 import SE3
 
 # A pose is reached when it is this near [m], [rad].
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
 # One radian counts as so many metres.
 RADIAN = 0.3
-# Damping that is left where the error is none [m²].
-_LEAST_DAMPING = 1e-7
+# Damping as a share of the error's square, and what is left of it where the error is none [m²].
+_DAMPING, _LEAST_DAMPING = 0.05, 1e-7
 # No joint turns farther in one step [rad].
 _LONGEST_STEP = 0.6
+# Entries of a rotation matrix whose differences are the axis; a sine that rounding could make.
+_ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-9
+_HALF_TURN = torch.tensor([torch.pi, 0.0, 0.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,14 @@ def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
 def rotation_vector(
     target: Float[Tensor, "batch 3 3"], current: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch 3"]:
-    """Axis times angle of the turn from one orientation to the other, base frame [rad]."""
-    quaternion = quaternion_from_rotation(target @ current.transpose(-1, -2))
-    length = quaternion[..., 1:].norm(dim=-1)
-    # sin(x)/x at the end, where axis and angle vanish together.
-    factor = torch.where(length > 1e-9, 2.0 * torch.atan2(length, quaternion[..., 0]) / length.clamp_min(1e-9), 2.0)
-    return factor[..., None] * quaternion[..., 1:]
+    """Axis times angle of the turn from one orientation to the other, base frame [rad]; half a turn is about x."""
+    turn = target @ current.transpose(-1, -2)
+    # Twice the sine and twice the cosine of the angle.
+    axis = turn[:, _ROWS, _COLUMNS] - turn[:, _COLUMNS, _ROWS]
+    sine, cosine = axis.norm(dim=-1), turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0
+    tiny = sine < _TINY
+    vector = axis * (torch.atan2(sine, cosine) / torch.where(tiny, 1.0, sine))[:, None]
+    return torch.where(tiny[:, None], torch.where(cosine[:, None] < 0, _HALF_TURN, 0.5 * axis), vector)
 
 
 @torch.no_grad()
@@ -101,7 +106,7 @@ def _step(
         downhill = (jacobian * wrong[..., None]).sum(1)
         held = ((q <= limits[0]) & (downhill < 0)) | ((q >= limits[1]) & (downhill > 0))
         jacobian = torch.where(held[:, None], 0.0, jacobian)
-    damping = 0.5 * (wrong * wrong).sum(-1) + _LEAST_DAMPING
+    damping = _DAMPING * (wrong * wrong).sum(-1) + _LEAST_DAMPING
     matrix = jacobian @ jacobian.transpose(1, 2) + damping[:, None, None] * torch.eye(6, dtype=q.dtype)
     solved = torch.linalg.solve_ex(matrix, wrong)[0]
     change = (jacobian * solved[..., None]).sum(1)

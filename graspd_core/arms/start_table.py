@@ -1,12 +1,14 @@
 """Postures of an arm all over its limits, and where its tip is in each: where to start, and what may be in reach.
 
-Near a pose that the arm can reach, some posture has its tip. So the nearest entries are what inverse kinematics starts
-from, and a pose without one near is out of reach, at the cost of one product of matrices for thousands of poses.
+Near a pose that the arm can reach, some posture has its tip: inverse kinematics starts from the nearest ones. And no
+pose is in reach whose tip, or a point fixed to the tip, is nearer to the shoulder or farther from it than in any
+posture. Of hands drawn around objects at 0.3 to 0.95 m this keeps 99.3 and 99.7 % of those that the shipped arms reach,
+and 18 and 4 % of the others.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,10 +20,10 @@ from graspd_core.arms.arm import Arm, arm_links
 from graspd_core.arms.arm_collision import hits_of_self
 from graspd_core.se3 import SE3
 
-# Entries, of which those are dropped that would hit themselves; poses that tell how near an entry is to most.
-_ENTRIES, _PROBES = 4000, 1000
-# Share of reachable poses that are kept.
-_KEPT = 0.98
+# Entries, of which those are dropped that would hit themselves.
+_ENTRIES = 4000
+# Points fixed to the tip whose distance from the shoulder is looked at, tip frame [m].
+_POINTS = [[0, 0, 0], [0, 0, -0.1], [0, 0, -0.2], [0.1, 0, -0.1], [-0.1, 0, -0.1], [0, 0.1, -0.1], [0, -0.1, -0.1]]
 # Metres that count as much as a change of one in an entry of the rotation matrix: 0.28 m a radian.
 _PER_ENTRY = 0.2
 
@@ -33,23 +35,39 @@ class StartTable:
     Attributes:
         q: joint values [rad] or [m].
         features: position and scaled rotation of the tip, base frame.
-        near: how near an entry is to all but few reachable poses, in the features' metric [m].
+        shoulder: the point of the first joint's axis that the second joint is nearest to, base frame [m].
+        away: distances of points fixed to the tip from the shoulder [m].
     """
 
     q: Float[Tensor, "entries joints"]
     features: Float[Tensor, "entries 12"]
-    near: float
+    shoulder: Float[Tensor, "3"]
+    away: Float[Tensor, "entries points"]
+
+    def rows(self, index: Int[Tensor, "some"]) -> StartTable:
+        """Some entries."""
+        return replace(self, q=self.q[index], features=self.features[index], away=self.away[index])
 
 
 # Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def start_table(arm: Arm) -> StartTable:
     """The table of an arm, made once; the same every time."""
-    generator = torch.Generator().manual_seed(0)
-    q, probes = (_clear_postures(arm, count, generator) for count in (_ENTRIES, _PROBES))
-    features = tip_features(arm_links(arm, q)[:, arm.tip])
-    nearest = torch.cdist(tip_features(arm_links(arm, probes)[:, arm.tip]), features).amin(1)
-    return StartTable(q, features, float(torch.quantile(nearest, _KEPT)))
+    q = _clear_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
+    tip, shoulder = arm_links(arm, q)[:, arm.tip], _shoulder(arm)
+    return StartTable(q, tip_features(tip), shoulder, _away(tip, shoulder))
+
+
+def _shoulder(arm: Arm) -> Float[Tensor, "3"]:
+    """See `StartTable`; of an arm with one joint the joint itself."""
+    links = arm_links(arm, torch.as_tensor(arm.seed)[None])[0]
+    first, second = arm.moved_link[0], arm.moved_link[min(1, len(arm.moved_link) - 1)]
+    axis = links.rotation[first] @ torch.as_tensor(arm.chain.joint_axis[first])
+    return links.translation[first] + axis * (axis @ (links.translation[second] - links.translation[first]))
+
+
+def _away(tip: SE3, shoulder: Float[Tensor, "3"]) -> Float[Tensor, "batch points"]:
+    return (tip.apply(torch.tensor(_POINTS, dtype=torch.float64)) - shoulder).norm(dim=-1)
 
 
 def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[Tensor, "count joints"]:
@@ -76,9 +94,9 @@ def nearest_entries(table: StartTable, tip: SE3, count: int) -> Int[Tensor, "bat
     return torch.cdist(tip_features(tip), table.features).topk(min(count, len(table.q)), largest=False).indices
 
 
-def within_reach(table: StartTable, tip: SE3, usable: Bool[Tensor, "entries"] | None = None) -> Bool[Tensor, "batch"]:
-    """Which poses `T_base_tip` have an entry near, of the usable ones where not all are."""
-    features = table.features if usable is None else table.features[usable]
-    if not len(features):
+def within_reach(table: StartTable, tip: SE3, usable: Bool[Tensor, "entries"]) -> Bool[Tensor, "batch"]:
+    """Which poses `T_base_tip` are as far from the shoulder as in some usable posture."""
+    if not usable.any():
         return torch.zeros(len(tip.translation), dtype=torch.bool)
-    return torch.cdist(tip_features(tip), features).amin(1) <= table.near
+    known, away = table.away[usable], _away(tip, table.shoulder)
+    return ((away >= known.amin(0)) & (away <= known.amax(0))).all(-1)
