@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -45,7 +46,7 @@ class Arm:
         """Names of the joints, base first."""
         return self.chain.joint_names
 
-    @property
+    @cached_property
     def moved_link(self) -> Int[np.ndarray, "joints"]:
         """The link that each joint moves against its parent."""
         return np.flatnonzero(self.chain.link_joint >= 0)

@@ -53,7 +53,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
     points, padded, owner = _samples(arm)
     at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
-    found = [hits_of_support(arm, scene, base, links)]
+    found = [hits_of_support(arm, scene, base, placed(arm.capsules, links)[:2])]
     for what, sdf in solids:
         depth = padded - _distance(sdf, at)
         worst = _worst_of_each(depth, owner, len(arm.capsules.link))
@@ -61,17 +61,21 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     return joined(*found)
 
 
-def hits_of_support(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
-    """Depths in the support, if there is one."""
+def hits_of_support(
+    arm: Arm, scene: Scene, base: SE3, ends: tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"]]
+) -> Hits:
+    """Depths in the support, if there is one, of capsules whose segments end there in the base's frame [m]."""
+    start, end = ends
     if scene.support is None:
-        return Hits(links.translation.new_zeros(len(links.translation), 0), ())
-    start, end, radius = placed(arm.capsules, links)
+        return Hits(start.new_zeros(len(start), 0), ())
     group = arm.chain.link_group[arm.capsules.link]
     beyond = np.flatnonzero((group != 0) & (group != arm.chain.link_group[arm.moved_link[0]]))
     normal = torch.as_tensor(scene.support.normal).to(start)
     # The plane in the base's frame.
     local, offset = normal @ base.rotation, scene.support.offset - float(normal @ base.translation)
-    height = torch.minimum(start @ local, end @ local)[:, beyond] - offset - radius[beyond]
+    height = (
+        torch.minimum(start @ local, end @ local)[:, beyond] - offset - torch.as_tensor(arm.capsules.radius[beyond])
+    )
     return Hits(-height, tuple(f"{_name(arm, k)} in the table" for k in beyond.tolist()))
 
 

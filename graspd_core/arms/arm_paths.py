@@ -20,7 +20,7 @@ from graspd_core.arms.arm_collision import Hits, hits_of_hand, hits_of_scene, hi
 from graspd_core.arms.hand_way import STAGE_ROWS, hand_ways
 from graspd_core.arms.inverse_kinematics import solve
 from graspd_core.arms.limit_reasons import why_unreached
-from graspd_core.arms.start_table import nearest_entries, start_table
+from graspd_core.arms.start_table import nearest_postures, start_table
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3
@@ -61,8 +61,9 @@ class ArmTask:
 
 def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
     """The task, with what of the start table is clear of the support."""
-    alone = hits_of_support(arm, scene, base, arm_links(arm, start_table(arm).q))
-    return ArmTask(arm, hand, scene, base, (alone.depth <= 0).all(-1))
+    table = start_table(arm)
+    hits = hits_of_support(arm, scene, base, (table.start, table.end))
+    return ArmTask(arm, hand, scene, base, (hits.depth <= 0).all(-1))
 
 
 def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
@@ -133,9 +134,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     Those that hit nothing come before those that do.
     """
     arm, table = task.arm, start_table(task.arm)
-    usable = torch.nonzero(task.usable).flatten()
-    entries = table if not len(usable) else table.rows(usable)
-    starts = entries.q[nearest_entries(entries, target, _STARTS)]
+    starts = nearest_postures(table, target, _STARTS, task.usable)
     count = starts.shape[1]
     owner = torch.arange(len(starts)).repeat_interleave(count)
     solved = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
@@ -147,11 +146,11 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     away = (q - torch.as_tensor(arm.seed)).square().sum(-1)
     order = (owner * 1e6 + (hits.depth > 0).any(-1) * 1e5 + away).argsort()
     q, owner = q[order], owner[order]
-    kept: list[int] = []
-    for row, grasp in enumerate(owner.tolist()):
-        same = [k for k in kept if owner[k] == grasp]
-        if len(same) < _FOLLOWED and all((q[k] - q[row]).abs().max() > _SAME for k in same):
-            kept.append(row)
+    # Of each grasp the first postures that differ from all before them.
+    alike = (owner[:, None] == owner) & ((q[:, None] - q).abs().amax(-1) < _SAME)
+    kept = torch.nonzero(~alike.tril(-1).any(1)).flatten()
+    place = torch.arange(len(kept)) - torch.searchsorted(owner[kept].contiguous(), owner[kept].contiguous())
+    kept = kept[place < _FOLLOWED]
     return q[kept], owner[kept]
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from graspd_core.arms.arm import Arm
 from graspd_core.arms.inverse_kinematics import solve
-from graspd_core.arms.start_table import nearest_entries, start_table
+from graspd_core.arms.start_table import nearest_postures, start_table
 from graspd_core.se3 import SE3
 
 # Starts of each pose, and steps of each.
@@ -26,7 +26,7 @@ def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -
     if not len(start):
         return []
     table = start_table(arm)
-    starts = torch.cat([start[:, None], table.q[nearest_entries(table, target, _STARTS - 1)]], 1)
+    starts = torch.cat([start[:, None], nearest_postures(table, target, _STARTS - 1)], 1)
     count = starts.shape[1]
     solved = solve(
         arm, target[torch.arange(len(start)).repeat_interleave(count)], starts.flatten(0, 1), _STEPS, limited=False

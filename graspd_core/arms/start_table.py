@@ -8,16 +8,17 @@ and 18 and 4 % of the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from graspd_core.arms.arm import Arm, arm_links
 from graspd_core.arms.arm_collision import hits_of_self
+from graspd_core.arms.capsules import placed
 from graspd_core.se3 import SE3
 
 # Entries, of which those are dropped that would hit themselves.
@@ -37,16 +38,15 @@ class StartTable:
         features: position and scaled rotation of the tip, base frame.
         shoulder: the point of the first joint's axis that the second joint is nearest to, base frame [m].
         away: distances of points fixed to the tip from the shoulder [m].
+        start, end: the ends of the arm's capsules, base frame [m].
     """
 
     q: Float[Tensor, "entries joints"]
     features: Float[Tensor, "entries 12"]
     shoulder: Float[Tensor, "3"]
     away: Float[Tensor, "entries points"]
-
-    def rows(self, index: Int[Tensor, "some"]) -> StartTable:
-        """Some entries."""
-        return replace(self, q=self.q[index], features=self.features[index], away=self.away[index])
+    start: Float[Tensor, "entries capsules 3"]
+    end: Float[Tensor, "entries capsules 3"]
 
 
 # Arms are hashed by identity.
@@ -54,8 +54,9 @@ class StartTable:
 def start_table(arm: Arm) -> StartTable:
     """The table of an arm, made once; the same every time."""
     q = _clear_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
-    tip, shoulder = arm_links(arm, q)[:, arm.tip], _shoulder(arm)
-    return StartTable(q, tip_features(tip), shoulder, _away(tip, shoulder))
+    links, shoulder = arm_links(arm, q), _shoulder(arm)
+    tip, (start, end, _) = links[:, arm.tip], placed(arm.capsules, links)
+    return StartTable(q, tip_features(tip), shoulder, _away(tip, shoulder), start, end)
 
 
 def _shoulder(arm: Arm) -> Float[Tensor, "3"]:
@@ -89,9 +90,14 @@ def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
     return torch.cat([tip.translation, _PER_ENTRY * tip.rotation.flatten(-2)], -1).float()
 
 
-def nearest_entries(table: StartTable, tip: SE3, count: int) -> Int[Tensor, "batch count"]:
-    """The entries nearest to poses `T_base_tip`, nearest first."""
-    return torch.cdist(tip_features(tip), table.features).topk(min(count, len(table.q)), largest=False).indices
+def nearest_postures(
+    table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
+) -> Float[Tensor, "batch count joints"]:
+    """Joint values of the entries nearest to poses `T_base_tip`, nearest first; of usable ones, where there are any."""
+    q, features = table.q, table.features
+    if usable is not None and usable.any():
+        q, features = q[usable], features[usable]
+    return q[torch.cdist(tip_features(tip), features).topk(min(count, len(q)), largest=False).indices]
 
 
 def within_reach(table: StartTable, tip: SE3, usable: Bool[Tensor, "entries"]) -> Bool[Tensor, "batch"]:

@@ -20,7 +20,7 @@ from graspd_core.arms.inverse_kinematics import (
     rotation_vector,
     solve,
 )
-from graspd_core.arms.start_table import nearest_entries, random_postures, start_table
+from graspd_core.arms.start_table import nearest_postures, random_postures, start_table
 from graspd_core.hands.readers.build_model import LinkSpec, assemble
 from graspd_core.hands.readers.joint_limits import JointSpec
 from graspd_core.se3 import SE3, axis_rotation, random_rotations
@@ -143,9 +143,9 @@ def test_nearly_every_pose_within_the_limits_is_found(arm: Arm):
     """Target of the issue: 99 %; the benchmark measures it on 1000 poses of each arm."""
     target = tip(arm, random_postures(arm, 300, torch.Generator().manual_seed(11)))
     found = torch.zeros(300, dtype=torch.bool)
-    for starts in nearest_entries(start_table(arm), target, 12).T:
+    for starts in nearest_postures(start_table(arm), target, 12).unbind(1):
         rows = torch.nonzero(~found).flatten()
-        found[rows] = solve(arm, target[rows], start_table(arm).q[starts[rows]], 24).reached
+        found[rows] = solve(arm, target[rows], starts[rows], 24).reached
     assert found.double().mean() >= 0.99
 
 

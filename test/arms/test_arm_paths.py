@@ -160,7 +160,7 @@ def test_depths_are_those_of_dense_points(arm: Arm, table: Scene):
     world = surface + base.translation
     assert table.support is not None
     deepest = (table.support.offset - world[..., 2]).amax((2, 3))
-    hits = hits_of_support(arm, table, base, links)
+    hits = hits_of_support(arm, table, base, (start, end))
     group = arm.chain.link_group[arm.capsules.link]
     held = np.flatnonzero((group != 0) & (group != arm.chain.link_group[arm.moved_link[0]]))
     assert torch.allclose(hits.depth, deepest[:, held], atol=2e-3)
