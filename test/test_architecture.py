@@ -79,7 +79,7 @@ MAY_IMPORT = {
     "bench": BELOW_PLANNING | {"arms", "planning", "__init__"},
     "doctor": BELOW_PLANNING | {"planning", "__init__"},
     "viewer": BELOW_PLANNING | {"planning", "bench", "__init__"},
-    "cli": BELOW_PLANNING | {"planning", "bench", "doctor", "viewer", "__init__"},
+    "cli": BELOW_PLANNING | {"arms", "planning", "bench", "doctor", "viewer", "__init__"},
 }
 # What the node sees: the public names, values, the viewer, and what only a process that serves needs.
 NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags", "viewer"}

@@ -82,6 +82,10 @@ def make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
     """The arm that a description makes of a URDF, whose elements are taken over. Raises: see `load_arm`."""
     _keep_chain(root, entries.base, entries.tip, where)
     chain = read_urdf(urdf, root)
+    if chain.mimics:
+        raise ConfigError(
+            f"{where}: joint {chain.mimics[0].name!r} follows another; an arm's joints move by themselves"
+        )
     lower, upper = _limits(chain, entries.limits, where)
     seed = 0.5 * (lower + upper)
     for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():

@@ -29,8 +29,8 @@ from graspd_core.types import ArmPath, Grasp
 # No joint moves farther between two waypoints [rad].
 LARGEST_JUMP = 0.2
 # Starts of each grasp, of which so many postures are followed along the way; steps of the one and of the other.
-_STARTS, _FOLLOWED = 8, 3
-_STEPS, _WAY_STEPS = 10, 6
+_STARTS, _FOLLOWED = 8, 2
+_STEPS, _WAY_STEPS = 8, 5
 # Joint values nearer than this are one posture [rad].
 _SAME = 0.1
 # Grasps at once.
@@ -75,7 +75,7 @@ def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
     return SE3(inverse @ rotation, (inverse @ (at - task.base.translation)[..., None]).squeeze(-1))
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     """A way of the arm through each grasp, or why there is none: "beyond joint_4's limit"."""
     found: list[ArmPath | str] = []

@@ -62,7 +62,7 @@ def rotation_vector(
     return torch.where(tiny[:, None], torch.where(cosine[:, None] < 0, _HALF_TURN, 0.5 * axis), vector)
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def solve(
     arm: Arm, target: SE3, start: Float[Tensor, "batch joints"], steps: int, *, limited: bool = True
 ) -> Solutions:

@@ -90,6 +90,13 @@ def test_a_wrong_description_is_refused_in_one_line(tmp_path: Path, keys: dict[s
     assert "\n" not in str(caught.value)
 
 
+def test_a_joint_that_follows_another_is_refused(tmp_path: Path):
+    path = write(tmp_path)
+    (tmp_path / "cell.urdf").write_text(ROBOT.replace('<origin xyz="0.4 0 0"/>', '<mimic joint="j1"/>'))
+    with pytest.raises(ConfigError, match=r"cell.yaml: joint 'j2' follows another; an arm's joints move by themselves"):
+        load_arm(path)
+
+
 def test_an_unknown_arm_is_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match=r"unknown arm 'ur99'; known: panda_like, ur5e_like, or the path of a .yaml"):
         load_arm("ur99")

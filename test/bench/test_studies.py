@@ -20,6 +20,7 @@ PAGES = {
     "rgbd": ("rgbd", "docs/clouds.md"),
     "robust": ("robust", "docs/stress.md"),
     "early": ("early-ends", "docs/bench.md"),
+    "reach": ("inverse-kinematics", "docs/arms.md"),
     "simulators": ("simulators", "docs/metrics.md"),
     "stress": ("stress", "docs/stress.md"),
     "decades": ("decades", "docs/stress.md"),
