@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
-from graspd_core import HandModel, load_preset, plan_grasps, save_result
+from graspd_core import HandModel, Reach, load_preset, plan_grasps, save_result
 from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
+from graspd_ros.inputs.arm_place import reach_of
 from graspd_ros.inputs.frames import moved_grasp, moved_result
 from graspd_ros.inputs.requests import Request
 from graspd_ros.recovery import RecentRuns, without
@@ -91,19 +92,27 @@ class Planner:
         run_isolated = request.frame_out != request.frame
         stamp = Time() if request.timeless else request.stamp
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
+        reach = reach_of(request, lambda target, source: self._lookup(target, source, stamp, stop))
         newest = Time()
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
-        result, file = self._runs.next_best(request, excluded) if excluded else None, ""
+        # What an earlier run found was reached by an arm that may have stood elsewhere.
+        result, file = self._runs.next_best(request, excluded) if excluded and not reach else None, ""
         if result is None:
             poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
-            result, file = self._search(request, excluded, stop, lambda progress: tell(_placed(progress, poses)))
+            placed = lambda progress: tell(_placed(progress, poses))  # noqa: E731
+            result, file = self._search(request, excluded, reach, stop, placed)
         self._runs.keep(request, result)
         for pose in (request.T_frame_object, T_out_frame):
             result = result if pose is None else moved_result(result, pose)
         return Planned(result, file)
 
     def _search(
-        self, request: Request, excluded: list[np.ndarray], stop: StopHook, tell: ProgressHook
+        self,
+        request: Request,
+        excluded: list[np.ndarray],
+        reach: tuple[Reach, ...],
+        stop: StopHook,
+        tell: ProgressHook,
     ) -> tuple[GraspResult, str]:
         """A run, without grasps like those excluded, and the file that it was written to."""
         settings = request.settings
@@ -119,6 +128,7 @@ class Planner:
             verify=settings.verify,
             deadline=max(request.time_left(), 1e-3),
             device=settings.device,
+            restrictions=reach,
             progress=tell,
             stop=stop,
         )

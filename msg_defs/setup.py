@@ -102,9 +102,10 @@ def compile_all(cc: str, cxx: str, prefix: Path, sources: Path) -> None:
     import numpy
 
     include = [
+        # First: an installed package of the same name has the headers of its own version.
+        *(sources / kind for kind in GENERATORS),
         prefix / "include",
         *(path for path in (prefix / "include").iterdir() if path.is_dir()),
-        *(sources / kind for kind in GENERATORS),
         sysconfig.get_path("include"),
         numpy.get_include(),
     ]

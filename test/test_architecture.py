@@ -83,7 +83,7 @@ MAY_IMPORT = {
 }
 # What the node sees: the public names, values, the viewer, and what only a process that serves needs.
 NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags", "viewer"}
-NODE_SEES |= {"runtime", "hands", "pointcloud", "formats", "planning"}
+NODE_SEES |= {"runtime", "hands", "arms", "pointcloud", "formats", "planning"}
 
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {
