@@ -25,8 +25,8 @@ _DAMPING, _LEAST_DAMPING = 0.05, 1e-7
 # No joint turns farther in one step [rad].
 _LONGEST_STEP = 0.6
 # Entries of a rotation matrix whose differences are the axis; a sine that rounding could make.
-_ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-9
-_HALF_TURN = torch.tensor([torch.pi, 0.0, 0.0], dtype=torch.float64)
+_ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-7
+_HALF_TURN = (torch.pi, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def rotation_vector(
     sine, cosine = axis.norm(dim=-1), turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0
     tiny = sine < _TINY
     vector = axis * (torch.atan2(sine, cosine) / torch.where(tiny, 1.0, sine))[:, None]
-    return torch.where(tiny[:, None], torch.where(cosine[:, None] < 0, _HALF_TURN, 0.5 * axis), vector)
+    return torch.where(tiny[:, None], torch.where(cosine[:, None] < 0, axis.new_tensor(_HALF_TURN), 0.5 * axis), vector)
 
 
 @torch.inference_mode()
@@ -68,12 +68,15 @@ def solve(
 ) -> Solutions:
     """Follow the error from each start to its target, `T_base_tip`; rows that have arrived wait for the others.
 
+    Computed in float32, which is a hundred times finer than the tolerances and takes two thirds of the time.
+
     Args:
         steps: at most so many.
         limited: whether joints are kept within their limits.
     """
-    lower, upper = (torch.as_tensor(limit).to(start) for limit in (arm.lower, arm.upper))
-    q, error = start.clone(), start.new_full((len(start),), torch.inf)
+    lower, upper = (torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper))
+    target, q = SE3(target.rotation.float(), target.translation.float()), start.to(torch.float32, copy=True)
+    error = q.new_full((len(q),), torch.inf)
     reached = torch.zeros(len(start), dtype=torch.bool)
     rows = torch.arange(len(start))
     for step in range(steps + 1):
@@ -90,7 +93,9 @@ def solve(
         q[rows] = q[rows] + change
         if limited:
             q[rows] = q[rows].clamp(lower, upper)
-    return Solutions(q, reached, error)
+    q = q.to(start)
+    # Rounding may step over a limit.
+    return Solutions(q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q, reached, error.to(start))
 
 
 def _step(
