@@ -68,20 +68,3 @@ def tip_hand(arm: Arm, hand: HandModel) -> SE3:
 def arm_links(arm: Arm, q: Float[Tensor, "batch joints"]) -> SE3:
     """`T_base_link` of every link at joint values q [rad] or [m]: a batch of arms by links."""
     return forward(make_kinematics(arm.chain, dtype=q.dtype), q)
-
-
-def tip_jacobian(arm: Arm, links: SE3) -> Float[Tensor, "batch 6 joints"]:
-    """Geometric Jacobian of the tip's origin at the poses of `arm_links`: velocity, then turning, base frame.
-
-    A revolute joint with axis a through o moves the tip x by `a × (x − o)` and turns it about a; a prismatic one moves
-    it by a.
-    """
-    moved = torch.as_tensor(arm.moved_link)
-    axis = torch.as_tensor(arm.chain.joint_axis[arm.moved_link]).to(links.translation)
-    axis = (links.rotation[:, moved] @ axis[..., None]).squeeze(-1)
-    lever = links.translation[:, arm.tip, None] - links.translation[:, moved]
-    velocity, turning = torch.linalg.cross(axis, lever), axis
-    if arm.chain.slides.any():
-        slides = torch.as_tensor(arm.chain.slides)[:, None]
-        velocity, turning = torch.where(slides, axis, velocity), torch.where(slides, 0.0, axis)
-    return torch.cat([velocity, turning], -1).transpose(1, 2)

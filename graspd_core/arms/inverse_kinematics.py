@@ -7,19 +7,22 @@ are Newton's. A joint at its limit that the step would push beyond is held there
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from graspd_core.arms.arm import Arm, arm_links, tip_jacobian
+from graspd_core.arms.arm import Arm
+from graspd_core.arms.tip_chain import tip_and_jacobian, tip_chain
 from graspd_core.se3 import SE3
 
 # A pose is reached when it is this near [m], [rad].
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
 # One radian counts as so many metres.
 RADIAN = 0.3
+_WEIGHTS = [1.0, 1.0, 1.0, RADIAN, RADIAN, RADIAN]
 # Damping as a share of the error's square, and what is left of it where the error is none [m²].
 _DAMPING, _LEAST_DAMPING = 0.05, 1e-7
 # No joint turns farther in one step [rad].
@@ -74,38 +77,38 @@ def solve(
         steps: at most so many.
         limited: whether joints are kept within their limits.
     """
-    lower, upper = (torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper))
-    target, q = SE3(target.rotation.float(), target.translation.float()), start.to(torch.float32, copy=True)
-    error = q.new_full((len(q),), torch.inf)
-    reached = torch.zeros(len(start), dtype=torch.bool)
-    rows = torch.arange(len(start))
+    limits = [torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper)]
+    target, now, chain = SE3(target.rotation.float(), target.translation.float()), start.float(), tip_chain(arm)
+    q, error, reached = torch.empty(now.shape), torch.empty(len(now)), torch.zeros(len(now), dtype=torch.bool)
+    rows = torch.arange(len(now))
     for step in range(steps + 1):
-        links = arm_links(arm, q[rows])
-        wrong = pose_error(target[rows], links[:, arm.tip])
-        error[rows] = (wrong * wrong.new_tensor([1.0] * 3 + [RADIAN] * 3)).norm(dim=-1)
-        there = (wrong[:, :3].norm(dim=-1) < POSITION_TOLERANCE) & (wrong[:, 3:].norm(dim=-1) < ROTATION_TOLERANCE)
-        reached[rows[there]] = True
-        ahead = ~there
-        rows, links, wrong = rows[ahead], links[ahead], wrong[ahead]
-        if step == steps or not len(rows):
-            break
-        change = _step(tip_jacobian(arm, links), wrong, q[rows], (lower, upper) if limited else None)
-        q[rows] = q[rows] + change
-        if limited:
-            q[rows] = q[rows].clamp(lower, upper)
+        tip, jacobian = tip_and_jacobian(chain, now)
+        wrong = pose_error(target, tip)
+        away, turned = wrong[:, :3].norm(dim=-1), wrong[:, 3:].norm(dim=-1)
+        there = (away < POSITION_TOLERANCE) & (turned < ROTATION_TOLERANCE)
+        if step == steps or there.any():
+            q[rows], error[rows], reached[rows] = now, torch.hypot(away, RADIAN * turned), there
+            ahead = torch.nonzero(~there).flatten()
+            if step == steps or not len(ahead):
+                break
+            rows, now, wrong, jacobian = (x[ahead] for x in (rows, now, wrong, jacobian))
+            target = target[ahead]
+        now = now + _step(jacobian, wrong, now, limits if limited else None)
+        now = now.clamp(*limits) if limited else now
     q = q.to(start)
     # Rounding may step over a limit.
-    return Solutions(q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q, reached, error.to(start))
+    q = q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q
+    return Solutions(q, reached, error.to(start))
 
 
 def _step(
     jacobian: Float[Tensor, "batch 6 joints"],
     wrong: Float[Tensor, "batch 6"],
     q: Float[Tensor, "batch joints"],
-    limits: tuple[Tensor, Tensor] | None,
+    limits: Sequence[Tensor] | None,
 ) -> Float[Tensor, "batch joints"]:
     """`Jᵀ (J Jᵀ + λ I)⁻¹ e` with rows of turning weighted, without joints that would leave their limits."""
-    weight = wrong.new_tensor([1.0] * 3 + [RADIAN] * 3)
+    weight = wrong.new_tensor(_WEIGHTS)
     jacobian, wrong = jacobian * weight[:, None], wrong * weight
     if limits is not None:
         downhill = (jacobian * wrong[..., None]).sum(1)

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.arms.arm import Arm, arm_links, tip_jacobian
+from graspd_core.arms.arm import Arm, arm_links
 from graspd_core.arms.arm_file import load_arm
 from graspd_core.arms.capsules import capsules_about
 from graspd_core.arms.inverse_kinematics import (
@@ -21,6 +21,7 @@ from graspd_core.arms.inverse_kinematics import (
     solve,
 )
 from graspd_core.arms.start_table import nearest_postures, random_postures, start_table
+from graspd_core.arms.tip_chain import tip_and_jacobian, tip_chain
 from graspd_core.hands.readers.build_model import LinkSpec, assemble
 from graspd_core.hands.readers.joint_limits import JointSpec
 from graspd_core.se3 import SE3, axis_rotation, random_rotations
@@ -112,7 +113,10 @@ def test_the_tip_is_where_the_published_table_has_it(name: str):
 def test_the_jacobian_is_that_of_finite_differences(joints: int, seed: int):
     arm = random_arm(joints, seed)
     q = inside(arm, torch.rand(1, len(arm.lower), generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
-    jacobian, step = tip_jacobian(arm, arm_links(arm, q))[0], 1e-5
+    at, jacobians = tip_and_jacobian(tip_chain(arm, torch.float64), q)
+    assert torch.allclose(at.translation, tip(arm, q).translation, atol=1e-12)
+    assert torch.allclose(at.rotation, tip(arm, q).rotation, atol=1e-12)
+    jacobian, step = jacobians[0], 1e-5
     for joint in range(len(arm.lower)):
         change = torch.zeros_like(q)
         change[0, joint] = step
