@@ -75,7 +75,7 @@ def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
     return SE3(inverse @ rotation, (inverse @ (at - task.base.translation)[..., None]).squeeze(-1))
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     """A way of the arm through each grasp, or why there is none: "beyond joint_4's limit"."""
     found: list[ArmPath | str] = []

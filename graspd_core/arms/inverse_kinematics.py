@@ -65,7 +65,7 @@ def rotation_vector(
     return torch.where(tiny[:, None], torch.where(cosine[:, None] < 0, axis.new_tensor(_HALF_TURN), 0.5 * axis), vector)
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def solve(
     arm: Arm, target: SE3, start: Float[Tensor, "batch joints"], steps: int, *, limited: bool = True
 ) -> Solutions:

@@ -16,6 +16,7 @@ from graspd_core.arms.arm_paths import LARGEST_JUMP, ArmTask, arm_paths, make_ta
 from graspd_core.arms.capsules import placed
 from graspd_core.arms.hand_way import LIFT, RETREAT, STAGE_ROWS, hand_ways
 from graspd_core.arms.start_table import random_postures
+from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf
@@ -182,3 +183,12 @@ def test_depths_are_those_of_dense_points(arm: Arm, table: Scene):
     assert (found.depth[:, named][hit] > 0).all()
     clear = depth < -0.03
     assert (found.depth[:, named][clear] < 0).all()
+
+
+def test_what_it_keeps_of_a_hand_still_carries_gradients(ur: Arm, table: Scene):
+    """Constants of a hand are kept for all who ask: made while no gradient is recorded, they must serve those who do."""
+    hand = load_hand("barrett_like", candidates=50)
+    assert isinstance(arm_paths(task_of(ur, hand, table, 0.5), [from_above(hand, 0.2)])[0], ArmPath)
+    q = torch.as_tensor(hand.open_posture)[None].requires_grad_()
+    forward(make_kinematics(hand, dtype=torch.float64), q).translation.sum().backward()
+    assert q.grad is not None
