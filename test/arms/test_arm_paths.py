@@ -186,7 +186,7 @@ def test_depths_are_those_of_dense_points(arm: Arm, table: Scene):
 
 
 def test_what_it_keeps_of_a_hand_still_carries_gradients(ur: Arm, table: Scene):
-    """Constants of a hand are kept for all who ask: made while no gradient is recorded, they must serve those who do."""
+    """Constants of a hand are kept for all who ask, those who want a gradient too."""
     hand = load_hand("barrett_like", candidates=50)
     assert isinstance(arm_paths(task_of(ur, hand, table, 0.5), [from_above(hand, 0.2)])[0], ArmPath)
     q = torch.as_tensor(hand.open_posture)[None].requires_grad_()
