@@ -86,6 +86,8 @@ def make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
         raise ConfigError(
             f"{where}: joint {chain.mimics[0].name!r} follows another; an arm's joints move by themselves"
         )
+    if all(chain.link_group[primitive.link] == 0 for primitive in chain.primitives):
+        raise ConfigError(f"{urdf}: no link that moves has a <collision> or <visual> shape: give the arm capsules")
     lower, upper = _limits(chain, entries.limits, where)
     seed = 0.5 * (lower + upper)
     for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():

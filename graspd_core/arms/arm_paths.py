@@ -17,6 +17,7 @@ from torch import Tensor
 
 from graspd_core.arms.arm import Arm, arm_links, tip_hand
 from graspd_core.arms.arm_collision import Hits, hits_of_hand, hits_of_scene, hits_of_self, hits_of_support, joined
+from graspd_core.arms.capsules import placed
 from graspd_core.arms.hand_way import STAGE_ROWS, hand_ways
 from graspd_core.arms.inverse_kinematics import solve
 from graspd_core.arms.limit_reasons import why_unreached
@@ -131,7 +132,7 @@ def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]
 def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joints"], Int[Tensor, "postures"]]:
     """Different joint values that bring the tip to each target, nearest to the seed first, and whose they are.
 
-    Those that hit nothing come before those that do.
+    Those that stay above the support come before those that do not; what else is hit, their ways will tell.
     """
     arm, table = task.arm, start_table(task.arm)
     starts = nearest_postures(table, target, _STARTS, task.usable)
@@ -141,8 +142,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     q, owner = nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
     if not len(q):
         return q, owner
-    links = arm_links(arm, q)
-    hits = joined(hits_of_scene(arm, task.scene, task.base, links), hits_of_self(arm, links))
+    hits = hits_of_support(arm, task.scene, task.base, placed(arm.capsules, arm_links(arm, q))[:2])
     away = (q - torch.as_tensor(arm.seed)).square().sum(-1)
     order = (owner * 1e6 + (hits.depth > 0).any(-1) * 1e5 + away).argsort()
     q, owner = q[order], owner[order]

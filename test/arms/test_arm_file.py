@@ -90,6 +90,14 @@ def test_a_wrong_description_is_refused_in_one_line(tmp_path: Path, keys: dict[s
     assert "\n" not in str(caught.value)
 
 
+def test_an_arm_that_could_hit_nothing_is_refused(tmp_path: Path):
+    path = write(tmp_path)
+    camera = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision>'
+    (tmp_path / "cell.urdf").write_text(ROBOT.replace(camera, ""))
+    with pytest.raises(ConfigError, match=r"cell.urdf: no link that moves has a <collision> or <visual> shape"):
+        load_arm(path)
+
+
 def test_a_joint_that_follows_another_is_refused(tmp_path: Path):
     path = write(tmp_path)
     (tmp_path / "cell.urdf").write_text(ROBOT.replace('<origin xyz="0.4 0 0"/>', '<mimic joint="j1"/>'))
