@@ -21,7 +21,7 @@ from graspd_core.arms.capsules import placed
 from graspd_core.arms.hand_way import STAGE_ROWS, hand_ways
 from graspd_core.arms.inverse_kinematics import solve
 from graspd_core.arms.limit_reasons import why_unreached
-from graspd_core.arms.start_table import nearest_postures, start_table
+from graspd_core.arms.start_table import nearest_postures, reach_bounds, start_table
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3
@@ -46,6 +46,7 @@ class ArmTask:
         arm, hand, scene: who takes what where.
         base: `T_scene_base` of the arm's base frame, one.
         usable: entries of the arm's start table that are clear of the support.
+        bounds: how far away their tips are, see `reach_bounds`.
     """
 
     arm: Arm
@@ -53,6 +54,7 @@ class ArmTask:
     scene: Scene
     base: SE3
     usable: Bool[Tensor, "entries"]
+    bounds: Float[Tensor, "2 points"]
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
@@ -64,7 +66,8 @@ def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
     """The task, with what of the start table is clear of the support."""
     table = start_table(arm)
     hits = hits_of_support(arm, scene, base, (table.start, table.end))
-    return ArmTask(arm, hand, scene, base, (hits.depth <= 0).all(-1))
+    usable = (hits.depth <= 0).all(-1)
+    return ArmTask(arm, hand, scene, base, usable, reach_bounds(table, usable))
 
 
 def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:

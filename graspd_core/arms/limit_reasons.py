@@ -13,7 +13,7 @@ from graspd_core.arms.start_table import nearest_postures, start_table
 from graspd_core.se3 import SE3
 
 # Starts of each pose, and steps of each.
-_STARTS, _STEPS = 4, 12
+_STARTS, _STEPS = 3, 10
 _TOO_FAR, _NOWHERE = "farther than the arm reaches", "that no posture of the arm reaches"
 
 

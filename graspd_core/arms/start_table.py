@@ -100,9 +100,13 @@ def nearest_postures(
     return q[torch.cdist(tip_features(tip), features).topk(min(count, len(q)), largest=False).indices]
 
 
-def within_reach(table: StartTable, tip: SE3, usable: Bool[Tensor, "entries"]) -> Bool[Tensor, "batch"]:
-    """Which poses `T_base_tip` are as far from the shoulder as in some usable posture."""
-    if not usable.any():
-        return torch.zeros(len(tip.translation), dtype=torch.bool)
-    known, away = table.away[usable], _away(tip, table.shoulder)
-    return ((away >= known.amin(0)) & (away <= known.amax(0))).all(-1)
+def reach_bounds(table: StartTable, usable: Bool[Tensor, "entries"]) -> Float[Tensor, "2 points"]:
+    """How far from the shoulder points fixed to the tip are at least and at most in usable postures [m]."""
+    away = table.away[usable] if usable.any() else table.away.new_full((1, len(_POINTS)), torch.nan)
+    return torch.stack([away.amin(0), away.amax(0)])
+
+
+def within_reach(table: StartTable, bounds: Float[Tensor, "2 points"], tip: SE3) -> Bool[Tensor, "batch"]:
+    """Which poses `T_base_tip` are within the bounds; none where no posture is usable."""
+    away = _away(tip, table.shoulder)
+    return ((away >= bounds[0]) & (away <= bounds[1])).all(-1)

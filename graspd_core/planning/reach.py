@@ -87,11 +87,11 @@ class BoundReach(BoundRestriction):
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
         retreat = at - RETREAT * (rotation @ torch.as_tensor(task.hand.approach))
         lift = at + LIFT * torch.as_tensor(task.up)
-        table = start_table(task.arm)
-        near = [
-            within_reach(table, tip_poses(task, SE3(rotation, there)), task.usable) for there in (at, retreat, lift)
-        ]
-        return torch.stack(near).all(0).numpy()
+        allowed = torch.arange(len(at))
+        for there in (at, retreat, lift):
+            tip = tip_poses(task, SE3(rotation[allowed], there[allowed]))
+            allowed = allowed[within_reach(start_table(task.arm), task.bounds, tip)]
+        return np.isin(np.arange(len(at)), allowed.numpy())
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
         """Each candidate with the arm's way, or why there is none."""
