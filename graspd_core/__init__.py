@@ -16,6 +16,9 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from graspd_core.arms.arm import Arm as Arm
+    from graspd_core.arms.arm_file import arm_names as arm_names
+    from graspd_core.arms.arm_file import load_arm as load_arm
     from graspd_core.config import SceneConfig as SceneConfig
     from graspd_core.errors import GraspdError as GraspdError
     from graspd_core.formats.grasps_json import save_result as save_result
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from graspd_core.metrics.metric_registry import Metric as Metric
     from graspd_core.planning.plan_grasps import plan_grasps as plan_grasps
     from graspd_core.planning.plan_grasps import warm_up as warm_up
+    from graspd_core.planning.reach import Reach as Reach
     from graspd_core.planning.steering.regions import Box as Box
     from graspd_core.planning.steering.regions import NearPoints as NearPoints
     from graspd_core.planning.steering.regions import Sphere as Sphere
@@ -51,6 +55,7 @@ if TYPE_CHECKING:
     from graspd_core.segmentation.target_selection import Target as Target
     from graspd_core.trials.trial_registry import TRIALS as TRIALS
     from graspd_core.trials.trial_registry import Trial as Trial
+    from graspd_core.types import ArmPath as ArmPath
     from graspd_core.types import Grasp as Grasp
     from graspd_core.types import GraspResult as GraspResult
     from graspd_core.types import Outcome as Outcome
@@ -75,7 +80,10 @@ _MODULES = {
     "hands.library": "hand_names load_hand",
     "hands.model": "HandModel",
     "hands.hand_mesh": "hand_mesh",
+    "arms.arm": "Arm",
+    "arms.arm_file": "arm_names load_arm",
     "planning.plan_grasps": "plan_grasps warm_up",
+    "planning.reach": "Reach",
     "planning.steering.steering": "Steering",
     "planning.steering.regions": "Box NearPoints Sphere",
     "methods.plan_config": "PlanConfig load_preset override preset_names",
@@ -83,7 +91,7 @@ _MODULES = {
     "planning.verify_grasps": "verify_grasps",
     "trials.trial_registry": "TRIALS Trial",
     "metrics.metric_registry": "METRICS Metric",
-    "types": "Grasp GraspResult Outcome Posture Progress TrialResult TriangleMesh Verdict",
+    "types": "ArmPath Grasp GraspResult Outcome Posture Progress TrialResult TriangleMesh Verdict",
     "formats.grasps_json": "save_result",
     "formats.read_grasps": "load_grasps",
     "errors": "GraspdError",

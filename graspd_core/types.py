@@ -140,6 +140,29 @@ class Posture:
     joint_positions: Float[np.ndarray, "joints"]
 
 
+# Where an arm is on its way through a grasp, in this order.
+ARM_STAGES = ("retreat", "pregrasp", "grasp", "lift")
+
+
+@dataclass(frozen=True)
+class ArmPath:
+    """How an arm brings a hand to a grasp and lifts it: joint values of closely spaced waypoints.
+
+    Attributes:
+        joint_names: of the arm, base first.
+        positions: joint values, a row a waypoint [rad] or [m].
+        stages: the rows at which the hand is at the retreat, the pregrasp, the grasp and the lift (`ARM_STAGES`).
+    """
+
+    joint_names: tuple[str, ...]
+    positions: Float[np.ndarray, "waypoints joints"]
+    stages: tuple[int, int, int, int]
+
+    def at(self, stage: str) -> Float[np.ndarray, "joints"]:
+        """Joint values at one of `ARM_STAGES`."""
+        return self.positions[self.stages[ARM_STAGES.index(stage)]]
+
+
 @dataclass(frozen=True)
 class Grasp:
     """One grasp: three postures, where it touches, how good it is, and what the trials measured.
@@ -153,6 +176,7 @@ class Grasp:
         metrics: static quality, None until measured.
         trials: in the order that they were run; the first failure ends them.
         probability: of holding on the true object, where a part of its shape was guessed (docs/clouds.md); else None.
+        arm: how the arm gets there, where one was given (docs/arms.md); else None.
     """
 
     pregrasp: Posture
@@ -163,6 +187,7 @@ class Grasp:
     metrics: GraspMetrics | None = None
     trials: tuple[TrialResult, ...] = ()
     probability: float | None = None
+    arm: ArmPath | None = None
 
     @property
     def verdict(self) -> Verdict:

@@ -15,7 +15,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from graspd_core import load_preset
+from graspd_core import load_arm, load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError
 from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
@@ -66,6 +66,11 @@ def _check_scene_config(path: str) -> None:
         load_scene_config(path)
 
 
+def _check_arm(name: str) -> None:
+    if name:
+        load_arm(name)
+
+
 def _check_corner(corner: Any) -> None:
     if not _numbers(corner) or len(corner) != 3 or not np.isfinite(corner).all():
         raise ConfigError(f"{corner} is no place; give three finite numbers, x, y and z in metres")
@@ -84,6 +89,14 @@ class Settings:
     hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
     hand_prefix: str = _setting(
         "", "put before the names of the hand's joints and links, where a robot has several hands", read_only=True
+    )
+    arm: str = _setting(
+        "",
+        "name of a shipped arm, or path of an arm's yaml file: only grasps that it reaches are tried; empty: no arm",
+        check=_check_arm,
+    )
+    arm_base_frame: str = _setting(
+        "", "frame of the arm's base, by /tf; empty: named as the link that the arm begins at"
     )
     device: str = _setting("cpu", "torch device of the optimiser", check=_check_device, read_only=True)
     torch_threads: int = _setting(

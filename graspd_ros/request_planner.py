@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
-from graspd_core import HandModel, load_preset, plan_grasps, save_result
+from graspd_core import HandModel, Reach, load_preset, plan_grasps, save_result
 from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
+from graspd_ros.inputs.arm_place import reach_of
 from graspd_ros.inputs.frames import moved_grasp, moved_result
 from graspd_ros.inputs.requests import Request
 from graspd_ros.recovery import RecentRuns, without
@@ -91,27 +92,34 @@ class Planner:
         run_isolated = request.frame_out != request.frame
         stamp = Time() if request.timeless else request.stamp
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
+        reach = reach_of(request, lambda target, source: self._lookup(target, source, stamp, stop))
         newest = Time()
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
-        # Earlier runs were not asked for the place and direction that this request may ask for.
-        known = excluded and request.steering is None
+        # What an earlier run found was not asked for these wishes, and an arm may have stood elsewhere.
+        known = excluded and request.steering is None and not reach
         result, file = self._runs.next_best(request, excluded) if known else None, ""
         if result is None:
             poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
-            result, file = self._search(request, excluded, stop, lambda progress: tell(_placed(progress, poses)))
+            placed = lambda progress: tell(_placed(progress, poses))  # noqa: E731
+            result, file = self._search(request, excluded, reach, stop, placed)
         self._runs.keep(request, result)
         for pose in (request.T_frame_object, T_out_frame):
             result = result if pose is None else moved_result(result, pose)
         return Planned(result, file)
 
     def _search(
-        self, request: Request, excluded: list[np.ndarray], stop: StopHook, tell: ProgressHook
+        self,
+        request: Request,
+        excluded: list[np.ndarray],
+        reach: tuple[Reach, ...],
+        stop: StopHook,
+        tell: ProgressHook,
     ) -> tuple[GraspResult, str]:
         """A run, without grasps like those excluded, and the file that it was written to."""
         settings = request.settings
         config = load_preset(settings.preset)
         scene = request.load()
-        restrictions = [] if request.steering is None else [request.steering()]
+        steering = () if request.steering is None else (request.steering(),)
         result = plan_grasps(
             scene,
             self._hand,
@@ -122,7 +130,7 @@ class Planner:
             verify=settings.verify,
             deadline=max(request.time_left(), 1e-3),
             device=settings.device,
-            restrictions=restrictions,
+            restrictions=(*steering, *reach),
             progress=tell,
             stop=stop,
         )

@@ -67,22 +67,23 @@ MAY_IMPORT = {
     "scene": PERCEPTION,
     "bags": BASE | {"pointcloud", "transforms"},
     "hands": BASE | {"mesh"},
+    "arms": BASE | {"mesh", "hands", "scene"},
     "rendering": BASE | {"mesh", "pointcloud", "hands"},
     "contact": UP_TO_CONTACT,
     "methods": UP_TO_CONTACT | {"kernel"},
     "metrics": UP_TO_CONTACT,
     "trials": UP_TO_CONTACT,
     "formats": BASE | {"mesh", "scene", "hands", "methods", "metrics"},
-    "planning": BELOW_PLANNING,
-    "__init__": BELOW_PLANNING | {"planning"},
-    "bench": BELOW_PLANNING | {"planning", "__init__"},
+    "planning": BELOW_PLANNING | {"arms"},
+    "__init__": BELOW_PLANNING | {"arms", "planning"},
+    "bench": BELOW_PLANNING | {"arms", "planning", "__init__"},
     "doctor": BELOW_PLANNING | {"planning", "__init__"},
     "viewer": BELOW_PLANNING | {"planning", "bench", "__init__"},
-    "cli": BELOW_PLANNING | {"planning", "bench", "doctor", "viewer", "__init__"},
+    "cli": BELOW_PLANNING | {"arms", "planning", "bench", "doctor", "viewer", "__init__"},
 }
 # What the node sees: the public names, values, the viewer, and what only a process that serves needs.
 NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags", "viewer"}
-NODE_SEES |= {"runtime", "hands", "pointcloud", "formats", "planning"}
+NODE_SEES |= {"runtime", "hands", "arms", "pointcloud", "formats", "planning"}
 
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {

@@ -8,6 +8,7 @@ from graspd_core.bench.failure_maps import map_registry, map_report
 from graspd_core.bench.measurements.measurement import run_cell
 from graspd_core.bench.stress import stress_cases, stress_table
 from graspd_core.bench.studies import (
+    arm_reach,
     early_ends,
     frames,
     human_hand,
@@ -128,6 +129,16 @@ STUDIES: dict[str, Study] = {
         ("studies/steered.py", "object_case.py"),
         _PLANS,
         lambda case: 3.0,
+    ),
+    "reach": Study(
+        "inverse kinematics of the arms, and requests with and without an arm",
+        arm_reach.reach_cases,
+        arm_reach.run_reach,
+        arm_reach.reach_sections,
+        ("studies/arm_reach.py", "measurements/arm_poses.py", "object_case.py"),
+        _PLANS,
+        lambda case: 10.0,
+        came=arm_reach.came,
     ),
     "mano": Study(
         "a human hand of the user's, in the units of the Grasp'D paper",

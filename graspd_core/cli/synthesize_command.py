@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from graspd_core.cli.arm_options import add_arm_options, reach_of
 from graspd_core.cli.cloud_options import add_object_options, scene_config_of, target_of
 from graspd_core.cli.deadline import Deadline, DeadlinePassed
 from graspd_core.cli.planning_options import (
@@ -38,6 +39,7 @@ def add_command(commands: Any) -> None:
     add_planning_options(parser)
     add_object_options(parser)
     add_steering_options(parser)
+    add_arm_options(parser)
     sizes = parser.add_mutually_exclusive_group()
     sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file")
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
@@ -55,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.scene.load_scene import load_scene
 
     config, request = planning_options(options)
-    request["restrictions"] = steering_of(options)
+    request["restrictions"] = (*steering_of(options), *reach_of(options))
     deadline = Deadline(options.deadline, options.began)
     # A run whose result could not be written would be lost.
     for path in (options.out, options.html):

@@ -17,7 +17,7 @@ from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positi
 from graspd_core.methods.plan_config import PlanConfig, to_mapping
 from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.scene.scene import ObjectModel
-from graspd_core.types import Grasp, GraspResult, Posture
+from graspd_core.types import ARM_STAGES, ArmPath, Grasp, GraspResult, Posture
 
 FORMAT, VERSION = "graspd/grasps", 2
 _LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
@@ -138,8 +138,15 @@ def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
         "pregrasp_position": _list(grasp.pregrasp.position),
         "pregrasp_quaternion_wxyz": _list(grasp.pregrasp.quaternion_wxyz),
         "contacts": [{"link": c.link, "position": list(c.position), "normal": list(c.normal)} for c in grasp.contacts],
+        "arm": grasp.arm and _arm(grasp.arm),
         **grasp_figures(grasp),
     }
+
+
+def _arm(path: ArmPath) -> dict[str, Any]:
+    """The arm's way, and the waypoint at which it is at each stage."""
+    stages = dict(zip(ARM_STAGES, path.stages, strict=True))
+    return {"joint_names": list(path.joint_names), "positions": path.positions.tolist(), "stages": stages}
 
 
 def grasp_figures(grasp: Grasp) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from graspd_core.errors import FormatError, shown
 from graspd_core.formats.grasps_json import FORMAT, VERSION
 from graspd_core.metrics.metric_registry import METRICS
-from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
+from graspd_core.types import ARM_STAGES, ArmPath, Contact, Grasp, GraspMetrics, Posture, TrialResult
 
 
 def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
@@ -89,6 +89,8 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
         # Files written before clouds were doubted have no such key.
         probability=_scaled({"probability": None, **values}, "probability", 1.0),
+        # Nor those written before an arm could be given.
+        arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
     if values["verdict"] != grasp.verdict:
         raise ValueError(f"verdict: {shown(values['verdict'])}; by its trials the grasp is {grasp.verdict}")
@@ -132,6 +134,15 @@ def _trial_of(values: dict[str, Any]) -> TrialResult:
 def _scaled(values: dict[str, Any], key: str, factor: float) -> float | None:
     """A number times `factor`; None where there is none."""
     return None if values.get(key) is None else float(_numbers_of(values, key)) * factor
+
+
+def _arm_of(values: dict[str, Any]) -> ArmPath:
+    names, rows = tuple(map(str, values["joint_names"])), len(values["positions"])
+    positions = _numbers_of(values, "positions", rows, len(names))
+    first, second, third, fourth = (int(values["stages"][stage]) for stage in ARM_STAGES)
+    if not 0 <= first <= second <= third <= fourth < rows:
+        raise ValueError(f"arm.stages: {shown(values['stages'])}; expected rows of its {rows} waypoints in order")
+    return ArmPath(names, positions, (first, second, third, fourth))
 
 
 def _contact_of(values: dict[str, Any]) -> Contact:

@@ -21,6 +21,7 @@ from graspd_core import HandModel
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Progress, Stage, TrialResult, Verdict
 from graspd_ros.inputs.frames import pose_of_matrix
 from graspd_ros.outputs import status_json as convert
+from graspd_ros.outputs.arm_trajectory import arm_trajectory
 from graspd_ros.outputs.error_codes import ErrorCode
 from graspd_ros.outputs.mount import parent_pose
 from graspd_ros.outputs.trajectory import Pace, base_poses, trajectory_of
@@ -125,6 +126,9 @@ def grasp_message(
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
+    if grasp.arm is not None:
+        message.arm_trajectory = arm_trajectory(grasp, grasp.arm, pace)
+        message.arm_stages = list(grasp.arm.stages)
     if hand.mount is not None:
         message.mount_link = hand.mount.parent
         message.mount_pregrasp_pose = parent_pose(message.pregrasp_pose, hand.mount)

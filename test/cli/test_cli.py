@@ -15,7 +15,7 @@ import pytest
 
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
-from graspd_core.formats.read_grasps import load_document
+from graspd_core.formats.read_grasps import load_document, load_grasps
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import preset_names
@@ -78,6 +78,11 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--region", "sphere", "0", "0", "0", "wide"], "--region: sphere 0 0 0 wide; valid: box"),
     (["--region", "sphere", "1", "0", "0", "0.1"], "region: no part of the object lies in it; the object goes from"),
     (["--avoid", "0", "0", "0", "1", "1", "0"], "box size: (1.0, 1.0, 0.0); valid: three lengths above 0"),
+    (["--arm", "ur99", "--arm-base", "1", "0", "0"], "unknown arm 'ur99'; known: panda_like, ur5e_like"),
+    (["--arm", "ur5e_like"], "--arm-base: 0 numbers; valid: X Y Z, or X Y Z QW QX QY QZ"),
+    (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
+    (["--arm-base", "1", "0", "0"], "--arm-base: there is no arm"),
+    (["--arm", "ur5e_like", "--arm-base", "0", "0", "0", "1", "1", "0", "0"], "valid: w x y z of length 1"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
 ]
 
@@ -170,6 +175,17 @@ def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.Cap
     for bad in (command, ["synthesize", str(tmp_path / "ball.npy"), "--scene", str(scene)]):
         assert main(bad) == EXIT_BAD_INPUT
         assert "scene.yaml.reconstruction: unknown key 'most_faces'; valid keys: fit_distance" in the_line(capsys)
+
+
+def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    asked = ["synthesize", "shape:box", "-n", "1", "--hand", "barrett_like", "--verify", "none", "--arm", "panda_like"]
+    assert main([*asked, "--arm-base", "-0.5", "0", "-0.1", "--out", str(tmp_path / "g.json")]) == EXIT_OK
+    assert all(grasp.arm is not None for grasp in load_grasps(tmp_path / "g.json"))
+    capsys.readouterr()
+    assert main([*asked, "--arm-base", "-5", "0", "-0.1", "0", "0", "0", "1"]) == EXIT_TOO_FEW
+    assert "m from the base of panda_like" in capsys.readouterr().out
 
 
 def test_a_run_that_ends_with_too_few_says_so(capsys: pytest.CaptureFixture[str]):

@@ -57,7 +57,7 @@ TIMING = {"load", "sdf", "compile", "optimise", "verify", "first_verified", "tot
 GRASP = {
     "rank", "verdict", "reason", "score", "position", "quaternion_wxyz", "joint_positions", "pregrasp_joint_positions",
     "squeeze_joint_positions", "pregrasp_position", "pregrasp_quaternion_wxyz", "contacts", "metrics", "trials",
-    "probability",
+    "probability", "arm",
 }  # fmt: skip
 METRIC_KEYS = {
     "contact_area_cm2", "contact_area_5mm_cm2", "contact_area_10mm_cm2", "contact_links", "penetration_mm",

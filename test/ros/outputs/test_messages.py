@@ -92,6 +92,23 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert len(client.answers) == 1
 
 
+def test_with_an_arm_every_grasp_has_its_joints_and_what_is_out_of_reach_is_told(client, node):
+    client.set_parameters(arm="panda_like", arm_base_frame="table")
+    header, upright = Header(frame_id="table", stamp=stamp_now(client)), Quaternion(w=1.0)
+    near, far = (Pose(position=Point(x=away, z=0.3), orientation=upright) for away in (0.5, 5.0))
+    client.send_request(id="near", header=header, object_pose=near, **SPHERE, **FEW)
+    answer = client.answer("near")
+    assert answer.status == GraspArray.SUCCEEDED, answer.message
+    for grasp in answer.grasps:
+        assert list(grasp.arm_trajectory.joint_names) == [f"joint_{k}" for k in range(1, 8)]
+        assert len(grasp.arm_stages) == 4
+        assert grasp.arm_stages[-1] == len(grasp.arm_trajectory.points) - 1
+    client.send_request(id="far", header=header, object_pose=far, **SPHERE, **FEW)
+    answer = client.answer("far")
+    assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_GRASP")
+    assert "m from the base of panda_like, which brings allegro_right" in answer.message
+
+
 def test_whatever_cannot_be_served_is_refused_by_name(client, node):
     cases = [
         ({"source": 9}, "BAD_REQUEST", "source: 9"),

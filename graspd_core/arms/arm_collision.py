@@ -1,0 +1,190 @@
+"""What an arm hits: its links as capsules against the support, the object, obstacles, each other and the hand.
+
+The support is a plane and what stands on it a signed distance, sampled along a capsule's segment so densely that the
+padding for what lies between two samples stays below an eighth of the radius. The arm's base is held against nothing
+but the arm: it stands where it stands. Nor is the first link that moves held against the support, above which it turns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from graspd_core.arms.arm import Arm, arm_links, tip_hand
+from graspd_core.arms.capsules import Capsules, capsules_about, placed, segment_distance
+from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import GridSDF, sample_sdf
+from graspd_core.scene.scene import Scene
+from graspd_core.se3 import SE3
+
+
+@dataclass(frozen=True)
+class Hits:
+    """How deep an arm is in what it must not touch.
+
+    Attributes:
+        depth: of each thing that could be hit, negative where clear [m].
+        what: the things, "forearm in the table".
+    """
+
+    depth: Float[Tensor, "batch things"]
+    what: tuple[str, ...]
+
+
+def joined(*hits: Hits) -> Hits:
+    """All things of several."""
+    return Hits(torch.cat([h.depth for h in hits], -1), tuple(what for h in hits for what in h.what))
+
+
+def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
+    """Depths in the support, the object and the obstacles.
+
+    Args:
+        base: `T_scene_base`, one.
+        links: of `arm_links`.
+    """
+    solids = [("the object", scene.sdf), *(("an obstacle", obstacle.sdf) for obstacle in scene.obstacles)]
+    moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
+    points, padded, owner = _samples(arm)
+    at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
+    found = [hits_of_support(arm, scene, base, placed(arm.capsules, links)[:2])]
+    for what, sdf in solids:
+        depth = padded - _distance(sdf, at)
+        worst = _worst_of_each(depth, owner, len(arm.capsules.link))
+        found.append(Hits(worst[:, moved], tuple(f"{_name(arm, k)} in {what}" for k in moved.tolist())))
+    return joined(*found)
+
+
+def hits_of_support(
+    arm: Arm, scene: Scene, base: SE3, ends: tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"]]
+) -> Hits:
+    """Depths in the support, if there is one, of capsules whose segments end there in the base's frame [m]."""
+    start, end = ends
+    if scene.support is None:
+        return Hits(start.new_zeros(len(start), 0), ())
+    group = arm.chain.link_group[arm.capsules.link]
+    beyond = np.flatnonzero((group != 0) & (group != arm.chain.link_group[arm.moved_link[0]]))
+    normal = torch.as_tensor(scene.support.normal).to(start)
+    # The plane in the base's frame.
+    local, offset = normal @ base.rotation, scene.support.offset - float(normal @ base.translation)
+    height = (
+        torch.minimum(start @ local, end @ local)[:, beyond] - offset - torch.as_tensor(arm.capsules.radius[beyond])
+    )
+    return Hits(-height, tuple(f"{_name(arm, k)} in the table" for k in beyond.tolist()))
+
+
+def _name(arm: Arm, capsule: int) -> str:
+    return arm.chain.link_names[arm.capsules.link[capsule]]
+
+
+def _worst_of_each(
+    depth: Float[Tensor, "batch n"], owner: Int[np.ndarray, "n"], count: int
+) -> Float[Tensor, "batch owners"]:
+    """The greatest depth of the columns that each owner has; minus infinity where it has none."""
+    worst = depth.new_full((len(depth), count), -torch.inf)
+    return worst.scatter_reduce(1, torch.as_tensor(owner).expand(len(depth), -1), depth, "amax")
+
+
+def hits_of_self(arm: Arm, links: SE3) -> Hits:
+    """Depths of links in each other, but for neighbours and pairs that touch in the seed posture."""
+    start, end, radius = placed(arm.capsules, links)
+    first, second = _pairs(arm)
+    distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
+    what = tuple(
+        f"{_name(arm, b)} against {_name(arm, a)}" for a, b in zip(first.tolist(), second.tolist(), strict=True)
+    )
+    return Hits(radius[first] + radius[second] - distance, what)
+
+
+def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
+    """Depths of links in the hand at its joint values, but for pairs that touch in the seed posture."""
+    own_start, own_end, own_radius = placed(arm.capsules, links)
+    start, end, radius = _hand_capsules(arm, hand, links, joints)
+    # Links that stay clear of a ball about the hand need no closer look.
+    center = 0.5 * (start + end).mean(1, keepdim=True)
+    ball = torch.maximum((start - center).norm(dim=-1), (end - center).norm(dim=-1)).add(radius).amax(1, keepdim=True)
+    near = segment_distance(own_start, own_end, center, center) < own_radius + ball
+    checked = _clear_of_hand(arm, hand) & near.any(0).numpy()[:, None]
+    first, second = np.nonzero(checked)
+    distance = segment_distance(own_start[:, first], own_end[:, first], start[:, second], end[:, second])
+    worst = _worst_of_each(own_radius[first] + radius[second] - distance, first, len(checked))
+    own = np.flatnonzero(checked.any(1))
+    return Hits(worst[:, own], tuple(f"{_name(arm, k)} against the hand" for k in own.tolist()))
+
+
+def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Ends and radii of the hand's capsules in the arm's base frame."""
+    capsules = capsules_of_hand(hand)
+    fingers = forward(make_kinematics(hand, dtype=joints.dtype), joints)
+    base = links[:, arm.tip].compose(tip_hand(arm, hand))
+    start, end, radius = placed(capsules, fingers)
+    return base.apply(start), base.apply(end), radius
+
+
+# Hands and arms are hashed by identity.
+@lru_cache(maxsize=8)
+def capsules_of_hand(hand: HandModel) -> Capsules:
+    """A capsule about each solid of a hand."""
+    return capsules_about(hand.primitives)
+
+
+@lru_cache(maxsize=8)
+def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+    """Capsules to hold against each other: no neighbours, none that touch in the seed posture."""
+    group = arm.chain.link_group[arm.capsules.link]
+    above = np.array([_group_above(arm, g) for g in group.tolist()])
+    first, second = np.triu_indices(len(group), 1)
+    near = (group[first] == group[second]) | (above[first] == group[second]) | (above[second] == group[first])
+    first, second = first[~near], second[~near]
+    start, end, radius = (x[0] if x.dim() == 3 else x for x in placed(arm.capsules, _seed_links(arm)))
+    gap = segment_distance(start[first], end[first], start[second], end[second]) - radius[first] - radius[second]
+    clear = (gap > 0).numpy()
+    return first[clear], second[clear]
+
+
+def _group_above(arm: Arm, group: int) -> int:
+    """The group that a group of welded links hangs on; -1 for the base's."""
+    parent = arm.chain.link_parent[group]
+    return -1 if parent < 0 else int(arm.chain.link_group[parent])
+
+
+@lru_cache(maxsize=8)
+def _clear_of_hand(arm: Arm, hand: HandModel) -> np.ndarray:
+    """Which of the arm's capsules (rows) are held against which of the open hand's: those clear in the seed posture."""
+    links = _seed_links(arm)
+    start, end, radius = _hand_capsules(arm, hand, links, torch.as_tensor(hand.open_posture)[None].double())
+    a, b, own = placed(arm.capsules, links)
+    gap = segment_distance(a[0, :, None], b[0, :, None], start[0], end[0]) - own[:, None] - radius
+    return (gap > 0).numpy()
+
+
+def _seed_links(arm: Arm) -> SE3:
+    return arm_links(arm, torch.as_tensor(arm.seed)[None])
+
+
+@lru_cache(maxsize=8)
+def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
+    """Points along the segments as a `placement`, their padded radii [m], and the capsule of each."""
+    points, radii, owner = [], [], []
+    for k in range(len(arm.capsules.link)):
+        start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
+        count = 1 + int(np.ceil(np.linalg.norm(end - start) / radius))
+        spacing = np.linalg.norm(end - start) / max(count - 1, 1)
+        points.append(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
+        # Of the surface point nearest to a segment, a sample is at most half a spacing farther along.
+        radii.append(np.full(count, np.hypot(radius, spacing / 2)))
+        owner.append(np.full(count, k))
+    owner = np.concatenate(owner)
+    links = torch.as_tensor(arm.capsules.link[owner])
+    matrix = placement(arm.chain.num_links, torch.as_tensor(np.concatenate(points)), links)
+    return matrix, torch.as_tensor(np.concatenate(radii)), owner
+
+
+def _distance(sdf: GridSDF, points: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch n"]:
+    return sample_sdf(sdf, points.to(sdf.field))[0].to(points)

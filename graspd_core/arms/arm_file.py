@@ -1,0 +1,172 @@
+"""Arms by name, from an arm description: the YAML file beside a URDF (docs/arms.md)."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.arms.arm import Arm
+from graspd_core.arms.capsules import capsules_about
+from graspd_core.config.mapping import from_mapping, read_yaml
+from graspd_core.errors import ConfigError, shown
+from graspd_core.hands.model import HandModel, Mount
+from graspd_core.hands.readers.urdf import read_urdf
+from graspd_core.hands.readers.xml_io import read_xml
+from graspd_core.paths import config_dir
+
+
+@dataclass(frozen=True)
+class MountEntry:
+    """Where a hand's base link sits on the tip: position [m] and unit quaternion, w first."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ArmFile:
+    """The keys of an arm description.
+
+    Attributes:
+        urdf: path of the URDF, from the description's folder; it may hold more than the arm.
+        tip: the link that carries the hand.
+        base: the link that the arm begins at; empty: the URDF's root.
+        name: of the arm; empty: the file's.
+        seed: joint values by name; what is not named is in the middle of its limits [rad] or [m].
+        limits: narrower limits by joint name, lower and upper [rad] or [m].
+        mounts: `MountEntry`s by the hand's name; other hands sit as their own description says.
+    """
+
+    urdf: str = ""
+    tip: str = ""
+    base: str = ""
+    name: str = ""
+    seed: dict = field(default_factory=dict)
+    limits: dict = field(default_factory=dict)
+    mounts: dict = field(default_factory=dict)
+
+
+def arm_names() -> tuple[str, ...]:
+    """Names of the arms that graspd ships with."""
+    return tuple(sorted(path.stem for path in (config_dir() / "arms").glob("*.yaml")))
+
+
+def load_arm(name_or_path: str | Path) -> Arm:
+    """An arm by its name, or by the path of its description (.yaml).
+
+    Raises:
+        ConfigError: no such arm or file, or the description is wrong: names file, key and valid choices.
+        HandError: the URDF cannot be used.
+    """
+    text = str(name_or_path)
+    if not text.endswith((".yaml", ".yml")):
+        if text not in arm_names():
+            raise ConfigError(f"unknown arm {text!r}; known: {', '.join(arm_names())}, or the path of a .yaml file")
+        text = str(config_dir() / "arms" / f"{text}.yaml")
+    path = Path(text)
+    entries = from_mapping(ArmFile, read_yaml(path), str(path))
+    for key in ("urdf", "tip"):
+        if not getattr(entries, key):
+            raise ConfigError(f"{path}: {key} is missing; keys: {', '.join(ArmFile.__dataclass_fields__)}")
+    urdf = path.parent / entries.urdf
+    return make_arm(entries, urdf, read_xml(urdf), str(path))
+
+
+def make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
+    """The arm that a description makes of a URDF, whose elements are taken over. Raises: see `load_arm`."""
+    _keep_chain(root, entries.base, entries.tip, where)
+    chain = read_urdf(urdf, root)
+    if chain.mimics:
+        raise ConfigError(
+            f"{where}: joint {chain.mimics[0].name!r} follows another; an arm's joints move by themselves"
+        )
+    if all(chain.link_group[primitive.link] == 0 for primitive in chain.primitives):
+        raise ConfigError(f"{urdf}: no link that moves has a <collision> or <visual> shape: give the arm capsules")
+    lower, upper = _limits(chain, entries.limits, where)
+    seed = 0.5 * (lower + upper)
+    for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():
+        index = chain.joint_names.index(joint)
+        if not _number(value) or not lower[index] <= value <= upper[index]:
+            limits = f"[{lower[index]:g}, {upper[index]:g}]"
+            raise ConfigError(f"{where}.seed.{joint}: {shown(value)} is no number within the limits {limits}")
+        seed[index] = value
+    name = entries.name or Path(where).stem
+    mounts = {str(hand): _mount(given, entries.tip, f"{where}.mounts.{hand}") for hand, given in entries.mounts.items()}
+    capsules = capsules_about(chain.primitives)
+    return Arm(name, chain, chain.link_index[entries.tip], lower, upper, seed, capsules, mounts)
+
+
+def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
+    """Drop all links and joints but those from base to tip, and what is welded to them before the tip."""
+    links = [str(link.get("name")) for link in root.findall("link")]
+    for key, link in (("tip", tip), ("base", base)):
+        if link and link not in links:
+            raise ConfigError(f"{where}.{key}: no link {link!r} in the URDF; links: {', '.join(links) or 'none'}")
+    joints = {_end(joint, "child"): joint for joint in root.findall("joint")}
+    above = {child: _end(joint, "parent") for child, joint in joints.items()}
+    chain = [tip]
+    while chain[-1] != base and chain[-1] in above and above[chain[-1]] not in chain:
+        chain.append(above[chain[-1]])
+    if base and chain[-1] != base:
+        raise ConfigError(f"{where}.base: {base!r} is not above the tip {tip!r}; above it: {', '.join(chain[1:])}")
+    kept, waiting = set(chain), chain[1:]
+    while waiting:
+        parent = waiting.pop()
+        welded = [c for c, j in joints.items() if above[c] == parent and j.get("type") == "fixed" and c not in kept]
+        kept.update(welded)
+        waiting += welded
+    dropped = {chain[-1], *links} - kept | {chain[-1]}
+    for element in root.findall("link"):
+        if element.get("name") not in kept:
+            root.remove(element)
+    for child, element in joints.items():
+        if child in dropped or child not in kept:
+            root.remove(element)
+
+
+def _end(joint: ET.Element, end: str) -> str:
+    element = joint.find(end)
+    return "" if element is None else str(element.get("link"))
+
+
+def _limits(
+    chain: HandModel, narrower: Mapping[str, Any], where: str
+) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
+    """The URDF's limits, made narrower where the description says so."""
+    lower, upper = chain.lower.copy(), chain.upper.copy()
+    for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
+        index = chain.joint_names.index(joint)
+        if not isinstance(given, list) or len(given) != 2 or not all(map(_number, given)):
+            raise ConfigError(f"{where}.limits.{joint}: expected a lower and an upper number, got {shown(given)}")
+        low, high = given
+        if not chain.lower[index] <= low < high <= chain.upper[index]:
+            limits = f"[{chain.lower[index]:g}, {chain.upper[index]:g}]"
+            raise ConfigError(f"{where}.limits.{joint}: [{low:g}, {high:g}] is no range within the URDF's {limits}")
+        lower[index], upper[index] = low, high
+    return lower, upper
+
+
+def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    for joint in values:
+        if joint not in chain.joint_names:
+            raise ConfigError(f"{where}: no joint {shown(joint)}; joints: {', '.join(chain.joint_names)}")
+    return values
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+
+
+def _mount(given: Any, tip: str, where: str) -> Mount:
+    entry = from_mapping(MountEntry, given, where)
+    length = float(np.linalg.norm(entry.quaternion_wxyz))
+    if abs(length - 1.0) > 1e-2:
+        raise ConfigError(f"{where}.quaternion_wxyz: a unit quaternion has length 1, not {length:.3g}")
+    w, x, y, z = (value / length for value in entry.quaternion_wxyz)
+    return Mount(tip, entry.position, (w, x, y, z))

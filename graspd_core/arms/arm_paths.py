@@ -1,0 +1,217 @@
+"""Ways of an arm through grasps: joint values at every waypoint of the hand, or why there are none.
+
+Of each grasp several postures are found, from starts all over the arm's postures, so that elbow and wrist vary. From
+each the whole way is solved at once; the first in order of nearness to the seed posture is taken whose way stays within
+the limits, goes on without a jump, and hits nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from graspd_core.arms.arm import Arm, arm_links, tip_hand
+from graspd_core.arms.arm_collision import Hits, hits_of_hand, hits_of_scene, hits_of_self, hits_of_support, joined
+from graspd_core.arms.capsules import placed
+from graspd_core.arms.hand_way import STAGE_ROWS, hand_ways
+from graspd_core.arms.inverse_kinematics import solve
+from graspd_core.arms.limit_reasons import why_unreached
+from graspd_core.arms.start_table import nearest_postures, reach_bounds, start_table
+from graspd_core.hands.model import HandModel
+from graspd_core.scene.scene import Scene
+from graspd_core.se3 import SE3
+from graspd_core.types import ArmPath, Grasp
+
+# No joint moves farther between two waypoints [rad].
+LARGEST_JUMP = 0.2
+# Starts of each grasp, of which so many postures are followed along the way; steps of the one and of the other.
+_STARTS, _FOLLOWED = 8, 2
+_STEPS, _WAY_STEPS = 8, 5
+# Joint values nearer than this are one posture [rad].
+_SAME = 0.1
+# Grasps at once.
+_AT_ONCE = 64
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTask:
+    """An arm somewhere in a scene, with a hand.
+
+    Attributes:
+        arm, hand, scene: who takes what where.
+        base: `T_scene_base` of the arm's base frame, one.
+        usable: entries of the arm's start table that are clear of the support.
+        bounds: how far away their tips are, see `reach_bounds`.
+    """
+
+    arm: Arm
+    hand: HandModel
+    scene: Scene
+    base: SE3
+    usable: Bool[Tensor, "entries"]
+    bounds: Float[Tensor, "2 points"]
+
+    @property
+    def up(self) -> Float[np.ndarray, "3"]:
+        """Direction of a lift in the scene: off the support, else along the z axis of the arm's base."""
+        return self.base.rotation[:, 2].numpy() if self.scene.support is None else self.scene.support.normal
+
+
+def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
+    """The task, with what of the start table is clear of the support."""
+    table = start_table(arm)
+    hits = hits_of_support(arm, scene, base, (table.start, table.end))
+    usable = (hits.depth <= 0).all(-1)
+    return ArmTask(arm, hand, scene, base, usable, reach_bounds(table, usable))
+
+
+def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
+    """`T_base_tip` that bring the hand to `T_scene_hand`."""
+    mount = tip_hand(task.arm, task.hand)
+    rotation = hand_poses.rotation @ mount.rotation.T
+    at = hand_poses.translation - (rotation @ mount.translation[:, None]).squeeze(-1)
+    inverse = task.base.rotation.T
+    return SE3(inverse @ rotation, (inverse @ (at - task.base.translation)[..., None]).squeeze(-1))
+
+
+@torch.no_grad()
+def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
+    """A way of the arm through each grasp, or why there is none: "beyond joint_4's limit"."""
+    found: list[ArmPath | str] = []
+    for first in range(0, len(grasps), _AT_ONCE):
+        found += _some_paths(task, grasps[first : first + _AT_ONCE])
+    return found
+
+
+def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
+    ways = tip_poses(task, hand_ways(grasps, task.hand.approach, task.up))
+    q, owner = _postures(task, ways[:, STAGE_ROWS[2]])
+    joints = torch.as_tensor(np.stack([grasp.pregrasp.joint_positions for grasp in grasps]))[owner]
+    followed = _followed(task, ways[owner], q, joints)
+    best = _best_of_each(followed, owner, len(grasps))
+    reasons = _why_lost(task, ways, followed, best)
+    return [
+        reasons[grasp] if grasp in reasons else ArmPath(task.arm.joint_names, followed.path[row].numpy(), STAGE_ROWS)
+        for grasp, row in enumerate(best)
+    ]
+
+
+def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
+    """The first posture of each grasp whose way can be gone, else the first of all; -1 where there is none."""
+    best = [-1] * count
+    for row in reversed(range(len(owner))):
+        grasp, good = int(owner[row]), followed.good(row)
+        if good or best[grasp] < 0 or not followed.good(best[grasp]):
+            best[grasp] = row
+    return best
+
+
+def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:
+    """Why the grasps that have no way have none, by their number."""
+    reasons: dict[int, str] = {}
+    unreached: list[tuple[int, int, Tensor]] = []
+    for grasp, row in enumerate(best):
+        if row < 0:
+            unreached.append((grasp, STAGE_ROWS[2], torch.as_tensor(task.arm.seed)))
+        elif followed.lost[row] >= 0:
+            unreached.append((grasp, followed.lost[row], followed.path[row, STAGE_ROWS[2]]))
+        elif followed.hit[row]:
+            reasons[grasp] = followed.hit[row]
+    if unreached:
+        rows, waypoints, starts = zip(*unreached, strict=True)
+        told = why_unreached(task.arm, ways[list(rows), list(waypoints)], torch.stack(starts))
+        for (grasp, waypoint, _), reason in zip(unreached, told, strict=True):
+            on_way = waypoint != STAGE_ROWS[2]
+            missed = "without a way of the arm that goes on" if on_way else "whose posture of the arm was not found"
+            reasons[grasp] = (f"{reason} on the way" if on_way else reason) if reason else missed
+    return reasons
+
+
+def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joints"], Int[Tensor, "postures"]]:
+    """Different joint values that bring the tip to each target, nearest to the seed first, and whose they are.
+
+    Those that stay above the support come before those that do not; what else is hit, their ways will tell.
+    """
+    arm, table = task.arm, start_table(task.arm)
+    starts = nearest_postures(table, target, _STARTS, task.usable)
+    count = starts.shape[1]
+    owner = torch.arange(len(starts)).repeat_interleave(count)
+    solved = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
+    q, owner = nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
+    if not len(q):
+        return q, owner
+    hits = hits_of_support(arm, task.scene, task.base, placed(arm.capsules, arm_links(arm, q))[:2])
+    away = (q - torch.as_tensor(arm.seed)).square().sum(-1)
+    order = (owner * 1e6 + (hits.depth > 0).any(-1) * 1e5 + away).argsort()
+    q, owner = q[order], owner[order]
+    # Of each grasp the first postures that differ from all before them.
+    alike = (owner[:, None] == owner) & ((q[:, None] - q).abs().amax(-1) < _SAME)
+    kept = torch.nonzero(~alike.tril(-1).any(1)).flatten()
+    place = torch.arange(len(kept)) - torch.searchsorted(owner[kept].contiguous(), owner[kept].contiguous())
+    kept = kept[place < _FOLLOWED]
+    return q[kept], owner[kept]
+
+
+def nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
+    """The same postures with joints turned by full turns to where they are nearest to the seed within their limits."""
+    turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
+    turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
+    inside = (turned >= torch.as_tensor(arm.lower)) & (turned <= torch.as_tensor(arm.upper))
+    return torch.where(inside, turned, q)
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """Ways that were followed from a posture at their grasp.
+
+    Attributes:
+        path: joint values at every waypoint.
+        lost: the waypoint nearest to the grasp that is not reached; -1 where all are.
+        hit: what jumps or is hit where all are reached; empty where the way can be gone.
+    """
+
+    path: Float[Tensor, "postures way joints"]
+    lost: list[int]
+    hit: list[str]
+
+    def good(self, row: int) -> bool:
+        """Whether a way can be gone."""
+        return self.lost[row] < 0 and not self.hit[row]
+
+
+def _followed(
+    task: ArmTask, ways: SE3, q: Float[Tensor, "postures joints"], joints: Float[Tensor, "postures hand_joints"]
+) -> _Followed:
+    """Follow each way from the posture at its grasp, with the hand's joints as they are at the pregrasp."""
+    count, length = ways.translation.shape[:2]
+    if not count:
+        return _Followed(q.new_zeros(0, length, q.shape[1]), [], [])
+    target = SE3(ways.rotation.flatten(0, 1), ways.translation.flatten(0, 1))
+    solved = solve(task.arm, target, q.repeat_interleave(length, 0), _WAY_STEPS)
+    path, reached = solved.q.unflatten(0, (count, length)), solved.reached.unflatten(0, (count, length))
+    off = torch.where(reached, length, (torch.arange(length) - STAGE_ROWS[2]).abs())
+    lost = torch.where(reached.all(1), -1, off.argmin(1)).tolist()
+    jumps, hits = path.diff(dim=1).abs().amax(1), _hits_on_way(task, path, joints)
+    told: list[str] = []
+    for row in range(count):
+        worst, joint = int(hits.depth[row].argmax()), int(jumps[row].argmax())
+        hit = hits.what[worst] if hits.depth[row, worst] > 0 else ""
+        told.append(f"with a jump of {task.arm.joint_names[joint]}" if jumps[row, joint] > LARGEST_JUMP else hit)
+    return _Followed(path, lost, told)
+
+
+def _hits_on_way(
+    task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
+) -> Hits:
+    """The deepest hits of each way: of the scene at every waypoint, of itself and the hand at its stages."""
+    count = len(path)
+    scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
+    stages = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))
+    own = hits_of_self(task.arm, stages)
+    hand = hits_of_hand(task.arm, task.hand, stages, joints.repeat_interleave(len(STAGE_ROWS), 0))
+    return joined(*(Hits(hits.depth.unflatten(0, (count, -1)).amax(1), hits.what) for hits in (scene, own, hand)))

@@ -1,0 +1,212 @@
+"""What an arm costs and buys: inverse kinematics by itself, and requests with and without the filter by reach.
+
+Things stand or lie on a table; the arm's base stands 40 to 80 cm away in a random direction, turned at random. Without
+the filter the verified grasps that come back are asked afterwards whether the arm reaches them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from graspd_core.arms.arm_file import arm_names, load_arm
+from graspd_core.arms.arm_paths import arm_paths
+from graspd_core.bench.measurements.arm_poses import measure_arm
+from graspd_core.bench.object_case import ObjectCase
+from graspd_core.bench.report import markdown_table
+from graspd_core.bench.study import Case, Record, Request, Sections, find_objects
+from graspd_core.hands.model import HandModel
+from graspd_core.methods.restrictions import BoundRestriction, Refusal
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.planning.reach import Reach
+from graspd_core.scene.scene import Scene, build_scene
+from graspd_core.se3 import axis_rotation
+from graspd_core.types import ArmPath, Grasp, Plane, Progress, TriangleMesh
+
+# Authored shapes that are tried in two places each.
+SHAPES = ("box", "mug", "hammer", "bottle", "torus", "cylinder", "plate", "l_block", "sphere", "bowl")
+POSES = 1000
+NEAREST, FARTHEST = 0.4, 0.8
+
+
+@dataclass(frozen=True)
+class ArmCase(Case):
+    """Inverse kinematics of `poses` that an arm reaches."""
+
+    arm: str
+    poses: int
+
+
+@dataclass(frozen=True)
+class ReachCase(ObjectCase):
+    """A request for `count` grasps of a thing on a table, with an arm; the seed draws where both are."""
+
+    arm: str = ""
+
+    def place(self) -> tuple[HandModel, Scene, Reach]:
+        """The hand, the thing as it stands or lies, and the arm."""
+        rng = np.random.default_rng((self.seed, sum(self.object.encode())))
+        hand, scene = self.load()
+        side = axis_rotation(np.eye(3)[int(rng.integers(2))], float(rng.choice([0.0, np.pi / 2])))
+        vertices = scene.object.mesh.vertices @ side.T
+        vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))
+        support = Plane(np.array([0.0, 0.0, 1.0]), float(vertices[:, 2].min()))
+        mesh = TriangleMesh(vertices, scene.object.mesh.faces)
+        scene = build_scene(mesh, source=self.object, resolution=self.config.resolution, support=support)
+        away, where, turn = rng.uniform(NEAREST, FARTHEST), *rng.uniform(-np.pi, np.pi, 2)
+        base = (float(away * np.cos(where)), float(away * np.sin(where)), support.offset)
+        quaternion = (float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2)))
+        return hand, scene, Reach(load_arm(self.arm), base, quaternion)
+
+
+def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
+    """Every arm alone, and every arm at every thing."""
+    arms = [ArmCase(arm, 256 if request.quick else POSES) for arm in arm_names()]
+    things = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
+    seeds = request.seeds or ((0,) if request.objects else (0, 1))
+    cases = [
+        ReachCase(thing, request.preset(), request.hand or "allegro_right", seed, request.count or 4, arm)
+        for thing in things
+        for seed in seeds
+        for arm in arm_names()
+    ]
+    return (*arms[:1], *cases[:1]) if request.quick else (*arms, *cases)
+
+
+def run_reach(case: ArmCase | ReachCase) -> Record:
+    """What the case asks for."""
+    return measure_arm(load_arm(case.arm), case.poses) if isinstance(case, ArmCase) else _run_request(case)
+
+
+def _run_request(case: ReachCase) -> Record:
+    """The request with the filter, and without; both on libraries and caches in use."""
+    hand, scene, reach = case.place()
+    request: dict[str, Any] = {"count": case.count, "seed": case.seed, "preset": case.config, "measure": False}
+    plan_grasps(scene, hand, count=1, measure=False, restrictions=[reach])
+    timed = _Timed(reach, [])
+    plain = _Found([])
+    plan_grasps(scene, hand, **request, progress=plain)
+    filtered = _Found(timed.seconds)
+    result = plan_grasps(scene, hand, **request, progress=filtered, restrictions=[timed])
+    task = reach.bind(scene, hand).task
+    reached = [isinstance(path, ArmPath) for path in arm_paths(task, [grasp for _, _, grasp in plain.found])]
+    return {
+        "plain": {
+            "verified": len(reached),
+            "reached": sum(reached),
+            "best": bool(reached and reached[0]),
+            "first_s": next((at for (at, *_), good in zip(plain.found, reached, strict=True) if good), None),
+        },
+        "filtered": {
+            "verified": len(filtered.found),
+            "first_s": filtered.found[0][0] if filtered.found else None,
+            "filter_s": filtered.found[0][1] if filtered.found else sum(timed.seconds),
+            "refused": dict(result.refused),
+        },
+    }
+
+
+class _Found:
+    """Notes each verified grasp, the CPU seconds until it came, and those of them that the filter took."""
+
+    def __init__(self, seconds: Sequence[float]) -> None:
+        self.found: list[tuple[float, float, Grasp]] = []
+        self._seconds, self._began = seconds, time.process_time()
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.found is not None:
+            self.found.append((time.process_time() - self._began, sum(self._seconds), progress.found))
+
+
+@dataclass(frozen=True, eq=False)
+class _Timed(BoundRestriction):
+    """A reach, and the CPU seconds of each call to it."""
+
+    reach: Any
+    seconds: list[float]
+
+    def bind(self, scene: Scene, hand: HandModel) -> _Timed:
+        return _Timed(self._timed(self.reach.bind, scene, hand), self.seconds)
+
+    def starts(self, positions: np.ndarray, quaternions: np.ndarray, joints: np.ndarray) -> np.ndarray:
+        return self._timed(self.reach.starts, positions, quaternions, joints)
+
+    def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
+        return self._timed(self.reach.admit, grasps)
+
+    def _timed(self, call: Any, *values: Any) -> Any:
+        began = time.thread_time()
+        try:
+            return call(*values)
+        finally:
+            self.seconds.append(time.thread_time() - began)
+
+
+def came(record: Record) -> str:
+    """What came of a case, in a few words."""
+    if "own" in record:
+        return f"{record['own']['reached']:.1%} of the poses reached"
+    return f"{record['filtered']['verified']} verified in reach, without the filter {record['plain']['reached']}"
+
+
+def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Both tables as Markdown."""
+    whole = [record for record in records if not record["error"]]
+    alone, asked = ([r for r in whole if key in r] for key in ("own", "filtered"))
+    return {
+        "inverse-kinematics": [_alone_table(alone)] if alone else [],
+        "reach": [_asked_table(asked), _reasons(asked)] if asked else [],
+    }
+
+
+def _alone_table(records: Sequence[Record]) -> str:
+    headings = ["arm", "solver", "reached", "CPU ms a pose"]
+    rows = [
+        [record["arm"], solver, f"{record[key]['reached']:.1%}", f"{record[key]['ms']:.2f}"]
+        for record in records
+        for key, solver in (("own", "graspd"), ("library", "pytorch-kinematics"))
+        if record[key]
+    ]
+    return markdown_table(headings, rows)
+
+
+def _asked_table(records: Sequence[Record]) -> str:
+    headings = ["arm", "requests", "filter", "with a verified grasp in reach", "the best one is", "CPU s to the first"]
+    headings += ["filter's share of that time"]
+    rows: list[list[str]] = []
+    for arm in sorted({record["arm"] for record in records}):
+        mine = [record for record in records if record["arm"] == arm]
+        plain, filtered = ([record[key] for record in mine] for key in ("plain", "filtered"))
+        shares = [one["filter_s"] / one["first_s"] for one in filtered if one["verified"]]
+        some, best = sum(one["reached"] > 0 for one in plain), sum(one["best"] for one in plain)
+        good = sum(one["verified"] > 0 for one in filtered)
+        share = f"{median(shares):.1%}, at most {max(shares):.1%}" if shares else "–"
+        rows.append([arm, str(len(mine)), "without", str(some), str(best), _seconds(plain), "–"])
+        rows.append(["", "", "with", str(good), str(good), _seconds(filtered), share])
+    return markdown_table(headings, rows)
+
+
+def _seconds(ones: Sequence[Record]) -> str:
+    known = [one["first_s"] for one in ones if one["first_s"] is not None]
+    return f"{median(known):.2f}" if known else "–"
+
+
+def _reasons(records: Sequence[Record]) -> str:
+    """How many candidates were refused, and the kinds of reason."""
+    kinds: dict[str, int] = {}
+    for record in records:
+        for reason, count in record["filtered"]["refused"].items():
+            kind = next((kind for kind in _KINDS if kind in reason), reason)
+            kinds[kind] = kinds.get(kind, 0) + count
+    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+    return f"Refused before any trial: {told or 'none'}."
+
+
+# What reasons have in common, whatever link or joint they name.
+_KINDS = ("limit on the way", "limit", "in the table", "in the object", "against the hand", "against", "jump")

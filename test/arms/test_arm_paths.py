@@ -1,0 +1,194 @@
+"""Ways of an arm through grasps: what they promise, measured anew, and why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from graspd_core import load_hand, load_scene, make_shape
+from graspd_core.arms.arm import Arm, arm_links, tip_hand
+from graspd_core.arms.arm_collision import hits_of_hand, hits_of_scene, hits_of_self, hits_of_support
+from graspd_core.arms.arm_paths import LARGEST_JUMP, ArmTask, arm_paths, make_task
+from graspd_core.arms.capsules import placed
+from graspd_core.arms.hand_way import LIFT, RETREAT, STAGE_ROWS, hand_ways
+from graspd_core.arms.start_table import random_postures
+from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import build_sdf
+from graspd_core.methods import obstacle_distance
+from graspd_core.scene.scene import Obstacle, Scene
+from graspd_core.se3 import SE3, quaternion_from_rotation
+from graspd_core.types import ARM_STAGES, ArmPath, Grasp, Plane, Posture, TriangleMesh
+
+
+@pytest.fixture(scope="session")
+def hand() -> HandModel:
+    return load_hand("barrett_like", candidates=100)
+
+
+@pytest.fixture(scope="session")
+def table() -> Scene:
+    """A box on a table."""
+    scene = load_scene("shape:box")
+    return replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min())))
+
+
+def base_at(x: float, y: float, z: float) -> SE3:
+    return SE3(torch.eye(3, dtype=torch.float64), torch.tensor([x, y, z], dtype=torch.float64))
+
+
+def from_above(hand: HandModel, height: float, turn: float = 0.0) -> Grasp:
+    """A hand that comes down along z to `height` over the origin, turned about z."""
+    down = np.array([[np.cos(turn), np.sin(turn), 0], [np.sin(turn), -np.cos(turn), 0], [0, 0, -1.0]])
+    quaternion = quaternion_from_rotation(torch.as_tensor(down)).numpy()
+    before, there = (Posture(np.array([0.0, 0.0, z]), quaternion, hand.open_posture) for z in (height + 0.03, height))
+    return Grasp(before, there, there)
+
+
+def task_of(arm: Arm, hand: HandModel, scene: Scene, away: float) -> ArmTask:
+    support = scene.support
+    return make_task(arm, hand, scene, base_at(-away, 0.0, 0.0 if support is None else support.offset))
+
+
+def test_the_way_of_a_hand_is_that_of_the_trial(hand: HandModel):
+    """It retreats as far as the trials come from; rows of the stages are where the postures say."""
+    assert obstacle_distance.RETREAT == RETREAT
+    grasp = from_above(hand, 0.2, 0.5)
+    way = hand_ways([grasp], hand.approach, np.array([0.0, 0.0, 1.0]))
+    heights = way.translation[0, list(STAGE_ROWS), 2].tolist()
+    assert heights == pytest.approx([0.23 + RETREAT, 0.23, 0.2, 0.2 + LIFT])
+    assert way.translation.diff(dim=1).norm(dim=-1).max() < 0.025
+    again = replace(grasp.grasp, quaternion_wxyz=-grasp.grasp.quaternion_wxyz)
+    other = hand_ways([replace(grasp, grasp=again)], hand.approach, np.array([0.0, 0.0, 1.0]))
+    assert torch.allclose(other.rotation, way.rotation)
+
+
+@pytest.mark.parametrize("away", [0.45, 0.6])
+def test_a_way_goes_where_the_hand_goes_within_limits_without_jump_or_hit(
+    arm: Arm, hand: HandModel, table: Scene, away: float
+):
+    grasps = [from_above(hand, 0.2, turn) for turn in np.linspace(-3, 3, 7)]
+    task = task_of(arm, hand, table, away)
+    found = arm_paths(task, grasps)
+    assert sum(isinstance(path, ArmPath) for path in found) >= 6
+    for grasp, path in zip(grasps, found, strict=True):
+        if not isinstance(path, ArmPath):
+            continue
+        q = torch.as_tensor(path.positions)
+        assert (path.joint_names, path.stages) == (arm.joint_names, STAGE_ROWS)
+        assert (path.positions >= arm.lower).all()
+        assert (path.positions <= arm.upper).all()
+        assert np.abs(np.diff(path.positions, axis=0)).max() <= LARGEST_JUMP
+        links = arm_links(arm, q)
+        carried = task.base.compose(links[:, arm.tip].compose(tip_hand(arm, hand)))
+        wanted = hand_ways([grasp], hand.approach, task.up)[0]
+        assert torch.allclose(carried.translation, wanted.translation, atol=2e-4)
+        assert torch.allclose(carried.rotation, wanted.rotation, atol=2e-3)
+        assert np.array_equal(path.at("grasp"), path.positions[STAGE_ROWS[2]])
+        joints = torch.as_tensor(hand.open_posture).expand(len(q), -1)
+        assert (hits_of_scene(arm, table, task.base, links).depth <= 0).all()
+        stages = links[list(STAGE_ROWS)]
+        assert (hits_of_self(arm, stages).depth <= 0).all()
+        assert (hits_of_hand(arm, hand, stages, joints[: len(STAGE_ROWS)]).depth <= 0).all()
+    assert ARM_STAGES == ("retreat", "pregrasp", "grasp", "lift")
+
+
+def test_answers_do_not_depend_on_who_else_is_asked(ur: Arm, hand: HandModel, table: Scene):
+    grasps = [from_above(hand, 0.2, turn) for turn in (0.0, 1.0, 2.0)]
+    task = task_of(ur, hand, table, 0.5)
+    together, alone = arm_paths(task, grasps), [arm_paths(task, [grasp])[0] for grasp in grasps]
+    for a, b in zip(together, alone, strict=True):
+        assert isinstance(a, ArmPath)
+        assert isinstance(b, ArmPath)
+        assert np.allclose(a.positions, b.positions, atol=1e-6)
+    assert arm_paths(task, []) == []
+
+
+def reason(task: ArmTask, grasp: Grasp) -> str:
+    told = arm_paths(task, [grasp])[0]
+    assert isinstance(told, str)
+    return told
+
+
+def test_a_refusal_names_what_is_in_the_way(ur: Arm, hand: HandModel, table: Scene, tmp_path: Path):
+    above = from_above(hand, 0.2)
+    assert reason(task_of(ur, hand, table, 1.6), above) == "farther than the arm reaches"
+    # From below, the wrist must be where the table is.
+    below = replace(above, **{key: _upside_down(getattr(above, key)) for key in ("pregrasp", "grasp", "squeeze")})
+    assert reason(task_of(ur, hand, table, 0.5), below).endswith("in the table")
+    # A column that stands where the arm must pass; the hand has room.
+    column = make_shape("cylinder")
+    low, high = column.vertices.min(0), column.vertices.max(0)
+    scaled = TriangleMesh((column.vertices - 0.5 * (low + high)) / (high - low) * [0.1, 0.4, 1.5], column.faces)
+    placed_at = TriangleMesh(scaled.vertices + np.array([-0.25, 0.0, 0.0]), scaled.faces)
+    scene = replace(table, obstacles=(Obstacle(placed_at, build_sdf(placed_at, resolution=32)),))
+    assert reason(task_of(ur, hand, scene, 0.5), above).endswith("in an obstacle")
+
+
+def test_a_limit_in_the_way_is_named(ur: Arm, hand: HandModel, table: Scene):
+    """All joints but one as free as they are: where that one cannot turn, it is named."""
+    task = task_of(ur, hand, table, 0.5)
+    path = arm_paths(task, [from_above(hand, 0.2)])[0]
+    assert isinstance(path, ArmPath)
+    lower, upper = ur.lower.copy(), ur.upper.copy()
+    lower[4], upper[4] = -0.3, 0.3
+    narrow = replace(ur, lower=lower, upper=upper, seed=np.clip(ur.seed, lower, upper))
+    assert reason(task_of(narrow, hand, table, 0.5), from_above(hand, 0.2)) == "beyond wrist_2_turn's limit"
+
+
+def _upside_down(posture: Posture) -> Posture:
+    w, x, y, z = posture.quaternion_wxyz
+    # Times a half turn about x.
+    quaternion = np.array([-x, w, z, -y])
+    return replace(posture, position=posture.position * [1, 1, -1], quaternion_wxyz=quaternion)
+
+
+def test_depths_are_those_of_dense_points(arm: Arm, table: Scene):
+    """Depth in the support: that of the capsules' surfaces. Depth in a solid: never less than that of their points."""
+    links = arm_links(arm, random_postures(arm, 20, torch.Generator().manual_seed(5)))
+    base = base_at(-0.3, 0.1, 0.05)
+    start, end, radius = placed(arm.capsules, links)
+    ball = surface_samples(make_shape("sphere"), 400, seed=0)[0]
+    ball = torch.as_tensor(ball / np.linalg.norm(ball, axis=1, keepdims=True))
+    shares = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
+    along = start[:, :, None] + shares * (end - start)[:, :, None]
+    surface = along[:, :, :, None] + radius[:, None, None, None] * ball
+    world = surface + base.translation
+    assert table.support is not None
+    deepest = (table.support.offset - world[..., 2]).amax((2, 3))
+    hits = hits_of_support(arm, table, base, (start, end))
+    group = arm.chain.link_group[arm.capsules.link]
+    held = np.flatnonzero((group != 0) & (group != arm.chain.link_group[arm.moved_link[0]]))
+    assert torch.allclose(hits.depth, deepest[:, held], atol=2e-3)
+    assert (hits.depth >= deepest[:, held] - 1e-9).all()
+    # A tall box as an obstacle, whose distance is known in closed form.
+    half, at = torch.tensor([0.1, 0.15, 0.5], dtype=torch.float64), torch.tensor([0.2, 0.0, 0.3])
+    box = make_shape("box")
+    low, high = box.vertices.min(0), box.vertices.max(0)
+    corners = (box.vertices - 0.5 * (low + high)) / (high - low) * 2 * half.numpy() + at.numpy()
+    mesh = TriangleMesh(corners, box.faces)
+    scene = replace(table, support=None, obstacles=(Obstacle(mesh, build_sdf(mesh, resolution=48)),))
+    off = (world - at).abs() - half
+    distance = off.clamp_min(0).norm(dim=-1) + off.amax(-1).clamp_max(0)
+    depth = (-distance).amax((2, 3))[:, np.flatnonzero(group != 0)]
+    found = hits_of_scene(arm, scene, base, links)
+    named = [k for k, what in enumerate(found.what) if what.endswith("an obstacle")]
+    hit = depth > 0.005
+    assert hit.any()
+    assert (found.depth[:, named][hit] > 0).all()
+    clear = depth < -0.03
+    assert (found.depth[:, named][clear] < 0).all()
+
+
+def test_what_it_keeps_of_a_hand_still_carries_gradients(ur: Arm, table: Scene):
+    """Constants of a hand are kept for all who ask, those who want a gradient too."""
+    hand = load_hand("barrett_like", candidates=50)
+    assert isinstance(arm_paths(task_of(ur, hand, table, 0.5), [from_above(hand, 0.2)])[0], ArmPath)
+    q = torch.as_tensor(hand.open_posture)[None].requires_grad_()
+    forward(make_kinematics(hand, dtype=torch.float64), q).translation.sum().backward()
+    assert q.grad is not None
