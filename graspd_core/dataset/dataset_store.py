@@ -93,8 +93,12 @@ class DatasetStore:
             from pyarrow import ArrowException
             from pyarrow.fs import FileSystem
 
+            # One request a file, where pyarrow would make three.
+            once = "allow_delayed_open=true"
+            sign = "&" if "?" in self.where else "?"
+            address = f"{self.where}{sign}{once}" if self.where.startswith("s3://") else self.where
             try:
-                self._system = FileSystem.from_uri(self.where)
+                self._system = FileSystem.from_uri(address)
             except (ArrowException, OSError, ValueError) as error:
                 raise StorageError(f"{self.shown}: {error}; valid: a directory, s3://bucket/path, …") from None
         return self._system

@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ _OBJECT_STORE = 256 * 2**20
 _RETRIES = 4
 # Loopback; of 127.0.0.1 Ray would make the machine's address in its network.
 _LOOPBACK = "127.0.0.2"
+# Begin of the name of Ray's own folder; the number of the driver's process follows.
+_FOLDER = "graspd-ray-"
 
 
 @contextmanager
@@ -38,11 +41,12 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
     """
     settings = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     if address is None:
-        settings |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        settings |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
+        _remove_abandoned(folder or Path(tempfile.gettempdir()))
     before = {name: os.environ.get(name) for name in settings}
     os.environ.update(settings)
     # Short: the paths of sockets in it may have 107 characters.
-    own = Path(tempfile.mkdtemp(prefix="graspd-ray-", dir=folder)) if address is None else None
+    own = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-", dir=folder)) if address is None else None
     try:
         ray = _ray()
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -62,6 +66,20 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
             os.environ.pop(name) if value is None else os.environ.update({name: value})
         if own is not None:
             shutil.rmtree(own, ignore_errors=True)
+
+
+@lru_cache
+def _token() -> str:
+    """Who knows it may give commands to the Ray of this process, which reads it once: a second Ray has the same."""
+    return secrets.token_hex(32)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove what drivers left that were killed: folders that name a process which is no more."""
+    for path in folder.glob(f"{_FOLDER}*-*"):
+        process = path.name.removeprefix(_FOLDER).partition("-")[0]
+        if process.isdigit() and not Path(f"/proc/{process}").exists() and Path("/proc/self").exists():
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _ray() -> Any:

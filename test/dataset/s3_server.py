@@ -27,7 +27,7 @@ class Server:
 @contextmanager
 def s3_server() -> Iterator[Server]:
     """The server, with an empty bucket."""
-    from moto.server import DomainDispatcherApplication, create_backend_app
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import WSGIRequestHandler, make_server
 
     class Quiet(WSGIRequestHandler):

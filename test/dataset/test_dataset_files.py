@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from small_dataset import make_here
 
-from graspd_core.dataset.blocks import Block
+from graspd_core.dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_core.dataset.dataset_stats import stats_of, tables_of
 from graspd_core.dataset.dataset_store import DatasetStore, key_of
 from graspd_core.dataset.merge_datasets import merge, sample
@@ -151,8 +153,8 @@ def test_others_read_it_in_one_line(made: DatasetStore):
     polar = pl.read_parquet(f"{where}/**/*.parquet", hive_partitioning=True)
     assert polar.height == rows
     assert polar.filter(pl.col("verdict") == "verified").height == 4
-    duck = duckdb.sql(f"select hand, count(*), max(squeeze_position[1]) from '{where}/*/*/*.parquet' group by hand")
-    assert duck.fetchall()[0][:2] == ("parallel_gripper", rows)
+    asked = f"select hand, count(*), max(squeeze_position[1]) from '{where}/*/*/*.parquet' group by hand"
+    assert duckdb.execute(asked).fetchall()[0][:2] == ("parallel_gripper", rows)
     hugging = datasets.load_dataset(
         "parquet", data_files=f"{where}/*/*/*.parquet", split="train", cache_dir=f"{made.where}-cache"
     )
@@ -179,3 +181,16 @@ def test_wrong_words_are_one_line(words: list[str], told: str, graspd: Run, caps
     error = capsys.readouterr().err
     assert told in error
     assert not list(tmp_path.iterdir())
+
+
+def test_the_example_trains_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    store = DatasetStore(str(tmp_path))
+    request = DatasetRequest(
+        ("shape:sphere", "shape:box"), hands=("parallel_gripper",), per_object=3, preset="fast", measure="none"
+    )
+    make_here(blocks_of(request), store)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    assert importlib.import_module("train_on_dataset").main([store.where, "parallel_gripper", "2"]) == 0
+    told = capsys.readouterr().out
+    assert "of 1 objects held out" in told
+    assert "of the best half by the network" in told

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import pickle
 import resource
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 from s3_server import Server, s3_server
 
 from graspd_core.dataset import dataset_store

@@ -17,10 +17,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from conftest import REQUEST, make_here
 from s3_server import s3_server
+from small_dataset import REQUEST, make_here
 
 from graspd_core.dataset.blocks import blocks_of
 from graspd_core.dataset.dataset_store import DatasetStore, key_of
@@ -69,7 +67,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
             start.family(process)  # type: ignore[attr-defined]
             process.kill()
         process.communicate()
-    _, left = psutil.wait_procs(family, timeout=60)
+    _, left = psutil.wait_procs(family, timeout=120)
     assert [process.cmdline() for process in left] == []
 
 
@@ -96,6 +94,16 @@ def test_a_run_on_this_machine_makes_what_blocks_make_alone(start: Start, made: 
     card = (tmp_path / "out" / "README.md").read_text()
     assert "graspd dataset shape:sphere --hands parallel_gripper --per-object 4" in card
     assert list(faults_of_dataset(store)) == []
+
+
+@pytest.mark.slow
+def test_ray_may_run_twice_in_a_process(start: Start):
+    program = (
+        "from graspd_core.dataset.ray_engine import ray_running\n"
+        "for _ in range(2):\n with ray_running(None, 1) as ray: print(ray.get(ray.remote(len).remote('abc')))\n"
+    )
+    output, errors = start("-c", program).communicate()
+    assert output == "3\n3\n", errors
 
 
 @pytest.mark.slow
