@@ -34,6 +34,6 @@ def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str
         cpu, size, tried = cpu + share * made.cpu, size + share * len(made.file), tried + share * made.rows
         told = f"{made.verified} of {made.rows} verified, {made.cpu:.1f} CPU s, {len(made.file) / 1024:.0f} kB"
         lines.append(f"{block.hand}: one block of {block.object.source}: {told}, {made.peak_mb:.0f} MB at the peak")
-    hours = f"{cpu / 3600:.2f} CPU hours, {cpu / 3600 / workers:.2f} hours on {workers} cores"
+    hours = f"{cpu / 3600:.3g} CPU hours, {cpu / 3600 / workers:.3g} hours on {workers} cores"
     lines.append(f"{len(blocks)} blocks, {sum(wanted.values())} grasps wanted, about {tried:.0f} tried: {hours}")
     return "\n".join([*lines, f"about {size / 2**20:.1f} MB"])

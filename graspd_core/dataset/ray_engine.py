@@ -6,6 +6,7 @@ import os
 import pickle
 import secrets
 import shutil
+import socket
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +26,8 @@ _OBJECT_STORE = 256 * 2**20
 _RETRIES = 4
 # Loopback; of 127.0.0.1 Ray would make the machine's address in its network.
 _LOOPBACK = "127.0.0.2"
+# Until a cluster has answered [s].
+_CONNECT = 10.0
 # Begin of the name of Ray's own folder; the number of the driver's process follows.
 _FOLDER = "graspd-ray-"
 
@@ -49,6 +52,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
     own = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-", dir=folder)) if address is None else None
     try:
         ray = _ray()
+        _refuse_silent(address)
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         if own is not None:
             options |= {"address": "local", "num_cpus": workers, "object_store_memory": _OBJECT_STORE}
@@ -66,6 +70,17 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
             os.environ.pop(name) if value is None else os.environ.update({name: value})
         if own is not None:
             shutil.rmtree(own, ignore_errors=True)
+
+
+def _refuse_silent(address: str | None) -> None:
+    """Refuse an address where nothing listens: Ray would wait for minutes and then end the process."""
+    host, _, port = (address or "").removeprefix("ray://").partition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), _CONNECT).close()
+    except OSError as error:
+        raise ConfigError(f"address: {address}: {error.strerror or error}; start one with: ray start --head") from None
 
 
 @lru_cache

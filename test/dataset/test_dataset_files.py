@@ -173,6 +173,10 @@ def test_others_read_it_in_one_line(made: DatasetStore):
         (["sample", "a", "--out", "x.csv"], ".parquet file"),
         (["merge", "a"], "--out is missing"),
         (["shape:box", "--out", "nowhere://x"], "nowhere://x"),
+        (
+            ["shape:box", "--out", "x", "--address", "127.0.0.1:9"],
+            "127.0.0.1:9: Connection refused; start one",
+        ),
     ],
 )
 def test_wrong_words_are_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path, monkeypatch):

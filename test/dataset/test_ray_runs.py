@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -100,7 +103,7 @@ def test_a_run_on_this_machine_makes_what_blocks_make_alone(start: Start, made: 
 def test_ray_may_run_twice_in_a_process(start: Start):
     program = (
         "from graspd_core.dataset.ray_engine import ray_running\n"
-        "for _ in range(2):\n with ray_running(None, 1) as ray: print(ray.get(ray.remote(len).remote('abc')))\n"
+        "for _ in range(2):\n with ray_running(None, 1) as ray: print(ray.get(ray.remote(lambda: 3).remote()))\n"
     )
     output, errors = start("-c", program).communicate()
     assert output == "3\n3\n", errors
@@ -167,6 +170,45 @@ def test_an_s3_server_that_refuses_one_request_in_ten(start: Start, many: dict[s
         assert list(faults_of_dataset(store)) == []
         # A block is one request: it is there whole or not at all.
         assert [r for r in server.requests if "PUT" in r and "grasps" in r and "partNumber" in r] == []
+
+
+@pytest.mark.slow
+def test_a_cluster_that_is_there_is_used_through_rays_client(
+    start: Start, made: DatasetStore, tmp_path: Path, monkeypatch
+):
+    with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
+        ports = [server.getsockname()[1] for server in (first, second)]
+    for name, value in {
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }.items():
+        monkeypatch.setenv(name, value)
+    options = [
+        f"--port={ports[0]}",
+        f"--ray-client-server-port={ports[1]}",
+        "--node-ip-address=127.0.0.2",
+        "--num-cpus=1",
+    ]
+    options += ["--include-dashboard=false", f"--object-store-memory={2**27}", "--block"]
+    with tempfile.TemporaryDirectory(prefix="graspd-head-") as folder:
+        head = start("-m", "ray.scripts.scripts", "start", "--head", *options, f"--temp-dir={folder}")
+        while not listens(ports[1]):
+            assert head.poll() is None, head.communicate()
+            time.sleep(0.1)
+        process = dataset(start, tmp_path / "out", "--per-object", "4", "--address", f"ray://127.0.0.1:{ports[1]}")
+        _, errors = process.communicate()
+        start.family(head)  # type: ignore[attr-defined]
+        head.terminate()
+        head.communicate()
+    assert process.returncode == 0, errors
+    assert files(DatasetStore(str(tmp_path / "out"))) == files(made)
+
+
+def listens(port: int) -> bool:
+    """Whether somebody listens at a port of this machine."""
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
 
 
 @pytest.fixture
