@@ -32,9 +32,9 @@ def add_command(commands: Any) -> None:
         "words",
         nargs="+",
         metavar="OBJECT",
-        help="shape:NAME, meshes or folders; or one of stats, validate, merge, sample and the data sets that are meant",
+        help="shape:NAME, meshes or folders; or stats, validate, merge, sample or export and the data sets meant",
     )
-    parser.add_argument("--out", default="", metavar="DIR|s3://…", help="the data set; of sample: a .parquet file")
+    parser.add_argument("--out", default="", metavar="DIR|s3://…", help="the data set; of sample a .parquet file")
     make = parser.add_argument_group("making one")
     make.add_argument("--hands", nargs="+", default=("allegro_right",), metavar="NAME|PATH")
     make.add_argument("--per-object", type=int, default=128, metavar="N", help="verified, by object, scale and hand")
@@ -57,6 +57,7 @@ def add_command(commands: Any) -> None:
     ray.add_argument("--retry-failed", action="store_true", help="try blocks and objects again that failed")
     ray.add_argument("--any-code", action="store_true", help="add to a data set that other code began")
     parser.add_argument("--count", type=int, default=1000, metavar="N", help="of sample: rows")
+    parser.add_argument("--to", default="isaac", metavar="FORMAT", help="of export: isaac or graspgen")
     parser.add_argument("--verdict", choices=("verified", "failed", "unverified"), default=None, help="of sample")
 
 
@@ -250,4 +251,14 @@ def _sample(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     return EXIT_OK
 
 
-_ACTIONS = {"stats": _stats, "validate": _validate, "merge": _merge, "sample": _sample}
+def _export(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
+    from graspd_core.dataset.export_grasps import export
+
+    if not options.out:
+        raise ConfigError("--out is missing: the folder that is written")
+    files, grasps = export(stores[0], options.to, Path(options.out))
+    print(f"{options.out}: {grasps} grasps in {files} files")
+    return EXIT_OK
+
+
+_ACTIONS = {"stats": _stats, "validate": _validate, "merge": _merge, "sample": _sample, "export": _export}

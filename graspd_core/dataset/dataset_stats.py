@@ -69,16 +69,15 @@ def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iter
 def stats_of(store: DatasetStore) -> DatasetStats:
     """Count. Raises FormatError: as `tables_of`."""
     stats, there = DatasetStats(), set[str]()
-    for _, content, table, told in tables_of(store, ("hand_name", "object_sha256", "verdict", "code", "trials")):
+    for path, content, table, told in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
         there.add(told["block"])
         stats.codes.update(table["code"].unique().to_pylist())
-        # A block is of one hand; one without a candidate names it in its path only.
-        for name in table["hand_name"].unique().to_pylist():
-            hand = stats.hands.setdefault(name, HandCount())
-            hand.blocks += 1
-            hand.size += len(content)
-            hand.verdicts.update(table["verdict"].to_pylist())
-            hand.objects.update(table["object_sha256"].unique().to_pylist())
+        # By its path: a block without a candidate is one too.
+        hand = stats.hands.setdefault(path.split("/")[1].removeprefix("hand="), HandCount())
+        hand.blocks += 1
+        hand.size += len(content)
+        hand.verdicts.update(table["verdict"].to_pylist())
+        hand.objects.update(table["object_sha256"].to_pylist())
         for trials in table["trials"].to_pylist():
             lost = next((trial for trial in trials if not trial["passed"]), None)
             if lost is not None:

@@ -162,6 +162,14 @@ def test_others_read_it_in_one_line(made: DatasetStore):
     assert hugging[0]["contacts"][0]["link"] == frame["contacts"][0][0]["link"]
 
 
+def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
+    _rewritten(copied, lambda t: t.slice(0, 0))
+    stats = stats_of(copied)
+    assert stats.hands["parallel_gripper"].blocks == 2
+    assert 0 < stats.rows < 4
+    assert list(faults_of_dataset(copied)) == []
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -1,0 +1,99 @@
+"""What others read: the same fingertips by MuJoCo's kinematics of the URDF, the same poses, the same object."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from small_dataset import make_here
+
+from graspd_core import load_hand, load_mesh
+from graspd_core.dataset.blocks import DatasetRequest, blocks_of
+from graspd_core.dataset.dataset_stats import tables_of
+from graspd_core.dataset.dataset_store import DatasetStore
+from graspd_core.hands.kinematics import link_poses
+
+
+@pytest.fixture(scope="module")
+def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
+    store = DatasetStore(str(tmp_path_factory.mktemp("allegro")))
+    request = DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")
+    make_here(blocks_of(request), store)
+    return store
+
+
+def rows_of(store: DatasetStore) -> list[dict]:
+    return [row for _, _, table, _ in tables_of(store) for row in table.to_pylist()]
+
+
+def mujoco_tips(urdf: str, position: list[float], orientation: dict, joints: dict[str, float]) -> dict[str, np.ndarray]:
+    """Where MuJoCo has the links of the hand in the object's frame [m]; joints by name."""
+    model = mujoco.MjModel.from_xml_path(urdf)  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    for name, value in joints.items():
+        data.joint(name).qpos = value
+    mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, np.array([orientation["w"], *orientation["xyz"]]))  # pyright: ignore[reportAttributeAccessIssue]
+    bodies = {model.body(index).name: data.xpos[index] for index in range(1, model.nbody)}
+    return {name: rotation.reshape(3, 3) @ there + position for name, there in bodies.items()}
+
+
+def test_isaac_grasps_stand_where_they_did(allegro: DatasetStore, tmp_path: Path, graspd):
+    assert graspd("dataset", "export", allegro.where, "--to", "isaac", "--out", tmp_path) == 0
+    (path,) = (tmp_path / "allegro_right").glob("*.yaml")
+    document = yaml.safe_load(path.read_text())
+    verified = [row for row in rows_of(allegro) if row["verdict"] == "verified"]
+    assert (document["format"], document["format_version"]) == ("isaac_grasp", 1.0)
+    assert len(document["grasps"]) == len(verified) == 8
+    hand = load_hand("allegro_right")
+    for row, grasp in zip(verified, document["grasps"].values(), strict=True):
+        assert list(grasp["pregrasp_cspace_position"].values()) == row["pregrasp_joint_positions"]
+        tips = mujoco_tips(hand.urdf, grasp["position"], grasp["orientation"], grasp["cspace_position"])
+        ours = link_positions(row)
+        shared = set(tips) & set(ours)
+        assert len(shared) >= 16
+        assert max(np.linalg.norm(tips[name] - ours[name]) for name in shared) < 1e-6
+
+
+def link_positions(row: dict) -> dict[str, np.ndarray]:
+    """Where graspd has the links in the object's frame [m]."""
+    hand = load_hand("allegro_right")
+    _, translations = link_poses(hand, np.array(row["grasp_joint_positions"]))
+    base = se3(row)
+    return {name: base[:3, :3] @ there + base[:3, 3] for name, there in zip(hand.link_names, translations, strict=True)}
+
+
+def se3(row: dict) -> np.ndarray:
+    """`T_object_hand` of a row, by MuJoCo."""
+    rotation, matrix = np.zeros(9), np.eye(4)
+    mujoco.mju_quat2Mat(rotation, np.array(row["grasp_quaternion_wxyz"]))  # pyright: ignore[reportAttributeAccessIssue]
+    matrix[:3, :3], matrix[:3, 3] = rotation.reshape(3, 3), row["grasp_position"]
+    return matrix
+
+
+def test_graspgen_gets_poses_failures_and_the_mesh(allegro: DatasetStore, tmp_path: Path, graspd):
+    assert graspd("dataset", "export", allegro.where, "--to", "graspgen", "--out", tmp_path) == 0
+    (path,) = (tmp_path / "allegro_right").glob("*.json")
+    document, rows = json.loads(path.read_text()), rows_of(allegro)
+    assert document["grasps"]["object_in_gripper"] == [row["verdict"] == "verified" for row in rows]
+    for row, matrix in zip(rows, np.array(document["grasps"]["transforms"]), strict=True):
+        assert np.allclose(matrix, se3(row), atol=1e-12)
+    mesh = load_mesh(tmp_path / document["object"]["file"])
+    assert path.stem == rows[0]["object_sha256"]
+    assert len(mesh.vertices) == len(rows_of_objects(allegro)[0]["vertices"])
+
+
+def rows_of_objects(store: DatasetStore) -> list[dict]:
+    import pandas as pd
+
+    return pd.read_parquet(f"{store.where}/objects").to_dict("records")
+
+
+def test_an_unknown_format_is_refused(allegro: DatasetStore, tmp_path: Path, graspd, capsys):
+    assert graspd("dataset", "export", allegro.where, "--to", "usd", "--out", tmp_path) == 2
+    assert "to: 'usd'; valid: isaac, graspgen" in capsys.readouterr().err
