@@ -57,7 +57,7 @@ def add_command(commands: Any) -> None:
     ray.add_argument("--retry-failed", action="store_true", help="try blocks and objects again that failed")
     ray.add_argument("--any-code", action="store_true", help="add to a data set that other code began")
     parser.add_argument("--count", type=int, default=1000, metavar="N", help="of sample: rows")
-    parser.add_argument("--to", default="isaac", metavar="FORMAT", help="of export: isaac or graspgen")
+    parser.add_argument("--to", default="isaac", metavar="FORMAT", help="of export: isaac, graspgen or dexgraspbench")
     parser.add_argument("--verdict", choices=("verified", "failed", "unverified"), default=None, help="of sample")
 
 
@@ -257,7 +257,7 @@ def _export(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     if not options.out:
         raise ConfigError("--out is missing: the folder that is written")
     files, grasps = export(stores[0], options.to, Path(options.out))
-    print(f"{options.out}: {grasps} grasps in {files} files")
+    print(f"{options.out}: {grasps} grasps of {files} pairs of hand and object")
     return EXIT_OK
 
 

@@ -1,4 +1,5 @@
-"""A data set in the files of others: isaac_grasp 1.0 (Isaac Sim, Isaac ROS) and the JSON that GraspGen trains on.
+"""A data set in the files of others: isaac_grasp 1.0 (Isaac Sim, Isaac ROS), the JSON that GraspGen trains on, and
+DexGraspBench's.
 
 Poses are those of the hand's base link in the object's frame, which is that of the mesh written beside: metres.
 """
@@ -15,32 +16,39 @@ import yaml
 
 from graspd_core.dataset.dataset_stats import tables_of
 from graspd_core.dataset.dataset_store import DatasetStore
+from graspd_core.dataset.dexgraspbench import obj_text, refuse_hand, write_dexgraspbench
 from graspd_core.dataset.parquet_files import read_parquet
 from graspd_core.errors import ConfigError
 from graspd_core.formats.grasps_json import save_text
+from graspd_core.types import TriangleMesh
 
 Row = dict[str, Any]
 
 
 def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
-    """Write a file for every hand and object, and the meshes; numbers of files and of grasps.
+    """Write files for every hand and object, and the meshes; numbers of such pairs and of grasps.
 
     Raises:
-        ConfigError: no such kind.
+        ConfigError: no such kind, or a hand that it does not know.
         FormatError: there is no data set, or a file is spoilt.
     """
-    if kind not in KINDS:
-        raise ConfigError(f"to: {kind!r}; valid: {', '.join(KINDS)}")
-    ending, keep, written = KINDS[kind]
+    if kind not in (*KINDS, DEXGRASPBENCH):
+        raise ConfigError(f"to: {kind!r}; valid: {', '.join((*KINDS, DEXGRASPBENCH))}")
+    ending, keep, written = KINDS.get(kind, ("", ("verified",), None))
     rows: dict[tuple[str, str], list[Row]] = {}
     for _, _, table, _ in tables_of(store, _COLUMNS):
         for row in table.to_pylist():
             if row["verdict"] in keep:
                 rows.setdefault((row["hand_name"], row["object_sha256"]), []).append(row)
+    for hand in {hand for hand, _ in rows} if written is None else ():
+        refuse_hand(hand)
     for (hand, target), own in rows.items():
+        if written is None:
+            write_dexgraspbench(own, _mesh(store, target), out)
+            continue
         mesh = out / "objects" / f"{target}.obj"
         if not mesh.exists():
-            save_text(mesh, _obj(store, target))
+            save_text(mesh, obj_text(_mesh(store, target)))
         save_text(out / hand / f"{target}{ending}", written(own, f"objects/{target}.obj"))
     return len(rows), sum(map(len, rows.values()))
 
@@ -79,8 +87,10 @@ KINDS: dict[str, tuple[str, tuple[str, ...], Callable[[Sequence[Row], str], str]
     "isaac": (".yaml", ("verified",), isaac_grasp),
     "graspgen": (".json", ("verified", "failed"), graspgen),
 }
-_COLUMNS = ("hand_name", "object_sha256", "verdict", "code", "joint_names", "grasp_position", "grasp_quaternion_wxyz")
-_COLUMNS += ("grasp_joint_positions", "pregrasp_joint_positions")
+DEXGRASPBENCH = "dexgraspbench"
+_PARTS = ("position", "quaternion_wxyz", "joint_positions")
+_COLUMNS = ("hand_name", "object_sha256", "mass", "verdict", "code", "joint_names")
+_COLUMNS += tuple(f"{stage}_{part}" for stage in ("pregrasp", "grasp", "squeeze") for part in _PARTS)
 
 
 def _matrix(position: Sequence[float], quaternion_wxyz: Sequence[float]) -> np.ndarray:
@@ -93,9 +103,7 @@ def _matrix(position: Sequence[float], quaternion_wxyz: Sequence[float]) -> np.n
     return matrix
 
 
-def _obj(store: DatasetStore, target: str) -> str:
+def _mesh(store: DatasetStore, target: str) -> TriangleMesh:
     path = f"objects/{target}.parquet"
-    mesh = read_parquet(store.read(path), path)[0].to_pylist()[0]
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh["vertices"]]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh["faces"]]
-    return "\n".join(lines) + "\n"
+    row = read_parquet(store.read(path), path)[0].to_pylist()[0]
+    return TriangleMesh(np.array(row["vertices"]), np.array(row["faces"]))

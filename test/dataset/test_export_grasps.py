@@ -96,4 +96,61 @@ def rows_of_objects(store: DatasetStore) -> list[dict]:
 
 def test_an_unknown_format_is_refused(allegro: DatasetStore, tmp_path: Path, graspd, capsys):
     assert graspd("dataset", "export", allegro.where, "--to", "usd", "--out", tmp_path) == 2
-    assert "to: 'usd'; valid: isaac, graspgen" in capsys.readouterr().err
+    assert "to: 'usd'; valid: isaac, graspgen, dexgraspbench" in capsys.readouterr().err
+
+
+def menagerie_like() -> str:
+    """An Allegro as Menagerie builds it: its names and frames, the palm turned in the frame of the qpos."""
+
+    def finger(name: str, place: str) -> str:
+        lengths, axes = ("0 0 0.0164", "0 0 0.054", "0 0 0.0384"), ("0 0 1", "0 1 0", "0 1 0", "0 1 0")
+        return chain(name, place, lengths, axes)
+
+    def chain(name: str, place: str, steps: tuple[str, ...], axes: tuple[str, ...]) -> str:
+        text, places = "", (place, *(f'pos="{step}"' for step in steps))
+        for number, (where, axis) in enumerate(zip(places, axes, strict=True)):
+            text += f'<body name="{name}{number}" {where}><joint name="{name}j{number}" axis="{axis}"/>'
+            text += '<geom size="0.005"/>'
+        return text + "</body>" * len(axes)
+
+    tilt, thumb = "0.0436194 0 0", 'pos="-0.0182 0.019333 -0.045987" quat="0.477714 -0.521334 -0.521334 -0.477714"'
+    fingers = [
+        finger("ff", f'pos="0 0.0435 -0.001542" quat="0.999048 -{tilt}"'),
+        finger("mf", 'pos="0 0 0.0007"'),
+        finger("rf", f'pos="0 -0.0435 -0.001542" quat="0.999048 {tilt}"'),
+        chain("th", thumb, ("-0.027 0.005 0.0399", "0 0 0.0177", "0 0 0.0514"), ("-1 0 0", "0 0 1", "0 1 0", "0 1 0")),
+    ]
+    palm = f'<body name="palm" quat="0 1 0 1"><geom size="0.01"/>{"".join(fingers)}</body>'
+    hand = f'<body name="hand"><freejoint/><geom size="0.01"/>{palm}</body>'
+    return f'<mujoco><compiler angle="radian"/><worldbody>{hand}</worldbody></mujoco>'
+
+
+def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_path: Path, graspd):
+    assert graspd("dataset", "export", allegro.where, "--to", "dexgraspbench", "--out", tmp_path) == 0
+    model = mujoco.MjModel.from_xml_string(menagerie_like())  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    verified = [row for row in rows_of(allegro) if row["verdict"] == "verified"]
+    files = sorted((tmp_path / "allegro_right").glob("*/*.npy"), key=lambda path: int(path.stem))
+    assert len(files) == len(verified)
+    for row, path in zip(verified, files, strict=True):
+        grasp = np.load(path, allow_pickle=True).item()
+        data.qpos[:] = grasp["grasp_qpos"]
+        mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+        ours = link_positions(row)
+        # The last link of every finger; a fingertip sits on it, fixed.
+        ends = {"ff3": "link_3.0", "mf3": "link_7.0", "rf3": "link_11.0", "th3": "link_15.0"}
+        assert max(np.linalg.norm(data.body(end).xpos - ours[link]) for end, link in ends.items()) < 1e-5
+        assert grasp["squeeze_qpos"].shape == grasp["pregrasp_qpos"].shape == (23,)
+    folder = tmp_path / grasp["obj_path"]
+    assert json.loads((folder / "info" / "simplified.json").read_text())["mass"] == 0.1
+    parts = [load_mesh(path) for path in (folder / "urdf" / "meshes").glob("convex_piece_*.obj")]
+    assert len(parts) > 3
+    whole = load_mesh(folder / "mesh" / "simplified.obj")
+    assert np.allclose(
+        np.ptp(np.concatenate([part.vertices for part in parts]), axis=0), np.ptp(whole.vertices, axis=0), atol=0.003
+    )
+
+
+def test_dexgraspbench_knows_its_hands_only(made: DatasetStore, tmp_path: Path, graspd, capsys):
+    assert graspd("dataset", "export", made.where, "--to", "dexgraspbench", "--out", tmp_path / "x") == 2
+    assert "hand 'parallel_gripper'; valid: allegro_right" in capsys.readouterr().err
