@@ -240,7 +240,8 @@ def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
 
 def _sample(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_core.dataset.merge_datasets import sample
-    from graspd_core.formats.grasps_json import check_writable, save_bytes
+    from graspd_core.formats.grasps_json import check_writable
+    from graspd_core.runtime.whole_files import save_bytes
 
     if not options.out.endswith(".parquet"):
         raise ConfigError(f"--out {options.out}: a .parquet file is written")

@@ -7,13 +7,14 @@ import tempfile
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from graspd_core.bench.result_store import code_version
 from graspd_core.bench.stopwatch import forget_peak, peak_mb
 from graspd_core.dataset.blocks import Block, DatasetObject
+from graspd_core.dataset.guarded_calls import MadeBlock, ReadyObject
 from graspd_core.dataset.parquet_files import parquet_bytes
 from graspd_core.dataset.record_schema import arrow_schema, object_schema
 from graspd_core.formats.grasps_json import grasp_figures
@@ -30,43 +31,6 @@ from graspd_core.types import Grasp, Verdict
 # Scenes and hands that a process keeps, so that consecutive blocks share what is built for them.
 _KEPT = 4
 _loaded: OrderedDict[str, Any] = OrderedDict()
-
-
-@dataclass(frozen=True)
-class ReadyObject:
-    """An object made ready: what every process that grasps it needs.
-
-    Attributes:
-        sha256: of its cleaned mesh.
-        file: bytes of its row in `objects/`.
-        shared: pickled scene and what was built for it: the distance grid, the convex parts.
-    """
-
-    sha256: str
-    file: bytes
-    shared: bytes
-
-
-@dataclass(frozen=True)
-class MadeBlock:
-    """A block's file and what it took.
-
-    Attributes:
-        object_sha256: of the cleaned mesh.
-        file: bytes of its Parquet file.
-        rows, verified: numbers of candidates.
-        failures: numbers of failed candidates by trial and kind of reason.
-        cpu: seconds of this process.
-        peak_mb: peak of its memory.
-    """
-
-    object_sha256: str
-    file: bytes
-    rows: int
-    verified: int
-    failures: dict[str, int]
-    cpu: float
-    peak_mb: float
 
 
 def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:

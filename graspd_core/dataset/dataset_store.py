@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from graspd_core.errors import GraspdError
-from graspd_core.formats.grasps_json import save_bytes
+from graspd_core.runtime.whole_files import save_bytes
 
 T = TypeVar("T")
 

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from graspd_core.errors import ConfigError
-from graspd_core.formats.grasps_json import save_bytes, save_text
+from graspd_core.formats.grasps_json import save_text
+from graspd_core.runtime.whole_files import save_bytes
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import object_parts
 from graspd_core.types import TriangleMesh

@@ -1,23 +1,19 @@
 """Blocks on a worker of Ray: the work in a child process with limits, its files written whole by the worker.
 
 What a block does, hang, crash, or fill memory, it does to the child; the worker writes down what it was. The worker
-itself needs neither torch nor MuJoCo.
+itself loads neither torch nor MuJoCo: what it hands on to the child is pickled.
 """
 
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from graspd_core.dataset.dataset_store import DatasetStore, block_path
 from graspd_core.runtime.worker_process import WorkerProcess
-
-if TYPE_CHECKING:
-    from graspd_core.dataset.block_rows import MadeBlock, ReadyObject
-    from graspd_core.dataset.blocks import Block, DatasetObject
-    from graspd_core.methods.plan_config import PlanConfig
 
 T = TypeVar("T")
 
@@ -60,33 +56,79 @@ class Report:
     peak_mb: float = 0.0
 
 
-def prepare_object(
-    thing: DatasetObject, content: bytes | None, config: PlanConfig, store: DatasetStore, limits: Limits
-) -> tuple[Report, bytes]:
+@dataclass(frozen=True)
+class ReadyObject:
+    """An object made ready: what every process that grasps it needs.
+
+    Attributes:
+        sha256: of its cleaned mesh.
+        file: bytes of its row in `objects/`.
+        shared: pickled scene and what was built for it: the distance grid, the convex parts.
+    """
+
+    sha256: str
+    file: bytes
+    shared: bytes
+
+
+@dataclass(frozen=True)
+class MadeBlock:
+    """A block's file and what it took.
+
+    Attributes:
+        object_sha256: of the cleaned mesh.
+        file: bytes of its Parquet file.
+        rows, verified: numbers of candidates.
+        failures: numbers of failed candidates by trial and kind of reason.
+        cpu: seconds of this process.
+        peak_mb: peak of its memory.
+    """
+
+    object_sha256: str
+    file: bytes
+    rows: int
+    verified: int
+    failures: dict[str, int]
+    cpu: float
+    peak_mb: float
+
+
+@dataclass(frozen=True)
+class Job:
+    """A block, or an object to make ready, as it goes to a worker.
+
+    Attributes:
+        key: of the block or the object.
+        asked: for the record of a failure, JSON-ready.
+        pickled: the block; of an object the pair of it and the settings.
+        hand: of a block, the name of its hand.
+    """
+
+    key: str
+    asked: dict[str, Any]
+    pickled: bytes
+    hand: str = ""
+
+
+def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits: Limits) -> tuple[Report, bytes]:
     """Make an object ready and keep its mesh; what its blocks share, or where it failed, the record and nothing."""
-    from graspd_core.dataset import block_rows
-
     try:
-        ready: ReadyObject = call_guarded(limits, block_rows.make_ready, thing, content, config)
+        ready = call_guarded(limits, ready_of, job.pickled, content)
     except Exception as error:
-        return failed_report(store, thing.key, {"object": thing.source, **thing.asked}, error), b""
+        return failed_report(store, job, error), b""
     store.write(f"objects/{ready.sha256}.parquet", ready.file)
-    return Report(thing.key), ready.shared
+    return Report(job.key), ready.shared
 
 
-def run_block(block: Block, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
+def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
     """Make a block and keep it."""
-    from graspd_core.dataset import block_rows
-
     try:
-        made: MadeBlock = call_guarded(limits, block_rows.make_block, block, hand, shared)
+        made = call_guarded(limits, block_of, job.pickled, hand, shared)
     except Exception as error:
-        return failed_report(
-            store, block.key, {"object": block.object.source, "hand": block.hand, **block.asked}, error
-        )
-    store.write(block_path(block.hand_name, made.object_sha256, block.key), made.file)
+        return failed_report(store, job, error)
+    store.write(block_path(job.hand, made.object_sha256, job.key), made.file)
     return Report(
-        block.key,
+        job.key,
         rows=made.rows,
         verified=made.verified,
         failures=made.failures,
@@ -96,13 +138,29 @@ def run_block(block: Block, hand: bytes, shared: bytes, store: DatasetStore, lim
     )
 
 
-def failed_report(store: DatasetStore, key: str, asked: dict[str, Any], error: BaseException) -> Report:
+def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:
+    """In the child: `make_ready` of an object and settings."""
+    from graspd_core.dataset.block_rows import make_ready
+
+    thing, config = pickle.loads(pickled)
+    return make_ready(thing, content, config)
+
+
+def block_of(pickled: bytes, hand: bytes, shared: bytes) -> MadeBlock:
+    """In the child: `make_block`."""
+    from graspd_core.dataset.block_rows import make_block
+
+    return make_block(pickle.loads(pickled), hand, shared)
+
+
+def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report:
     """Write down what failed."""
     from graspd_core.bench.result_store import failure
 
     record = failure(error, _KINDS.get(type(error), "raised"))
-    store.write(f"failed/{key}.json", (json.dumps({"key": key, "asked": asked, **record}, indent=1) + "\n").encode())
-    return Report(key, failed=record["failed"], error=record["error"])
+    told = {"key": job.key, "asked": job.asked, **record}
+    store.write(f"failed/{job.key}.json", (json.dumps(told, indent=1) + "\n").encode())
+    return Report(job.key, failed=record["failed"], error=record["error"])
 
 
 class _Child:

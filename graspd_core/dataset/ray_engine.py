@@ -16,7 +16,7 @@ from typing import Any
 
 from graspd_core.dataset.blocks import Block, DatasetObject
 from graspd_core.dataset.dataset_store import DatasetStore
-from graspd_core.dataset.guarded_calls import Limits, Report, prepare_object, run_block
+from graspd_core.dataset.guarded_calls import Job, Limits, Report, prepare_object, run_block
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.methods.plan_config import PlanConfig
 
@@ -112,6 +112,17 @@ def pickled_hand(block: Block) -> bytes:
     return pickle.dumps(load_hand(block.hand, candidates=block.config.problem.fine_candidates))
 
 
+def object_job(thing: DatasetObject, config: PlanConfig) -> Job:
+    """An object as a worker takes it."""
+    return Job(thing.key, {"object": thing.source, **thing.asked}, pickle.dumps((thing, config)))
+
+
+def block_job(block: Block) -> Job:
+    """A block as a worker takes it."""
+    asked = {"object": block.object.source, "hand": block.hand, **block.asked}
+    return Job(block.key, asked, pickle.dumps(block), block.hand_name)
+
+
 class RayEngine:
     """Submits blocks and objects to Ray, and says what came of them.
 
@@ -137,13 +148,13 @@ class RayEngine:
         """A handle of the report, and one of what the object's blocks share."""
         shape = thing.source.startswith("shape:")
         content = Path(thing.source).read_bytes() if self._ship and not shape else None
-        return tuple(self._prepare.remote(thing, content, config, self._store, self._limits))
+        return tuple(self._prepare.remote(object_job(thing, config), content, self._store, self._limits))
 
     def submit_block(self, block: Block, shared: Any) -> Any:
         """A handle of the report."""
         if block.hand_content not in self._hands:
             self._hands[block.hand_content] = self._ray.put(pickled_hand(block))
-        return self._run.remote(block, self._hands[block.hand_content], shared, self._store, self._limits)
+        return self._run.remote(block_job(block), self._hands[block.hand_content], shared, self._store, self._limits)
 
     def wait(self, handles: Sequence[Any], seconds: float) -> list[Any]:
         """Those that have ended, as soon as one has."""

@@ -17,6 +17,7 @@ from graspd_core.dataset import guarded_calls
 from graspd_core.dataset.blocks import Block
 from graspd_core.dataset.dataset_store import DatasetStore
 from graspd_core.dataset.guarded_calls import Limits, prepare_object, run_block
+from graspd_core.dataset.ray_engine import block_job, object_job
 from graspd_core.runtime.worker_process import WorkerProcess, resident_mb
 
 FILL = "x = [bytearray(b'1' * 2**20) for _ in range(4000)]"
@@ -83,7 +84,7 @@ def record(store: DatasetStore) -> dict:
 
 def test_an_object_that_cannot_be_used_is_written_down(store: DatasetStore, blocks: tuple[Block, ...]):
     thing = replace(blocks[0].object, source="broken.obj", content="0")
-    report, shared = prepare_object(thing, b"v 0 0 0\nv 1 0 0\n", blocks[0].config, store, Limits())
+    report, shared = prepare_object(object_job(thing, blocks[0].config), b"v 0 0 0\nv 1 0 0\n", store, Limits())
     assert (report.failed, shared) == ("raised", b"")
     assert "MeshError" in report.error
     assert record(store)["asked"]["object"] == "broken.obj"
@@ -92,13 +93,13 @@ def test_an_object_that_cannot_be_used_is_written_down(store: DatasetStore, bloc
 
 
 def test_a_block_that_hangs_is_written_down(store: DatasetStore, blocks: tuple[Block, ...]):
-    report = run_block(blocks[0], b"no hand", b"no scene", store, Limits(seconds=0.05))
+    report = run_block(block_job(blocks[0]), b"no hand", b"no scene", store, Limits(seconds=0.05))
     assert report.failed == record(store)["failed"] == "hung"
     assert not store.list("grasps")
 
 
 def test_a_block_that_raises_is_written_down_with_its_traceback(store: DatasetStore, blocks: tuple[Block, ...]):
-    report = run_block(blocks[0], b"no hand", b"no scene", store, Limits())
+    report = run_block(block_job(blocks[0]), b"no hand", b"no scene", store, Limits())
     assert report.failed == "raised"
     assert "UnpicklingError" in report.error
     assert "block_rows.py" in record(store)["traceback"]
@@ -110,7 +111,18 @@ def test_a_mesh_that_came_along_is_the_object(store: DatasetStore, blocks: tuple
     graspd_core.save_mesh(graspd_core.make_shape("box"), tmp_path / "box.ply")
     content = (tmp_path / "box.ply").read_bytes()
     thing = replace(blocks[0].object, source="there/box.ply", content="1")
-    report, shared = prepare_object(thing, content, blocks[0].config, store, Limits())
+    report, shared = prepare_object(object_job(thing, blocks[0].config), content, store, Limits())
     assert report.failed == ""
     assert len(store.list("objects")) == 1
     assert len(shared) > 100_000
+
+
+def test_a_worker_loads_neither_torch_nor_mujoco(tmp_path: Path):
+    program = (
+        "import sys\nfrom graspd_core.dataset.guarded_calls import Job, Limits, run_block\n"
+        "from graspd_core.dataset.dataset_store import DatasetStore\n"
+        "DatasetStore(sys.argv[1]).write('a', b'x')\n"
+        "print([name for name in ('torch', 'mujoco', 'scipy', 'open3d', 'pyarrow') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr

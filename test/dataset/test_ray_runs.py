@@ -27,7 +27,7 @@ from graspd_core.dataset.blocks import blocks_of
 from graspd_core.dataset.dataset_store import DatasetStore, key_of
 from graspd_core.dataset.validate_dataset import count_by_content, faults_of_dataset
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 WORDS = ["shape:sphere", "--hands", "parallel_gripper", "--block", "2", "--preset", "fast", "--measure", "none"]
 MANY = replace(REQUEST, per_object=40)
 
@@ -99,7 +99,6 @@ def test_a_run_on_this_machine_makes_what_blocks_make_alone(start: Start, made: 
     assert list(faults_of_dataset(store)) == []
 
 
-@pytest.mark.slow
 def test_ray_may_run_twice_in_a_process(start: Start):
     program = (
         "from graspd_core.dataset.ray_engine import ray_running\n"
@@ -109,7 +108,6 @@ def test_ray_may_run_twice_in_a_process(start: Start):
     assert output == "3\n3\n", errors
 
 
-@pytest.mark.slow
 def test_a_driver_that_is_killed_goes_on_where_it_was(start: Start, many: dict[str, bytes], tmp_path: Path):
     store = DatasetStore(str(tmp_path / "out"))
     process = dataset(start, store.where, "--per-object", "40")
@@ -128,7 +126,6 @@ def test_a_driver_that_is_killed_goes_on_where_it_was(start: Start, many: dict[s
     assert rows == different
 
 
-@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_done(start: Start, many: dict[str, bytes], tmp_path: Path):
     store = DatasetStore(str(tmp_path / "out"))
     process = dataset(start, store.where, "--per-object", "40")
@@ -142,7 +139,6 @@ def test_ctrl_c_keeps_what_is_done(start: Start, many: dict[str, bytes], tmp_pat
     assert files(store).items() <= many.items()
 
 
-@pytest.mark.slow
 def test_a_node_that_is_killed_loses_and_doubles_nothing(start: Start, many: dict[str, bytes], tmp_path: Path):
     process = start(Path(__file__).parent / "cluster_run.py", tmp_path / "out")
     store = DatasetStore(str(tmp_path / "out"))
@@ -155,7 +151,6 @@ def test_a_node_that_is_killed_loses_and_doubles_nothing(start: Start, many: dic
     assert files(store) == many
 
 
-@pytest.mark.slow
 def test_an_s3_server_that_refuses_one_request_in_ten(start: Start, many: dict[str, bytes]):
     with s3_server() as server:
         server.fail_each = 10
@@ -172,7 +167,6 @@ def test_an_s3_server_that_refuses_one_request_in_ten(start: Start, many: dict[s
         assert [r for r in server.requests if "PUT" in r and "grasps" in r and "partNumber" in r] == []
 
 
-@pytest.mark.slow
 def test_a_cluster_that_is_there_is_used_through_rays_client(
     start: Start, made: DatasetStore, tmp_path: Path, monkeypatch
 ):
@@ -223,7 +217,6 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", where], check=True)
 
 
-@pytest.mark.slow
 def test_a_full_disk_ends_the_run_in_one_line_and_what_is_there_stays(
     start: Start, many: dict[str, bytes], small_disk: Path
 ):
@@ -243,7 +236,6 @@ def test_a_full_disk_ends_the_run_in_one_line_and_what_is_there_stays(
     assert files(store) == many
 
 
-@pytest.mark.slow
 def test_a_poisoned_object_is_written_down_and_stops_nothing(start: Start, many: dict[str, bytes], tmp_path: Path):
     (tmp_path / "broken.obj").write_text("v 0 0 0\nv 1 0 0\n")
     store = DatasetStore(str(tmp_path / "out"))
