@@ -79,7 +79,8 @@ MAY_IMPORT = {
     "bench": BELOW_PLANNING | {"arms", "planning", "__init__"},
     "doctor": BELOW_PLANNING | {"planning", "__init__"},
     "viewer": BELOW_PLANNING | {"planning", "bench", "__init__"},
-    "cli": BELOW_PLANNING | {"arms", "planning", "bench", "doctor", "viewer", "__init__"},
+    "dataset": BELOW_PLANNING | {"planning", "bench", "__init__"},
+    "cli": BELOW_PLANNING | {"arms", "planning", "bench", "dataset", "doctor", "viewer", "__init__"},
 }
 # What the node sees: the public names, values, the viewer, and what only a process that serves needs.
 NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags", "viewer"}
@@ -97,9 +98,11 @@ CONFINED = {
     ),
     "matplotlib": ("graspd_core/bench/charts/",),
     "viser": ("graspd_core/viewer/",),
+    "ray": ("graspd_core/dataset/",),
+    "pyarrow": ("graspd_core/dataset/",),
 }
 HEAVY = {"open3d", "trimesh", "igl", "vhacdx", "mujoco", "matplotlib", "fast_simplification"}
-HEAVY |= {"pybullet", "viser"}
+HEAVY |= {"pybullet", "viser", "ray", "pyarrow"}
 ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
 
 

@@ -76,5 +76,5 @@ def test_somebody_elses_grasp(run: Run, capsys: pytest.CaptureFixture[str]):
 
 def test_examples_are_short():
     lengths = {path.name: len(path.read_text().splitlines()) for path in EXAMPLES.glob("*.py") if path.stem != "demo"}
-    assert len(lengths) == 9
+    assert len(lengths) == 10
     assert {name: n for name, n in lengths.items() if not 40 <= n <= 80} == {}

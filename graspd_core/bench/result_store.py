@@ -23,7 +23,7 @@ from graspd_core.formats.grasps_json import save_text
 
 FORMAT, VERSION = "graspd/bench", 2
 # Parts of the package that no figure depends on; of the benchmark itself, a study names its own.
-_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench", "viewer")
+_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench", "viewer", "dataset")
 
 
 def case_key(study: str, case: Case) -> str:

@@ -152,7 +152,7 @@ def thing_name(source: Any) -> str:
     return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
-def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
+def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
     """Shapes, mesh files and the meshes of folders. Raises MeshError: there is no such thing."""
     found: list[str] = []
     for source in sources:
@@ -165,10 +165,16 @@ def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
         else:
             object_hash(source)
             found.append(source)
+    return tuple(found)
+
+
+def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
+    """As `object_sources`; raises MeshError also where two of them go by the same name."""
+    found = object_sources(sources)
     names = [thing_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise MeshError(f"two objects are called {twice[0]!r}: results go by that name")
-    return tuple(found)
+    return found
 
 
 @lru_cache

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import tempfile
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +15,7 @@ from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.methods.plan_config import PlanConfig, to_mapping
 from graspd_core.metrics.metric_registry import METRICS
+from graspd_core.runtime.whole_files import save_bytes
 from graspd_core.scene.scene import ObjectModel
 from graspd_core.types import ARM_STAGES, ArmPath, Grasp, GraspResult, Posture
 
@@ -108,16 +108,7 @@ def save_result(
 
 def save_text(path: Path, text: str) -> None:
     """Write a file that appears whole or not at all; makes missing directories."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    save_bytes(path, text.encode())
 
 
 def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:

@@ -53,6 +53,20 @@ def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bo
     return arrays
 
 
+def contents() -> dict[str, Arrays]:
+    """What this process remembers in memory, by key."""
+    with _lock:
+        return dict(_memory)
+
+
+def supply(arrays: dict[str, Arrays]) -> None:
+    """Remember in memory what another process built."""
+    with _lock:
+        _memory.update(arrays)
+        while len(_memory) > CAPACITY:
+            _memory.popitem(last=False)
+
+
 def forget() -> None:
     """Empty the memory of this process; files stay."""
     with _lock:

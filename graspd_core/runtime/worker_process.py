@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import importlib
 import os
 import pickle
@@ -16,9 +17,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
 from typing import Any, TypeVar
 
 from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
@@ -26,18 +29,25 @@ from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
 T = TypeVar("T")
 
 # The child finds modules where this process does.
-_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r})"
+_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r}, {parent})"
+
+# How often a bounded call looks at the child's memory [s].
+_POLL = 0.1
+# prctl(2): the signal that a process gets when the thread that started it ends.
+_PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
     """Calls functions in a child process, which starts at once and ends with this one, however that ends.
 
     Calls come one at a time; before the first the child imports `modules`. A child that has died is replaced. Functions
-    must be importable by their names; arguments, results and errors are pickled.
+    must be importable by their names; arguments, results and errors are pickled. With `killed_with_thread` the child
+    is killed as soon as the thread that started it ends, even in the middle of a call (Linux); else behind its call.
     """
 
-    def __init__(self, *modules: str) -> None:
+    def __init__(self, *modules: str, killed_with_thread: bool = False) -> None:
         self._modules = modules
+        self._parent = os.getpid() if killed_with_thread else 0
         self._lock = threading.Lock()
         self._start()
 
@@ -68,6 +78,38 @@ class WorkerProcess:
             raise answer
         return answer
 
+    def bounded(self, seconds: float, most_mb: float, work: Callable[..., T], *arguments: Any) -> T:
+        """As a call, but done at most once, and ended with the child where it takes too long or too much memory.
+
+        Raises:
+            TimeoutError: no end after so many seconds.
+            MemoryError: the child's resident memory passed so many MB (looked at where there is a /proc).
+            ChildProcessError: the child died.
+        """
+        call = pickle.dumps((work, arguments, {}), pickle.HIGHEST_PROTOCOL)
+        with self._lock:
+            if self._process.poll() is not None:
+                self._start()
+            end = time.monotonic() + seconds
+            try:
+                self._pipe.send_bytes(call)
+                while not self._pipe.poll(_POLL):
+                    if time.monotonic() > end:
+                        raise TimeoutError(f"no end after {seconds:g} s")
+                    if (held := resident_mb(self._process.pid)) > most_mb:
+                        raise MemoryError(f"its process held {held:.0f} MB, more than {most_mb:g}")
+                told = self._pipe.recv_bytes()
+            except (EOFError, ConnectionError):
+                raise ChildProcessError(f"its process died with exit code {self._process.wait()}") from None
+            except BaseException:
+                self._process.kill()
+                self._process.wait()
+                raise
+        failed, answer = pickle.loads(told)
+        if failed:
+            raise answer
+        return answer
+
     def close(self) -> None:
         """End the child."""
         self._pipe.close()
@@ -78,7 +120,8 @@ class WorkerProcess:
         # Only the child's end of the pipe goes to the child, so that it reads an end of file when this process dies.
         self._pipe, theirs = Pipe()
         path = [entry for entry in sys.path if isinstance(entry, str)]
-        program = _CHILD.format(path=path, module=__name__, pipe=theirs.fileno(), modules=self._modules)
+        names = {"module": __name__, "modules": self._modules, "parent": self._parent}
+        program = _CHILD.format(path=path, pipe=theirs.fileno(), **names)
         # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
         # blocked, since it needs a second for its imports before it could ignore it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -110,8 +153,22 @@ def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
-def serve(number: int, modules: Iterable[str] = ()) -> None:
-    """Import modules, then do what comes through the pipe of this file descriptor, until its other end is closed."""
+def resident_mb(process: int) -> float:
+    """Resident memory of a process [MB]; 0 where it has ended or there is no /proc."""
+    try:
+        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
+    """Import modules, then do what comes through the pipe of this file descriptor, until its other end is closed.
+
+    Where a `parent` is named, its end ends this process at once.
+    """
+    if parent:
+        _end_with(parent)
     pipe = Connection(number)
     # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -133,6 +190,14 @@ def serve(number: int, modules: Iterable[str] = ()) -> None:
             return
         del answer
         trim_heap()
+
+
+def _end_with(parent: int) -> None:
+    """Have this process killed when the thread that started it ends; end it where that has happened already."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def _answer(call: bytes) -> bytes:

@@ -1,0 +1,86 @@
+"""What `graspd dataset` costs beside the grasps: `plan_grasps` in a loop against one worker and two.
+
+    dataset_overhead.py [--blocks 8] [--count 64] [--object shape:mug]
+
+The same blocks three ways, in turns. Wall-clock time says how it scales on a quiet machine; CPU time, of all processes
+that take part, Ray's own among them, says what it costs on any. Starting Ray and its workers is told apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from tempfile import TemporaryDirectory
+
+import psutil
+import torch
+
+from graspd_core import load_hand, load_scene, plan_grasps
+from graspd_core.bench.report import markdown_table
+from graspd_core.dataset.blocks import Block, DatasetRequest, blocks_of
+from graspd_core.dataset.dataset_store import DatasetStore
+from graspd_core.dataset.guarded_calls import Limits
+from graspd_core.dataset.ray_engine import RayEngine, ray_running
+from graspd_core.dataset.run_dataset import run_blocks
+from graspd_core.runtime.worker_process import resident_mb
+
+
+def loop(blocks: Sequence[Block]) -> tuple[float, float, int]:
+    """Wall and CPU seconds of `plan_grasps` over blocks, and the rows."""
+    scene, hand = load_scene(blocks[0].object.source), load_hand(blocks[0].hand)
+    plan_grasps(scene, hand, count=2, preset=blocks[0].config)
+    wall, cpu, rows = time.perf_counter(), time.process_time(), 0
+    for block in blocks:
+        rows += len(plan_grasps(scene, hand, count=block.count, seed=block.seed, preset=block.config).grasps)
+    return time.perf_counter() - wall, time.process_time() - cpu, rows
+
+
+def family_cpu() -> dict[int, float]:
+    """CPU seconds of this process and all below it, by process."""
+    taken = {}
+    for process in [psutil.Process(), *psutil.Process().children(recursive=True)]:
+        try:
+            taken[process.pid] = sum(process.cpu_times()[:2])
+        except psutil.Error:
+            continue
+    return taken
+
+
+def on_ray(blocks: Sequence[Block], first: Sequence[Block], workers: int) -> tuple[float, float, int, float, float]:
+    """Wall and CPU seconds of blocks on workers that are warm, the rows, seconds to begin, MB of all processes."""
+    with TemporaryDirectory() as folder, ray_running(None, workers) as ray:
+        begin = time.perf_counter()
+        engine = RayEngine(ray, DatasetStore(folder), Limits(), ship=False)
+        list(run_blocks(first[: 2 * workers], engine))
+        begin = time.perf_counter() - begin
+        before, wall = family_cpu(), time.perf_counter()
+        rows = sum(report.rows for _, report in run_blocks(blocks, engine))
+        wall, after = time.perf_counter() - wall, family_cpu()
+        held = sum(resident_mb(process.pid) for process in psutil.Process().children(recursive=True))
+    return wall, sum(after.values()) - sum(before.get(pid, 0.0) for pid in after), rows, begin, held
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--blocks", type=int, default=8)
+    parser.add_argument("--count", type=int, default=64)
+    parser.add_argument("--object", default="shape:mug")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    request = DatasetRequest((options.object,), per_object=options.blocks * options.count, block=options.count)
+    blocks = blocks_of(request)
+    first = blocks_of(DatasetRequest((options.object,), per_object=8, block=2, seed=1000))
+    body = []
+    wall, cpu, rows = loop(blocks)
+    body.append(("plan_grasps in a loop", f"{wall:.1f}", f"{cpu:.1f}", f"{rows}", "", ""))
+    for workers in (1, 2):
+        wall, cpu, rows, begin, held = on_ray(blocks, first, workers)
+        name = f"{workers} worker{'s' * (workers > 1)}"
+        body.append((name, f"{wall:.1f}", f"{cpu:.1f}", f"{rows}", f"{begin:.1f}", f"{held:.0f}"))
+    print(markdown_table(("", "wall s", "CPU s", "rows", "to begin s", "MB"), body))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""`graspd dataset` (docs/dataset.md): blocks of grasps made on Ray, kept as Parquet files."""

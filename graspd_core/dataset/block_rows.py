@@ -1,0 +1,166 @@
+"""A block in this process: the object made ready once, its grasps planned, and the rows of their file."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from graspd_core.bench.result_store import code_version
+from graspd_core.bench.stopwatch import forget_peak, peak_mb
+from graspd_core.dataset.blocks import Block, DatasetObject
+from graspd_core.dataset.guarded_calls import MadeBlock, ReadyObject
+from graspd_core.dataset.parquet_files import parquet_bytes
+from graspd_core.dataset.record_schema import arrow_schema, object_schema
+from graspd_core.formats.grasps_json import grasp_figures
+from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
+from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.metrics.measure import measure
+from graspd_core.metrics.metrics_context import make_metrics_context
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime import disk_cache
+from graspd_core.scene.load_scene import load_scene
+from graspd_core.scene.scene import ObjectModel, Scene, object_parts, object_sharp_points
+from graspd_core.types import Grasp, Verdict
+
+# Scenes and hands that a process keeps, so that consecutive blocks share what is built for them.
+_KEPT = 4
+_loaded: OrderedDict[str, Any] = OrderedDict()
+
+
+def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:
+    """Load an object and build what trials and optimiser need of it; `content` is its file's where it lies elsewhere.
+
+    Raises:
+        GraspdError: it cannot be read or used.
+    """
+    _one_thread()
+    disk_cache.forget()
+    options: dict[str, Any] = {"mass": thing.mass, "friction": thing.friction, "scale": thing.scale}
+    with tempfile.TemporaryDirectory(prefix="graspd-object-") as folder:
+        source = thing.source
+        if content is not None:
+            source = str(Path(folder) / Path(thing.source).name)
+            Path(source).write_bytes(content)
+        scene = load_scene(source, resolution=config.resolution, **options)
+    scene = replace(scene, object=replace(scene.object, source=thing.source))
+    object_parts(scene.object)
+    object_sharp_points(scene.object, 2 * config.problem.features)
+    shared = pickle.dumps((scene, disk_cache.contents()), pickle.HIGHEST_PROTOCOL)
+    return ReadyObject(scene.object.sha256, _object_file(scene.object), shared)
+
+
+def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
+    """Plan a block's grasps; `hand` is a pickled HandModel, `shared` as `ReadyObject` has it."""
+    _one_thread()
+    forget_peak()
+    began = time.process_time()
+    scene, arrays = _kept(block.object.key, shared)
+    disk_cache.supply(arrays)
+    model: HandModel = _kept(block.hand_content, hand)
+    request: dict[str, Any] = {"preset": block.config, "verify": block.verify, "measure": block.measure != "none"}
+    result = plan_grasps(scene, model, count=block.count, seed=block.seed, **request)
+    grasps = result.grasps if block.measure != "all" else all_measured(scene, model, result.grasps)
+    asked = {"block": block.key, "asked": block.asked, "outcome": result.outcome.name, "message": result.message}
+    return MadeBlock(
+        object_sha256=scene.object.sha256,
+        file=parquet_bytes(_table(block, scene.object, model, grasps), asked),
+        rows=len(grasps),
+        verified=sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps),
+        failures=dict(Counter(failure_kind(grasp) for grasp in grasps if grasp.verdict is Verdict.FAILED)),
+        cpu=time.process_time() - began,
+        peak_mb=peak_mb(),
+    )
+
+
+def all_measured(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
+    """Grasps with the metrics of those too that failed."""
+    context = make_metrics_context(scene.object, hand)
+    return tuple(grasp if grasp.metrics else replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in grasps)
+
+
+def failure_kind(grasp: Grasp) -> str:
+    """What a failed grasp is counted as."""
+    return kind_of_reason(*next((trial.name, trial.reason) for trial in grasp.trials if not trial.passed))
+
+
+def kind_of_reason(trial: str, reason: str) -> str:
+    """The trial that a grasp failed and why, without the numbers: for counting."""
+    words = [word for word in reason.split() if not any(sign.isdigit() for sign in word)]
+    return f"{trial}: {' '.join(word for word in words if word not in ('cm', 'mm', 'm', 'N'))}"
+
+
+def _one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _kept(key: str, pickled: bytes) -> Any:
+    """What was pickled, the same object each time while it is kept: worlds are remembered by identity."""
+    if key not in _loaded:
+        _loaded[key] = pickle.loads(pickled)
+    _loaded.move_to_end(key)
+    while len(_loaded) > _KEPT:
+        _loaded.popitem(last=False)
+    return _loaded[key]
+
+
+def _table(block: Block, target: ObjectModel, hand: HandModel, grasps: Sequence[Grasp]) -> Any:
+    import pyarrow as pa
+
+    same = {
+        "block": block.key,
+        "object_sha256": target.sha256,
+        "object_source": block.object.source,
+        "scale": block.object.scale,
+        "mass": block.object.mass,
+        "friction": block.object.friction,
+        "hand_name": block.hand_name,
+        "hand_sha256": block.hand_content,
+        "joint_names": list(all_joint_names(hand)),
+        "method": block.config.method,
+        "preset": block.preset,
+        "verify": block.verify,
+        "seed": block.seed,
+        "code": code_version(),
+    }
+    rows = [{**same, "row": number, **_row(grasp, hand)} for number, grasp in enumerate(grasps)]
+    return pa.Table.from_pylist(rows, schema=arrow_schema())
+
+
+def _row(grasp: Grasp, hand: HandModel) -> dict[str, Any]:
+    """What a row says of its grasp; the rest is the same in the whole block."""
+    row: dict[str, Any] = {
+        "verdict": str(grasp.verdict),
+        "reason": grasp.reason,
+        "score": float(grasp.score),
+        "probability": grasp.probability,
+        "contacts": [asdict(contact) for contact in grasp.contacts],
+    }
+    for stage in ("pregrasp", "grasp", "squeeze"):
+        posture = getattr(grasp, stage)
+        row[f"{stage}_position"] = posture.position.tolist()
+        row[f"{stage}_quaternion_wxyz"] = posture.quaternion_wxyz.tolist()
+        row[f"{stage}_joint_positions"] = [float(q) for q in all_joint_positions(hand, posture.joint_positions)]
+    figures = grasp_figures(grasp)
+    return {**row, "trials": figures["trials"], **{f"metric_{key}": v for key, v in figures["metrics"].items()}}
+
+
+def _object_file(target: ObjectModel) -> bytes:
+    import pyarrow as pa
+
+    row = {
+        "object_sha256": target.sha256,
+        "volume": float(target.volume),
+        "radius": float(target.radius),
+        "center_of_mass": target.center_of_mass.tolist(),
+        "vertices": target.mesh.vertices.tolist(),
+        "faces": target.mesh.faces.tolist(),
+    }
+    return parquet_bytes(pa.Table.from_pylist([row], schema=object_schema()), {"object": target.sha256})

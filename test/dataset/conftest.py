@@ -1,0 +1,44 @@
+"""A small data set, made once without Ray: two blocks of a sphere; and what the tests of a folder of files share."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from graspd_core.dataset.blocks import Block, blocks_of
+from graspd_core.dataset.dataset_store import DatasetStore
+
+sys.path.insert(0, str(Path(__file__).parent))
+from small_dataset import REQUEST, make_here
+
+
+@pytest.fixture(scope="session")
+def blocks() -> tuple[Block, ...]:
+    return blocks_of(REQUEST)
+
+
+@pytest.fixture(scope="session")
+def made(blocks: tuple[Block, ...], tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
+    """The data set; not to be changed."""
+    store = DatasetStore(str(tmp_path_factory.mktemp("dataset")))
+    make_here(blocks, store)
+    return store
+
+
+@pytest.fixture
+def copied(made: DatasetStore, tmp_path: Path) -> DatasetStore:
+    """A copy that may be spoilt."""
+    shutil.copytree(made.where, tmp_path / "copy")
+    return DatasetStore(str(tmp_path / "copy"))
+
+
+@pytest.fixture
+def graspd() -> Callable[..., int]:
+    """Runs the command in this process."""
+    from graspd_core.cli import main
+
+    return lambda *words: main([str(word) for word in words])

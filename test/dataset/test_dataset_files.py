@@ -1,0 +1,208 @@
+"""A data set that is there: resumed by listing, looked through, merged, sampled, read by others."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from small_dataset import make_here
+
+from graspd_core.dataset.blocks import Block, DatasetRequest, blocks_of
+from graspd_core.dataset.dataset_stats import stats_of, tables_of
+from graspd_core.dataset.dataset_store import DatasetStore, key_of
+from graspd_core.dataset.merge_datasets import merge, sample
+from graspd_core.dataset.parquet_files import parquet_bytes, read_parquet
+from graspd_core.dataset.run_dataset import missing_blocks
+from graspd_core.dataset.validate_dataset import count_by_content, faults_of_dataset
+from graspd_core.errors import FormatError
+
+Run = Callable[..., int]
+
+
+def test_what_is_missing_is_found_by_listing(copied: DatasetStore, blocks: tuple[Block, ...]):
+    assert missing_blocks(blocks, copied) == []
+    first = next(path for path in copied.list("grasps") if key_of(path) == blocks[0].key)
+    (Path(copied.where) / first).unlink()
+    assert missing_blocks(blocks, copied) == [blocks[0]]
+    # A temporary file of a process that was killed is no block.
+    (Path(copied.where) / f"{first}abc123").write_bytes(b"PAR1")
+    assert missing_blocks(blocks, copied) == [blocks[0]]
+    copied.write(f"failed/{blocks[0].key}.json", b"{}")
+    assert missing_blocks(blocks, copied) == []
+    assert missing_blocks(blocks, copied, retry_failed=True) == [blocks[0]]
+
+
+def test_blocks_of_an_object_that_failed_are_not_tried_again(blocks: tuple[Block, ...], tmp_path: Path):
+    store = DatasetStore(str(tmp_path))
+    store.write(f"failed/{blocks[0].object.key}.json", b"{}")
+    assert missing_blocks(blocks, store) == []
+
+
+def test_a_whole_data_set_has_no_fault(made: DatasetStore):
+    assert list(faults_of_dataset(made)) == []
+    rows, different = count_by_content(made)
+    assert rows == different >= 4
+
+
+def _rewritten(store: DatasetStore, change: Callable[..., object]) -> None:
+    path, _, table, told = next(iter(tables_of(store)))
+    kept = {key: value for key, value in told.items() if key not in ("format", "version")}
+    store.write(path, parquet_bytes(change(table), kept))
+
+
+def _column(table, name: str, values: list):
+    import pyarrow as pa
+
+    at = table.schema.get_field_index(name)
+    return table.set_column(at, table.schema.field(at), pa.array(values, table.schema.field(at).type))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda t: _column(t, "verdict", ["failed"] * len(t)), "verdicts that the trials do not bear out"),
+        (lambda t: _column(t, "grasp_quaternion_wxyz", [[1.0, 1.0, 0.0, 0.0]] * len(t)), "not of unit length"),
+        (lambda t: _column(t, "squeeze_position", [[float("nan")] * 3] * len(t)), "not finite"),
+        (lambda t: t.drop_columns(["score"]), "columns are not those of the schema: score"),
+        (lambda t: t.slice(1), "rows are missing"),
+        (lambda t: _column(t, "hand_name", ["other"] * len(t)), "belongs in grasps/hand=other/"),
+    ],
+)
+def test_a_file_that_says_wrong_things_is_found(copied: DatasetStore, spoil: Callable, told: str):
+    _rewritten(copied, spoil)
+    assert any(told in fault for fault in faults_of_dataset(copied))
+
+
+def test_spoilt_moved_doubled_and_missing_files_are_found(copied: DatasetStore, graspd: Run, capsys):
+    root = Path(copied.where)
+    first, second = (root / path for path in copied.list("grasps"))
+    content = first.read_bytes()
+    middle = len(content) // 3
+    first.write_bytes(content[:middle] + b"?" + content[middle + 1 :])
+    assert graspd("dataset", "validate", root) == 1
+    assert f"{first.name}: not a whole Parquet file" in capsys.readouterr().out
+    first.write_bytes(content)
+    shutil.copy(first, second)
+    (fault, twice) = list(faults_of_dataset(copied))
+    assert f"it holds the block {first.stem}" in fault
+    assert "a grasp that is in" in twice
+    second.unlink()
+    shutil.rmtree(root / "objects")
+    (fault,) = list(faults_of_dataset(copied))
+    assert "objects/" in fault
+    assert "is missing" in fault
+
+
+def test_merged_data_sets_hold_every_block_once(made: DatasetStore, copied: DatasetStore, tmp_path: Path, graspd: Run):
+    removed = copied.list("grasps")[0]
+    (Path(copied.where) / removed).unlink()
+    out = DatasetStore(str(tmp_path / "out"))
+    assert merge([copied, made], out) == (2, 1)
+    assert merge([made], out) == (0, 2)
+    assert count_by_content(out) == count_by_content(made)
+    assert [out.read(path) for path in out.list("grasps")] == [made.read(path) for path in made.list("grasps")]
+    assert graspd("dataset", "merge", made.where, "--out", tmp_path / "other") == 0
+    assert "tried in MuJoCo" in (tmp_path / "other" / "README.md").read_text()
+
+
+def test_a_key_with_other_rows_is_a_conflict(made: DatasetStore, copied: DatasetStore, tmp_path: Path):
+    _rewritten(copied, lambda t: _column(t, "score", [7.0] * len(t)))
+    with pytest.raises(FormatError, match=r"other rows than .* which has the same key"):
+        merge([made, copied], DatasetStore(str(tmp_path / "out")))
+
+
+def test_a_sample_depends_on_rows_and_seed_only(made: DatasetStore, tmp_path: Path, graspd: Run):
+    content, rows = sample(made, 2, seed=5)
+    assert rows == 2
+    assert content == sample(made, 2, seed=5)[0]
+    table, _ = read_parquet(content, "sample")
+    assert table.num_rows == 2
+    everything = count_by_content(made)[0]
+    assert sample(made, 1000, seed=0)[1] == everything
+    assert len({sample(made, 1, seed=seed)[0] for seed in range(8)}) > 1
+    out = tmp_path / "some.parquet"
+    assert graspd("dataset", "sample", made.where, "--count", 3, "--verdict", "verified", "--out", out) == 0
+    table, _ = read_parquet(out.read_bytes(), "sample")
+    assert table["verdict"].to_pylist() == ["verified"] * 3
+
+
+def test_stats_count_rows_and_reasons(made: DatasetStore, graspd: Run, capsys):
+    stats = stats_of(made)
+    hand = stats.hands["parallel_gripper"]
+    assert (hand.blocks, len(hand.objects), hand.verdicts["verified"]) == (2, 1, 4)
+    assert stats.rows == count_by_content(made)[0]
+    assert stats.reasons.total() == hand.verdicts["failed"]
+    assert graspd("dataset", "stats", made.where) == 0
+    assert "| parallel_gripper | 1 | 2 |" in capsys.readouterr().out
+
+
+def test_others_read_it_in_one_line(made: DatasetStore):
+    import datasets
+    import duckdb
+    import pandas as pd
+    import polars as pl
+
+    rows = count_by_content(made)[0]
+    where = f"{made.where}/grasps"
+    frame = pd.read_parquet(where)
+    assert len(frame) == rows
+    assert set(frame["hand"]) == {"parallel_gripper"}
+    polar = pl.read_parquet(f"{where}/**/*.parquet", hive_partitioning=True)
+    assert polar.height == rows
+    assert polar.filter(pl.col("verdict") == "verified").height == 4
+    asked = f"select hand, count(*), max(squeeze_position[1]) from '{where}/*/*/*.parquet' group by hand"
+    assert duckdb.execute(asked).fetchall()[0][:2] == ("parallel_gripper", rows)
+    hugging = datasets.load_dataset(
+        "parquet", data_files=f"{where}/*/*/*.parquet", split="train", cache_dir=f"{made.where}-cache"
+    )
+    assert len(hugging) == rows
+    assert hugging[0]["contacts"][0]["link"] == frame["contacts"][0][0]["link"]
+
+
+def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
+    _rewritten(copied, lambda t: t.slice(0, 0))
+    stats = stats_of(copied)
+    assert stats.hands["parallel_gripper"].blocks == 2
+    assert 0 < stats.rows < 4
+    assert list(faults_of_dataset(copied)) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["stats"], "dataset stats: 0 data sets; valid: one"),
+        (["stats", "a", "b"], "dataset stats: 2 data sets"),
+        (["validate", "nowhere"], "no data set"),
+        (["shape:box"], "--out is missing"),
+        (["shape:box", "--out", "x", "--workers", "0"], "workers: 0"),
+        (["sample", "a", "--out", "x.csv"], ".parquet file"),
+        (["merge", "a"], "--out is missing"),
+        (["shape:box", "--out", "nowhere://x"], "nowhere://x"),
+        (
+            ["shape:box", "--out", "x", "--address", "127.0.0.1:9"],
+            "127.0.0.1:9: Connection refused; start one",
+        ),
+    ],
+)
+def test_wrong_words_are_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert graspd("dataset", *words) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_example_trains_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    store = DatasetStore(str(tmp_path))
+    request = DatasetRequest(
+        ("shape:sphere", "shape:box"), hands=("parallel_gripper",), per_object=3, preset="fast", measure="none"
+    )
+    make_here(blocks_of(request), store)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    assert importlib.import_module("train_on_dataset").main([store.where, "parallel_gripper", "2"]) == 0
+    told = capsys.readouterr().out
+    assert "of 1 objects held out" in told
+    assert "of the best half by the network" in told

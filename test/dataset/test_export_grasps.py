@@ -1,0 +1,156 @@
+"""What others read: the same fingertips by MuJoCo's kinematics of the URDF, the same poses, the same object."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from small_dataset import make_here
+
+from graspd_core import load_hand, load_mesh
+from graspd_core.dataset.blocks import DatasetRequest, blocks_of
+from graspd_core.dataset.dataset_stats import tables_of
+from graspd_core.dataset.dataset_store import DatasetStore
+from graspd_core.hands.kinematics import link_poses
+
+
+@pytest.fixture(scope="module")
+def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
+    store = DatasetStore(str(tmp_path_factory.mktemp("allegro")))
+    request = DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")
+    make_here(blocks_of(request), store)
+    return store
+
+
+def rows_of(store: DatasetStore) -> list[dict]:
+    return [row for _, _, table, _ in tables_of(store) for row in table.to_pylist()]
+
+
+def mujoco_tips(urdf: str, position: list[float], orientation: dict, joints: dict[str, float]) -> dict[str, np.ndarray]:
+    """Where MuJoCo has the links of the hand in the object's frame [m]; joints by name."""
+    model = mujoco.MjModel.from_xml_path(urdf)  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    for name, value in joints.items():
+        data.joint(name).qpos = value
+    mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, np.array([orientation["w"], *orientation["xyz"]]))  # pyright: ignore[reportAttributeAccessIssue]
+    bodies = {model.body(index).name: data.xpos[index] for index in range(1, model.nbody)}
+    return {name: rotation.reshape(3, 3) @ there + position for name, there in bodies.items()}
+
+
+def test_isaac_grasps_stand_where_they_did(allegro: DatasetStore, tmp_path: Path, graspd):
+    assert graspd("dataset", "export", allegro.where, "--to", "isaac", "--out", tmp_path) == 0
+    (path,) = (tmp_path / "allegro_right").glob("*.yaml")
+    document = yaml.safe_load(path.read_text())
+    verified = [row for row in rows_of(allegro) if row["verdict"] == "verified"]
+    assert (document["format"], document["format_version"]) == ("isaac_grasp", 1.0)
+    assert len(document["grasps"]) == len(verified) == 8
+    hand = load_hand("allegro_right")
+    for row, grasp in zip(verified, document["grasps"].values(), strict=True):
+        assert list(grasp["pregrasp_cspace_position"].values()) == row["pregrasp_joint_positions"]
+        tips = mujoco_tips(hand.urdf, grasp["position"], grasp["orientation"], grasp["cspace_position"])
+        ours = link_positions(row)
+        shared = set(tips) & set(ours)
+        assert len(shared) >= 16
+        assert max(np.linalg.norm(tips[name] - ours[name]) for name in shared) < 1e-6
+
+
+def link_positions(row: dict) -> dict[str, np.ndarray]:
+    """Where graspd has the links in the object's frame [m]."""
+    hand = load_hand("allegro_right")
+    _, translations = link_poses(hand, np.array(row["grasp_joint_positions"]))
+    base = se3(row)
+    return {name: base[:3, :3] @ there + base[:3, 3] for name, there in zip(hand.link_names, translations, strict=True)}
+
+
+def se3(row: dict) -> np.ndarray:
+    """`T_object_hand` of a row, by MuJoCo."""
+    rotation, matrix = np.zeros(9), np.eye(4)
+    mujoco.mju_quat2Mat(rotation, np.array(row["grasp_quaternion_wxyz"]))  # pyright: ignore[reportAttributeAccessIssue]
+    matrix[:3, :3], matrix[:3, 3] = rotation.reshape(3, 3), row["grasp_position"]
+    return matrix
+
+
+def test_graspgen_gets_poses_failures_and_the_mesh(allegro: DatasetStore, tmp_path: Path, graspd):
+    assert graspd("dataset", "export", allegro.where, "--to", "graspgen", "--out", tmp_path) == 0
+    (path,) = (tmp_path / "allegro_right").glob("*.json")
+    document, rows = json.loads(path.read_text()), rows_of(allegro)
+    assert document["grasps"]["object_in_gripper"] == [row["verdict"] == "verified" for row in rows]
+    for row, matrix in zip(rows, np.array(document["grasps"]["transforms"]), strict=True):
+        assert np.allclose(matrix, se3(row), atol=1e-12)
+    mesh = load_mesh(tmp_path / document["object"]["file"])
+    assert path.stem == rows[0]["object_sha256"]
+    assert len(mesh.vertices) == len(rows_of_objects(allegro)[0]["vertices"])
+
+
+def rows_of_objects(store: DatasetStore) -> list[dict]:
+    import pandas as pd
+
+    return pd.read_parquet(f"{store.where}/objects").to_dict("records")
+
+
+def test_an_unknown_format_is_refused(allegro: DatasetStore, tmp_path: Path, graspd, capsys):
+    assert graspd("dataset", "export", allegro.where, "--to", "usd", "--out", tmp_path) == 2
+    assert "to: 'usd'; valid: isaac, graspgen, dexgraspbench" in capsys.readouterr().err
+
+
+def menagerie_like() -> str:
+    """An Allegro as Menagerie builds it: its names and frames, the palm turned in the frame of the qpos."""
+
+    def finger(name: str, place: str) -> str:
+        lengths, axes = ("0 0 0.0164", "0 0 0.054", "0 0 0.0384"), ("0 0 1", "0 1 0", "0 1 0", "0 1 0")
+        return chain(name, place, lengths, axes)
+
+    def chain(name: str, place: str, steps: tuple[str, ...], axes: tuple[str, ...]) -> str:
+        text, places = "", (place, *(f'pos="{step}"' for step in steps))
+        for number, (where, axis) in enumerate(zip(places, axes, strict=True)):
+            text += f'<body name="{name}{number}" {where}><joint name="{name}j{number}" axis="{axis}"/>'
+            text += '<geom size="0.005"/>'
+        return text + "</body>" * len(axes)
+
+    tilt, thumb = "0.0436194 0 0", 'pos="-0.0182 0.019333 -0.045987" quat="0.477714 -0.521334 -0.521334 -0.477714"'
+    fingers = [
+        finger("ff", f'pos="0 0.0435 -0.001542" quat="0.999048 -{tilt}"'),
+        finger("mf", 'pos="0 0 0.0007"'),
+        finger("rf", f'pos="0 -0.0435 -0.001542" quat="0.999048 {tilt}"'),
+        chain("th", thumb, ("-0.027 0.005 0.0399", "0 0 0.0177", "0 0 0.0514"), ("-1 0 0", "0 0 1", "0 1 0", "0 1 0")),
+    ]
+    palm = f'<body name="palm" quat="0 1 0 1"><geom size="0.01"/>{"".join(fingers)}</body>'
+    hand = f'<body name="hand"><freejoint/><geom size="0.01"/>{palm}</body>'
+    return f'<mujoco><compiler angle="radian"/><worldbody>{hand}</worldbody></mujoco>'
+
+
+def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_path: Path, graspd):
+    assert graspd("dataset", "export", allegro.where, "--to", "dexgraspbench", "--out", tmp_path) == 0
+    model = mujoco.MjModel.from_xml_string(menagerie_like())  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    verified = [row for row in rows_of(allegro) if row["verdict"] == "verified"]
+    files = sorted((tmp_path / "allegro_right").glob("*/*.npy"), key=lambda path: int(path.stem))
+    assert len(files) == len(verified)
+    for row, path in zip(verified, files, strict=True):
+        grasp = np.load(path, allow_pickle=True).item()
+        data.qpos[:] = grasp["grasp_qpos"]
+        mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+        ours = link_positions(row)
+        # The last link of every finger; a fingertip sits on it, fixed.
+        ends = {"ff3": "link_3.0", "mf3": "link_7.0", "rf3": "link_11.0", "th3": "link_15.0"}
+        assert max(np.linalg.norm(data.body(end).xpos - ours[link]) for end, link in ends.items()) < 1e-5
+        assert grasp["squeeze_qpos"].shape == grasp["pregrasp_qpos"].shape == (23,)
+    folder = tmp_path / grasp["obj_path"]
+    assert json.loads((folder / "info" / "simplified.json").read_text())["mass"] == 0.1
+    parts = [load_mesh(path) for path in (folder / "urdf" / "meshes").glob("convex_piece_*.obj")]
+    assert len(parts) > 3
+    whole = load_mesh(folder / "mesh" / "simplified.obj")
+    assert np.allclose(
+        np.ptp(np.concatenate([part.vertices for part in parts]), axis=0), np.ptp(whole.vertices, axis=0), atol=0.003
+    )
+
+
+def test_dexgraspbench_knows_its_hands_only(made: DatasetStore, tmp_path: Path, graspd, capsys):
+    assert graspd("dataset", "export", made.where, "--to", "dexgraspbench", "--out", tmp_path / "x") == 2
+    assert "hand 'parallel_gripper'; valid: allegro_right" in capsys.readouterr().err
