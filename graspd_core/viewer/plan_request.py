@@ -14,6 +14,7 @@ from graspd_core.mesh.mesh_files import MESH_ENDINGS
 from graspd_core.mesh.shapes import SHAPES
 from graspd_core.methods.plan_config import preset_names
 from graspd_core.planning.planning_worker import start_planning_worker
+from graspd_core.planning.steering.steering import Steering
 from graspd_core.pointcloud.cloud_files import CLOUD_ENDINGS
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.load_scene import SHAPE_PREFIX, load_scene
@@ -21,6 +22,16 @@ from graspd_core.scene.scene import Scene
 from graspd_core.viewer.session import seen_points
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+# Directions that the hand may be asked to come from, and the way that it then moves, in the object's frame.
+APPROACHES = {
+    "any side": None,
+    "above": (0.0, 0.0, -1.0),
+    "below": (0.0, 0.0, 1.0),
+    "+x": (-1.0, 0.0, 0.0),
+    "-x": (1.0, 0.0, 0.0),
+    "+y": (0.0, -1.0, 0.0),
+    "-y": (0.0, 1.0, 0.0),
+}
 ENDINGS = tuple(sorted({*MESH_ENDINGS, *CLOUD_ENDINGS}))
 MOST_GRASPS = 64
 
@@ -49,6 +60,8 @@ class PlanRequest:
         alone: a cloud shows the object and nothing else.
         hand, preset: names.
         friction: coefficient.
+        approach: where the hand comes from, a key of `APPROACHES`.
+        approach_angle: greatest angle between that direction and a grasp's [degrees].
         count, seed: as of `plan_grasps`.
     """
 
@@ -60,7 +73,15 @@ class PlanRequest:
     preset: str
     friction: float
     count: int
+    approach: str = "any side"
+    approach_angle: float = 30.0
     seed: int = 0
+
+    @property
+    def restrictions(self) -> tuple[Steering, ...]:
+        """What `plan_grasps` is asked to keep to. Raises ConfigError: the angle is out of its range."""
+        direction = APPROACHES[self.approach]
+        return () if direction is None else (Steering(direction, math.radians(self.approach_angle)),)
 
 
 def check(request: PlanRequest) -> None:
@@ -70,6 +91,7 @@ def check(request: PlanRequest) -> None:
         ("units", request.units, tuple(UNITS)),
         ("hand", request.hand, hand_names()),
         ("preset", request.preset, preset_names()),
+        ("approach", request.approach, tuple(APPROACHES)),
     )
     for name, value, valid in chosen:
         if value not in valid:
@@ -78,6 +100,8 @@ def check(request: PlanRequest) -> None:
         raise ConfigError(f"{request.upload.name[:80]}: unknown ending; valid endings: {', '.join(ENDINGS)}")
     if not (math.isfinite(request.friction) and 0.01 <= request.friction <= 2.0):
         raise ConfigError(f"friction: {shown(request.friction)}; valid: 0.01 to 2")
+    if not 1.0 <= request.approach_angle <= 180.0:
+        raise ConfigError(f"approach angle: {shown(request.approach_angle)} degrees; valid: 1 to 180")
     if not 1 <= request.count <= MOST_GRASPS:
         raise ConfigError(f"count: {shown(request.count)} grasps; valid here: 1 to {MOST_GRASPS}")
 

@@ -20,7 +20,16 @@ from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import Verdict
 from graspd_core.viewer.grasp_list import BLOCK
 from graspd_core.viewer.live_view import LiveView
-from graspd_core.viewer.plan_request import ENDINGS, MOST_GRASPS, UNITS, PlanRequest, Upload, check, load_object
+from graspd_core.viewer.plan_request import (
+    APPROACHES,
+    ENDINGS,
+    MOST_GRASPS,
+    UNITS,
+    PlanRequest,
+    Upload,
+    check,
+    load_object,
+)
 from graspd_core.viewer.session import Session, make_session
 
 _FILE = "the file sent"
@@ -53,6 +62,8 @@ class PlanTab:
         self._hand = gui.add_dropdown("Hand", hand_names(), initial_value="allegro_right")
         self._preset = gui.add_dropdown("Preset", preset_names(), initial_value="fast")
         self._friction = gui.add_slider("Friction", 0.1, 1.5, 0.05, 0.6, hint="of the object against the hand")
+        self._approach = gui.add_dropdown("The hand comes from", tuple(APPROACHES), hint="in the object's frame")
+        self._angle = gui.add_slider("Within [°]", 5, 180, 5, 30, hint="of that direction")
         self._count = gui.add_slider("Grasps", 1, MOST_GRASPS, 1, 8, hint="verified grasps wanted")
         self._plan = gui.add_button("Plan")
         self._halt = gui.add_button("Stop", disabled=True)
@@ -109,13 +120,15 @@ class PlanTab:
         """What the widgets say, checked. Raises ConfigError."""
         sent = self._upload if self._object.value == _FILE else None
         try:
-            friction, count = float(self._friction.value), int(self._count.value)
+            friction, count, angle = float(self._friction.value), int(self._count.value), float(self._angle.value)
         except (TypeError, ValueError, OverflowError):
-            raise ConfigError(f"friction or count: {shown((self._friction.value, self._count.value))}") from None
+            given = shown((self._friction.value, self._count.value, self._angle.value))
+            raise ConfigError(f"friction, count or angle: {given}") from None
         request = PlanRequest(
             shape=self._object.value if sent is None else next(iter(SHAPES)),
             upload=sent, units=self._units.value, alone=bool(self._alone.value), hand=self._hand.value,
             preset=self._preset.value, friction=friction, count=count,
+            approach=self._approach.value, approach_angle=angle,
         )  # fmt: skip
         check(request)
         return request
@@ -144,6 +157,7 @@ class PlanTab:
         self._live.begin(session)
         result = plan_grasps(
             scene, hand, count=request.count, seed=request.seed, preset=config,
+            restrictions=request.restrictions,
             progress=self._live.progress, watch=self._live.watch, stop=self._stop.is_set,
         )  # fmt: skip
         self._live.end()

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from graspd_core.hands.library import load_hand
+from graspd_core.planning.steering.steering import angle_of_approach
 from graspd_core.viewer.session import open_grasps
 
 
@@ -100,7 +103,14 @@ def test_a_flood_of_sliders_ends_where_the_last_one_is(page, viewer):
     page.until(lambda: places(viewer) == pytest.approx(at_grasp))
 
 
-def test_plans_are_made_stopped_and_saved(viewer, visit):
+def angles_from_y(viewer, folder: Path) -> list[float]:
+    """Of the grasps that can be saved, to a hand that comes from +y [degrees]; -1 where there is none."""
+    (folder / "grasps.json").write_bytes(viewer._planner._saved)
+    hand, grasps = load_hand("parallel_gripper"), open_grasps(folder / "grasps.json").grasps
+    return [np.degrees(angle_of_approach(hand, grasp, np.array([0.0, -1.0, 0.0]))) for grasp in grasps] or [-1.0]
+
+
+def test_plans_are_made_stopped_and_saved(viewer, visit, tmp_path):
     page = visit(viewer.url)
     page.tab.get_by_role("tab", name="Plan").click()
     page.choose("Hand", "parallel_gripper")
@@ -111,6 +121,11 @@ def test_plans_are_made_stopped_and_saved(viewer, visit):
     with page.tab.expect_download() as saved:
         page.press("Save grasps.json")
     assert '"graspd/grasps"' in saved.value.path().read_text()
+    page.choose("The hand comes from", "+y")
+    page.set("Within [°]", 20)
+    page.press("Plan")
+    page.until(lambda: 0 < max(angles_from_y(viewer, tmp_path)) < 20.01)
+    page.choose("The hand comes from", "any side")
     page.choose("Preset", "accurate")
     page.set("Grasps", 64)
     page.press("Plan")

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from graspd_core.cli import main
 from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.hands.library import load_hand
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.planning.steering.steering import angle_of_approach
 from graspd_core.viewer import server as viewer_server
 from graspd_core.viewer.plan_request import PlanRequest, Upload, check, load_object
 from graspd_core.viewer.server import may_connect
@@ -106,6 +110,8 @@ def test_no_tunnel_is_opened(viewer):
         ({"preset": "/etc/preset.yaml"}, "preset: '/etc/preset.yaml'; valid: "),
         ({"units": "ft"}, "units: 'ft'; valid: "),
         ({"friction": float("nan")}, "friction: nan; valid: "),
+        ({"approach": "within"}, "approach: 'within'; valid: any side, above"),
+        ({"approach_angle": float("inf")}, "approach angle: inf degrees; valid: 1 to 180"),
         ({"count": 10**6}, "count: 1000000 grasps; valid here: 1 to "),
         ({"upload": Upload("a.obj/../../b.yaml", b"")}, "b.yaml: unknown ending"),
         ({"upload": Upload("obj", b"")}, "obj: unknown ending"),
@@ -116,6 +122,17 @@ def test_what_no_honest_visitor_asks_for_is_refused(change, culprit):
     with pytest.raises(ConfigError) as caught:
         check(PlanRequest(**{**vars(GOOD), **change}))
     assert culprit in str(caught.value)
+
+
+@pytest.mark.parametrize(("side", "way"), [("above", (0.0, 0.0, -1.0)), ("+y", (0.0, -1.0, 0.0))])
+def test_the_hand_comes_from_the_side_that_was_chosen(side, way):
+    hand = load_hand("parallel_gripper")
+    asked = PlanRequest(**{**vars(GOOD), "approach": side, "approach_angle": 20.0})
+    check(asked)
+    result = plan_grasps(load_object(asked)[0], hand, count=2, preset="fast", restrictions=asked.restrictions)
+    angles = [angle_of_approach(hand, grasp, np.array(way)) for grasp in result.grasps]
+    assert len(angles) > 0
+    assert np.degrees(max(angles)) < 20.01
 
 
 def test_a_file_is_called_by_its_visitors_name_and_read_from_nowhere_else(monkeypatch):
