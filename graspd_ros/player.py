@@ -7,64 +7,42 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
-import signal
 import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from graspd_core.bags.reader import BagTopic, bag_topics, read_raw
-from graspd_core.errors import BagError, ConfigError, GraspdError
+from graspd_core.errors import BagError, ConfigError
 from graspd_core.transforms import SECOND
-
-EXIT_DONE = 0
-EXIT_BAD_INPUT = 2
+from graspd_ros.ros_command import Parser, run_command
 
 DEPTH = 10
 SETTLE = 0.3  # seconds after a match in which the first messages could still be lost
 DELIVERY = 5.0  # seconds that reliable subscribers get to confirm the last messages, which end with their publisher
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message} (see {self.prog} --help)")
-
-
 def main(args: list[str] | None = None) -> int:
     """Play a recording to its end or until a signal; 0 when done or stopped, 2 for bad input."""
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+    return run_command("graspd_play", args, _parse, _play)
 
+
+def _play(options: argparse.Namespace, stop: threading.Event) -> None:
     import rclpy
-    from rclpy.signals import SignalHandlerOptions
-    from rclpy.utilities import remove_ros_args, try_shutdown
 
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    arguments = sys.argv if args is None else ["graspd_play", *args]
-    try:
-        options = _parse(remove_ros_args(arguments)[1:])
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node("graspd_play")
-        play(
-            node,
-            options.bag,
-            topics=tuple(options.topics),
-            rate=options.rate,
-            loop=options.loop,
-            now=options.now,
-            wait=options.wait,
-            stop=stop,
-        )
-        node.destroy_node()
-    except GraspdError as error:
-        sys.stderr.write(f"graspd_play: {error}\n")
-        return EXIT_BAD_INPUT
-    finally:
-        try_shutdown()
-    return EXIT_DONE
+    node = rclpy.create_node("graspd_play")
+    play(
+        node,
+        options.bag,
+        topics=tuple(options.topics),
+        rate=options.rate,
+        loop=options.loop,
+        now=options.now,
+        wait=options.wait,
+        stop=stop,
+    )
+    node.destroy_node()
 
 
 def play(
@@ -114,7 +92,7 @@ def play(
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
-    parser = _Parser(prog="graspd_play", description="Publish the topics of a rosbag2 recording.")
+    parser = Parser(prog="graspd_play", description="Publish the topics of a rosbag2 recording.")
     parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast as recorded (default 1)")
     parser.add_argument("--loop", action="store_true", help="begin again at the end")

@@ -6,52 +6,25 @@ graspd_view [--node /graspd] [--object OBJECT] [--hand FILE] [--host H] [--port 
 from __future__ import annotations
 
 import argparse
-import os
-import signal
 import sys
 import threading
 from functools import lru_cache
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from graspd_core.errors import ConfigError, GraspdError, HandError
+from graspd_core.errors import GraspdError, HandError
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
-
-EXIT_DONE, EXIT_BAD_INPUT = 0, 2
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message} (see {self.prog} --help)")
+from graspd_ros.ros_command import Parser, run_command
 
 
 def main(args: list[str] | None = None) -> int:
     """Follow a node until a signal; 0 when stopped, 2 for bad input."""
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
-
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-    from rclpy.utilities import remove_ros_args, try_shutdown
-
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    arguments = sys.argv if args is None else ["graspd_view", *args]
-    try:
-        options = _parse(remove_ros_args(arguments)[1:])
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        _serve(options, stop)
-    except GraspdError as error:
-        sys.stderr.write(f"graspd_view: {error}\n")
-        return EXIT_BAD_INPUT
-    finally:
-        try_shutdown()
-    return EXIT_DONE
+    return run_command("graspd_view", args, _parse, _serve)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
-    parser = _Parser(prog="graspd_view", description="Look at what a graspd node finds, in a browser.")
+    parser = Parser(prog="graspd_view", description="Look at what a graspd node finds, in a browser.")
     parser.add_argument("--node", default="/graspd", help="name of the node (default /graspd)")
     parser.add_argument("--object", default=None, metavar="OBJECT", help="a file, in the answers' frame")
     parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="instead of the one that answers name")
