@@ -90,7 +90,7 @@ def test_every_field_is_used_on_the_way_from_views_to_a_scene():
     settings = SceneConfig(**{name: recorded(part, name, read) for name, part in PARTS})
     read.clear()
     on_table = tabletop("mug", obstacles=[("cylinder", 0.0, 0.16), ("box", 0.0, -0.16)])
-    view = views_of(on_table, CAMERA, ring_poses(1, elevation=0.5, azimuth=0.4), NONE)[0]
+    view = views_of(on_table, CAMERA, ring_poses(1, elevation=0.3, azimuth=0.4), NONE)[0]
     corners = (np.array([-0.07, -0.07, 0.0]), np.array([0.07, 0.07, 0.2]))
     scene_from_views([view], target=Target(box=corners), settings=settings, resolution=16)
     # The things alone, in the air.
