@@ -35,7 +35,9 @@ def reach_of(options: argparse.Namespace) -> tuple[Reach, ...]:
     from graspd_core.arms.arm_file import load_arm
     from graspd_core.planning.reach import Reach
 
-    arm, base = load_arm(options.arm), options.arm_base or []
+    arm, base = load_arm(options.arm), options.arm_base
+    if base is None:
+        raise ConfigError("--arm: say where it stands, --arm-base X Y Z or X Y Z QW QX QY QZ")
     if len(base) not in (3, 7):
         raise ConfigError(f"--arm-base: {len(base)} numbers; valid: X Y Z, or X Y Z QW QX QY QZ")
     x, y, z, *turn = base

@@ -24,7 +24,11 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="the same")
     parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in ones")
     parser.add_argument(
-        "--objects", nargs="+", default=(), metavar="OBJECT", help="shape:NAME, meshes or folders; default: all shapes"
+        "--objects",
+        nargs="+",
+        default=(),
+        metavar="OBJECT",
+        help="shape:NAME, meshes in metres or folders; default: all shapes",
     )
     parser.add_argument(
         "--cases", nargs="+", default=(), metavar="CASE", help="of stress: names, families; of maps: names"

@@ -32,7 +32,8 @@ def add_command(commands: Any) -> None:
         "words",
         nargs="+",
         metavar="OBJECT",
-        help="shape:NAME, meshes or folders; or stats, validate, merge, sample or export and the data sets meant",
+        help="shape:NAME, meshes in metres (else --scales) or folders; "
+        "or stats, validate, merge, sample or export and the data sets meant",
     )
     parser.add_argument("--out", default="", metavar="DIR|s3://…", help="the data set; of sample a .parquet file")
     make = parser.add_argument_group("making one")

@@ -43,8 +43,8 @@ def add_command(commands: Any) -> None:
     sizes = parser.add_mutually_exclusive_group()
     sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file")
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
-    parser.add_argument("--out", type=Path, default=None, metavar="grasps.json")
-    parser.add_argument("--html", type=Path, default=None, metavar="view.html")
+    parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="the grasps (docs/format.md)")
+    parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="a page that shows them")
     parser.add_argument("--view", action="store_true", help="watch it in a browser (docs/viewer.md)")
     add_address(parser)
 

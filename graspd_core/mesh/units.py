@@ -11,8 +11,14 @@ SMALL, LARGE = 0.008, 0.5
 # A graspable thing is about this large [m], and within this ratio of it.
 USUAL, SPREAD = 0.12, 6.0
 
-# What would turn a file's coordinates into metres: the option to pass, and the factor.
-REMEDIES = {"--units mm": 1e-3, "--units cm": 1e-2, "--units inch": 0.0254, "--scale 0.1": 0.1}
+# What would turn a file's coordinates into metres: the number that library, command line and node take, the option that
+# says the same, and the factor.
+REMEDIES = {
+    "scale 0.001 (--units mm)": 1e-3,
+    "scale 0.01 (--units cm)": 1e-2,
+    "scale 0.0254 (--units inch)": 0.0254,
+    "scale 0.1": 0.1,
+}
 
 
 def unit_advice(size: float, scale: float = 1.0) -> str:
@@ -23,13 +29,13 @@ def unit_advice(size: float, scale: float = 1.0) -> str:
     """
     # Of absurd numbers, whose ratio overflows, too.
     given = min(max(size / scale, 1e-200), 1e200)
-    remedies = REMEDIES if scale == 1 else {"--scale 1": 1.0} | REMEDIES
+    remedies = REMEDIES if scale == 1 else {"scale 1": 1.0} | REMEDIES
     likely = sorted(remedies, key=lambda option: _strangeness(given * remedies[option]))
     kept = {option: remedies[option] for option in likely if _strangeness(given * remedies[option]) < log(SPREAD)}
     if not kept:
         # No unit that files come in: scaled once too often, or for another purpose.
         factor = 10.0 ** ceil(log10(USUAL / given) - 0.5)
-        kept = {f"--scale {factor:g}": factor}
+        kept = {f"scale {factor:g}": factor}
     return ", ".join(f"{option} makes it {_length(given * factor)}" for option, factor in kept.items())
 
 

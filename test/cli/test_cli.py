@@ -79,7 +79,7 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--region", "sphere", "1", "0", "0", "0.1"], "region: no part of the object lies in it; the object goes from"),
     (["--avoid", "0", "0", "0", "1", "1", "0"], "box size: (1.0, 1.0, 0.0); valid: three lengths above 0"),
     (["--arm", "ur99", "--arm-base", "1", "0", "0"], "unknown arm 'ur99'; known: panda_like, ur5e_like"),
-    (["--arm", "ur5e_like"], "--arm-base: 0 numbers; valid: X Y Z, or X Y Z QW QX QY QZ"),
+    (["--arm", "ur5e_like"], "--arm: say where it stands, --arm-base X Y Z or X Y Z QW QX QY QZ"),
     (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
     (["--arm-base", "1", "0", "0"], "--arm-base: there is no arm"),
     (["--arm", "ur5e_like", "--arm-base", "0", "0", "0", "1", "1", "0", "0"], "valid: w x y z of length 1"),

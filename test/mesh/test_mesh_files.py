@@ -69,11 +69,14 @@ def test_bad_files_are_named(tmp_path, make, complaint):
 @pytest.mark.parametrize(
     ("factor", "complaint"),
     [
-        (1000.0, "90 m across.*--units mm makes it 90 mm$"),
-        (100.0, "9 m across.*--units cm makes it 90 mm, --units inch makes it 229 mm"),
-        (1 / 0.0254, "3.543 m across.*--units inch makes it 90 mm.*--units cm makes it 35.4 mm"),
-        (1e-3, "9e-05 m across.*--scale 1000 makes it 90 mm"),
-        (1e6, r"9e\+04 m across.*--scale 1e-06 makes it 90 mm$"),
+        (1000.0, r"90 m across.*scale 0.001 \(--units mm\) makes it 90 mm$"),
+        (100.0, r"9 m across.*scale 0.01 \(--units cm\) makes it 90 mm, scale 0.0254 \(--units inch\) makes it 229 mm"),
+        (
+            1 / 0.0254,
+            r"3.543 m across.*scale 0.0254 \(--units inch\) makes it 90 mm.*scale 0.01 \(--units cm\) makes it 35.4 mm",
+        ),
+        (1e-3, "9e-05 m across.*scale 1000 makes it 90 mm"),
+        (1e6, r"9e\+04 m across.*scale 1e-06 makes it 90 mm$"),
         (0.0, "0 m across.*all lie in one point"),
     ],
 )
@@ -85,10 +88,11 @@ def test_wrong_units_are_guessed_and_not_applied(factor, complaint):
 @pytest.mark.parametrize(
     ("size", "doubt"),
     [
-        (0.005, "small for a hand; if the file is not in metres, --scale 10 makes it 50 mm"),
+        (0.005, "small for a hand; if the file is not in metres, scale 10 makes it 50 mm"),
         (
             0.9,
-            "large for a hand; if the file is not in metres, --scale 0.1 makes it 90 mm, --units inch makes it 22.9 mm",
+            "large for a hand; if the file is not in metres, scale 0.1 makes it 90 mm, "
+            "scale 0.0254 (--units inch) makes it 22.9 mm",
         ),
         (0.09, None),
         (0.45, None),
@@ -104,13 +108,14 @@ def test_small_and_large_things_are_allowed_and_doubted(size, doubt):
 @pytest.mark.parametrize(
     ("scale", "size", "advice"),
     [
-        (0.01, 0.9, "in another unit, --units mm makes it 90 mm"),
+        (0.01, 0.9, "in another unit, scale 0.001 (--units mm) makes it 90 mm"),
         (
             1e-3,
             0.005,
-            "in another unit, --units inch makes it 127 mm, --units cm makes it 50 mm, --scale 0.1 makes it 500 mm",
+            "in another unit, scale 0.0254 (--units inch) makes it 127 mm, scale 0.01 (--units cm) makes it 50 mm, "
+            "scale 0.1 makes it 500 mm",
         ),
-        (10.0, 0.9, "in another unit, --scale 1 makes it 90 mm"),
+        (10.0, 0.9, "in another unit, scale 1 makes it 90 mm"),
     ],
 )
 def test_advice_is_on_what_to_pass_in_place_of_what_was_passed(scale, size, advice):
@@ -120,7 +125,7 @@ def test_advice_is_on_what_to_pass_in_place_of_what_was_passed(scale, size, advi
 
 @pytest.mark.parametrize(("size", "scale"), [(float("inf"), 1.0), (1e300, 1e-300), (5e-324, 1e10), (1e-9, 1e300)])
 def test_advice_on_absurd_numbers_is_a_number_still(size, scale):
-    assert re.fullmatch(r"--scale 1e[+-]\d+ makes it [\d.]+ mm", unit_advice(size, scale))
+    assert re.fullmatch(r"scale 1e[+-]\d+ makes it [\d.]+ mm", unit_advice(size, scale))
 
 
 def test_a_face_without_its_vertex_is_named(tmp_path):
