@@ -15,7 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from graspd_core.errors import ConfigError
 from graspd_ros.probe import foreign_rclpy
+from graspd_ros.ros_command import Parser
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -33,6 +35,11 @@ EXIT_BAD_INPUT = 2
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until a signal; 0 when stopped, 1 when it cannot go on, 2 for a bad argument or parameter."""
+    try:
+        _refuse_arguments(sys.argv[1:] if args is None else args)
+    except ConfigError as error:
+        sys.stderr.write(f"graspd_node: {error}\n")
+        return EXIT_BAD_INPUT
     # Nothing has been promised to anybody yet, and neither an import nor reading a hand can be ended otherwise.
     _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
@@ -74,6 +81,13 @@ def main(args: list[str] | None = None) -> int:
         sys.stderr.flush()
         os._exit(status)
     return status
+
+
+def _refuse_arguments(args: list[str]) -> None:
+    """Say what the node takes, where it is asked or is given what is not for ROS. Raises ConfigError."""
+    told = "Grasps of objects that are asked for over ROS 2; its parameters are in config/graspd.yaml."
+    parser = Parser(prog="graspd_node", usage="graspd_node [--ros-args -p NAME:=VALUE ...]", description=told)
+    parser.parse_args(args[: args.index("--ros-args")] if "--ros-args" in args else args)
 
 
 def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:

@@ -15,6 +15,8 @@ from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspRequest
 from rclpy.action.client import ActionClient
 
+from graspd_ros.node import main
+
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 256, "preset": "accurate", "time_budget": 600.0}
@@ -108,6 +110,15 @@ def test_a_bad_parameter_or_argument_ends_the_start_with_one_line(tmp_path, doma
     }
     for line, culprit in zip(refusals(tmp_path, domain, list(cases.values())), cases, strict=True):
         assert culprit in line
+
+
+def test_an_argument_that_is_not_for_ros_is_refused(capsys):
+    assert main(["--hand", "leap_right"]) == 2
+    assert "unrecognized arguments: --hand leap_right (see graspd_node --help)" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    assert "--ros-args" in capsys.readouterr().out
 
 
 def test_a_refused_start_is_the_status_of_the_process(start_node):
