@@ -166,9 +166,9 @@ def _all_trials(context: VerificationContext, grasp: Grasp, stop: StopHook) -> t
 
 
 def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Verified grasps, then those less sure by their probability, then those that failed; else in their order."""
+    """Verified grasps, then those less sure, then those that failed; among them by probability, then by score."""
     place = {Verdict.VERIFIED: 0, Verdict.UNVERIFIED: 1, Verdict.FAILED: 2}
-    return tuple(sorted(grasps, key=lambda g: (place[g.verdict], -(g.probability or 0.0))))
+    return tuple(sorted(grasps, key=lambda g: (place[g.verdict], -(g.probability or 0.0), -g.score)))
 
 
 def rank_by_robustness(
