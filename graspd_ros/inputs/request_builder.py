@@ -113,6 +113,8 @@ class RequestBuilder:
             listener=listener,
             timeless=timeless,
             object_key=found.key,
+            known=found.known,
+            surface=found.surface,
             exclude=tuple(message.exclude),
             exclude_poses=tuple(
                 (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
