@@ -95,8 +95,9 @@ class Planner:
         reach = reach_of(request, lambda target, source: self._lookup(target, source, stamp, stop))
         newest = Time()
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
-        # What an earlier run found was not asked for these wishes, and an arm may have stood elsewhere.
-        known = excluded and request.steering is None and not reach
+        # What an earlier run found was not asked for these wishes, and an arm may have stood elsewhere. A library has
+        # what that run found, and more.
+        known = excluded and request.steering is None and not reach and request.known is None
         result, file = self._runs.next_best(request, excluded) if known else None, ""
         if result is None:
             poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]

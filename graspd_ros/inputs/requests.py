@@ -134,6 +134,13 @@ def check_request(message: GraspRequest, hand: str) -> None:
     if message.use_target_point:
         point_of(message)
     check_camera_and_mask(message)
+    if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
+        raise _bad(f"surface: with source {message.source}, whose cloud shows it; valid with MESH=1 and KNOWN=4")
+    if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
+        told = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
+        raise _bad(
+            f"known_object: {message.known_object[:MOST_ID]!r} with {told}; valid with KNOWN=4, without mesh_uri"
+        )
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
         raise _bad(f"exclude: {len(message.exclude)} ids, {len(message.exclude_poses)} poses; valid: {MOST_EXCLUDED}")
 

@@ -180,7 +180,8 @@ def _from_known(given: SourceInput) -> SourceObject:
     pose, header = pose_matrix(message.object_pose), message.header
     surface = plane_of(message.surface, np.linalg.inv(pose))
     load = with_support(named_loader(known, settings), surface)
-    return SourceObject(header.frame_id or settings.mesh_frame, header.stamp, load, pose, known=known, surface=surface)
+    frame, key = header.frame_id or settings.mesh_frame, f"known {message.known_object}"
+    return SourceObject(frame, header.stamp, load, pose, key, known=known, surface=surface)
 
 
 def _from_latest_cloud(given: SourceInput) -> SourceObject:
