@@ -116,6 +116,11 @@ def mesh_key(uri: str, settings: Settings) -> str:
     return f"mesh {uri} {changed} {settings.mesh_scale} {settings.mass} {settings.friction}"
 
 
+def known_mesh(uri: str, settings: Settings) -> KnownObject | None:
+    """What a library may know a mesh by; None where the node has no library."""
+    return KnownObject("", str(resolve_mesh(uri, settings.mesh_roots)), False) if settings.grasp_library else None
+
+
 def frame_loader(
     frame: SensorFrame,
     settings: Settings,
@@ -159,7 +164,7 @@ def _from_mesh(given: SourceInput) -> SourceObject:
     uri, settings = given.message.mesh_uri, given.settings
     surface = plane_of(given.message.surface, np.linalg.inv(pose))
     load = with_support(mesh_loader(uri, settings), surface)
-    known = KnownObject("", str(resolve_mesh(uri, settings.mesh_roots)), False) if settings.grasp_library else None
+    known = known_mesh(uri, settings)
     # Grasps of an earlier run stand for another one where the same things stand about the object.
     stands = "" if surface is None else f" {surface.normal.round(4)} {surface.offset:.4f}"
     key = mesh_key(uri, settings) + stands

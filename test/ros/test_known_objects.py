@@ -72,6 +72,10 @@ class Node:
         request = self._builder.from_message(str(fields["id"]), self.settings, GraspRequest(**fields))
         return self._planner.plan(request, lambda: False, lambda _: None)
 
+    def answer_path(self, path: str) -> Planned:
+        request = self._builder.from_mesh("r", self.settings, path)
+        return self._planner.plan(request, lambda: False, lambda _: None)
+
 
 def known(**fields: object) -> dict[str, object]:
     return {"source": GraspRequest.KNOWN, "known_object": "ball", **fields}
@@ -103,6 +107,10 @@ def test_a_known_object_is_answered_where_it_stands_without_its_mesh_being_read(
     assert len(planned.result.grasps) == 2
     assert all(abs(grasp.grasp.position[0] - 5.0) < 0.3 for grasp in planned.result.grasps)
     assert "2 grasps of the library known.grasps" in planned.result.message
+
+
+def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandModel, unread: None):
+    assert "2 grasps of the library known.grasps" in Node(hand).answer_path("ball.obj").result.message
 
 
 def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unread: None):
