@@ -132,8 +132,13 @@ def measure_node(library: GraspLibrary, hand_name: str, count: int) -> None:
     command = [sys.executable, "-m", "graspd_ros.node", "--ros-args", *arguments]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     rclpy.init()
-    node, answers = rclpy.create_node("asks"), {}
-    node.create_subscription(GraspArray, "/graspd/grasps", lambda m: answers.update({m.request_id: m}), 100)
+    node = rclpy.create_node("asks")
+    answers: dict[str, GraspArray] = {}
+
+    def keep(message: GraspArray) -> None:
+        answers[message.request_id] = message
+
+    node.create_subscription(GraspArray, "/graspd/grasps", keep, 100)
     publisher = node.create_publisher(GraspRequest, "/graspd/request", 100)
 
     def ask(request_id: str, name: str) -> None:

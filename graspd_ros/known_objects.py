@@ -13,7 +13,7 @@ from graspd_core import HandModel, Reach, Scene, Steering, load_scene
 from graspd_core.library.find_entry import Physics, entry_by_file, entry_by_name
 from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.library.known_grasps import known_or_planned, library_result
-from graspd_core.library.library_entry import LibraryEntry
+from graspd_core.library.library_entry import LibraryEntry, hand_hash
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import GraspResult
 from graspd_ros.inputs.requests import KnownObject, Request
@@ -32,6 +32,13 @@ def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -
     if known.name:
         return entry_by_name(library, hand, known.name, physics)
     return entry_by_file(library, hand, known.path, settings.mesh_scale, physics, required=known.required)
+
+
+def warm_up_library(settings: Settings, hand: HandModel) -> None:
+    """Do the first-use work of a look-up. Raises FormatError: the library cannot be read."""
+    library = GraspLibrary(Path(settings.grasp_library))
+    for entry, _ in library.entries(hand_content=hand_hash(hand))[:1]:
+        library.grasps(entry, hand)
 
 
 def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:

@@ -17,7 +17,6 @@ import pytest
 
 from graspd_core import GraspResult, HandModel, Scene, load_hand, load_preset, load_scene
 from graspd_core.errors import FormatError
-from graspd_core.library import grasp_library as module
 from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.library.library_entry import LibraryEntry, entry_of, hand_hash
 from graspd_core.types import Grasp, Verdict
@@ -147,7 +146,7 @@ def test_a_library_that_nobody_may_write_is_read(library: GraspLibrary, hand, tm
     copy.parent.mkdir()
     copy.write_bytes(library.path.read_bytes())
     # As it is on a medium that cannot be written; the tests may run as one who may write anywhere.
-    monkeypatch.setattr(module.os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_: False)
     connected = []
     real = sqlite3.connect
 
@@ -155,7 +154,7 @@ def test_a_library_that_nobody_may_write_is_read(library: GraspLibrary, hand, tm
         connected.append(address)
         return real(address, **named)
 
-    monkeypatch.setattr(module.sqlite3, "connect", connect)
+    monkeypatch.setattr(sqlite3, "connect", connect)
     assert len(stored(GraspLibrary(copy), hand)[1]) == 4
     assert all(address.endswith("mode=ro&immutable=1") for address in connected)
     assert list(copy.parent.iterdir()) == [copy]

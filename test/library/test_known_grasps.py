@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from graspd_core import GraspResult, HandModel, Outcome, Scene, Steering, TriangleMesh, Verdict, load_hand, load_scene
-from graspd_core.errors import ConfigError, MeshError
+from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.library import known_grasps as module
 from graspd_core.library.find_entry import Physics, entry_by_file, entry_by_name
 from graspd_core.library.grasp_library import GraspLibrary
@@ -21,6 +21,7 @@ from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import load_preset
 from graspd_core.planning.steering.steering import angle_of_approach
+from graspd_core.trials.trial_registry import grasp_trials
 from graspd_core.types import Plane
 
 PHYSICS = Physics(mass=0.1, friction=0.6)
@@ -52,7 +53,7 @@ def test_what_is_missing_is_planned_and_added(library: GraspLibrary, scene: Scen
 
 def test_a_library_that_cannot_be_written_costs_no_grasp(library, scene, hand, monkeypatch: pytest.MonkeyPatch):
     def refuse(*_: object) -> int:
-        raise module.FormatError("known.grasps: the library cannot be used: disk is full")
+        raise FormatError("known.grasps: the library cannot be used: disk is full")
 
     monkeypatch.setattr(GraspLibrary, "add", refuse)
     result = known_or_planned(library, scene, hand, count=5, preset="fast")
@@ -88,7 +89,7 @@ def test_only_what_comes_near_something_is_tried_again(
     library: GraspLibrary, scene: Scene, hand: HandModel, planned: GraspResult, monkeypatch: pytest.MonkeyPatch
 ):
     tried = []
-    real = module.grasp_trials
+    real = grasp_trials
     monkeypatch.setattr(module, "grasp_trials", lambda *given: tried.append(1) or real(*given))
     for gap in (0.25, 0.01, -0.03):
         tried.clear()
