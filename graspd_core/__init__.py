@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from graspd_core.hands.library import hand_names as hand_names
     from graspd_core.hands.library import load_hand as load_hand
     from graspd_core.hands.model import HandModel as HandModel
+    from graspd_core.library.grasp_library import GraspLibrary as GraspLibrary
+    from graspd_core.library.known_grasps import known_grasps as known_grasps
+    from graspd_core.library.known_grasps import known_or_planned as known_or_planned
     from graspd_core.mesh.mesh_files import load_mesh as load_mesh
     from graspd_core.mesh.mesh_files import save_mesh as save_mesh
     from graspd_core.mesh.shapes import make_shape as make_shape
@@ -89,6 +92,8 @@ _MODULES = {
     "methods.plan_config": "PlanConfig load_preset override preset_names",
     "methods.problem": "build_problem",
     "planning.verify_grasps": "verify_grasps",
+    "library.grasp_library": "GraspLibrary",
+    "library.known_grasps": "known_grasps known_or_planned",
     "trials.trial_registry": "TRIALS Trial",
     "metrics.metric_registry": "METRICS Metric",
     "types": "ArmPath Grasp GraspResult Outcome Posture Progress TrialResult TriangleMesh Verdict",

@@ -287,6 +287,10 @@ class GraspNode(Node):
         torch.set_num_threads(read_settings(self).torch_threads)
         try:
             warm_up(self._hand, stop=self._worker.stopping)
+            if read_settings(self).grasp_library:
+                from graspd_ros.known_objects import warm_up_library
+
+                warm_up_library(read_settings(self), self._hand)
         except BaseException as error:  # without this the node would stand there deaf
             self._responses.tell_error("", "node", error)
             self._on_failure()

@@ -7,7 +7,6 @@ that it stands on, towards which no hand may go.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,9 +20,9 @@ from shape_msgs.msg import SolidPrimitive
 from graspd_core import HandModel, Scene, load_scene
 from graspd_core.errors import GraspdError
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.types import Plane
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.requests import Listener, Request, pose_matrix
+from graspd_ros.inputs.support_surface import plane_of, with_support
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings
@@ -94,10 +93,10 @@ def request_from_goal(
         told = f"group_name: {goal.group_name[:128]!r} is no hand here; this node plans for {hand!r}"
         raise RequestError(ErrorCode.WRONG_HAND, told)
     target = goal.object
-    plane = _plane(target)
+    plane = plane_of(target.surface)
     if target.meshes or target.primitives:
         mesh, header = _solid(target), target.header
-        load = _with_support(lambda: _load(mesh, settings), plane)
+        load = with_support(lambda: _load(mesh, settings), plane)
         return builder.from_loader(request_id, "grasp_planning", header, settings, load, listener)
     cluster = target.point_cluster
     if not cluster.data:
@@ -106,7 +105,7 @@ def request_from_goal(
     if plane is not None and target.header.frame_id not in ("", header.frame_id):
         raise _bad(f"surface: in {target.header.frame_id!r}, the point_cluster in {header.frame_id!r}; give one frame")
     request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, header, listener)
-    return replace(request, load=_with_support(request.load, plane))
+    return replace(request, load=with_support(request.load, plane))
 
 
 def _load(mesh: trimesh.Trimesh, settings: Settings) -> Scene:
@@ -114,30 +113,6 @@ def _load(mesh: trimesh.Trimesh, settings: Settings) -> Scene:
         path = Path(directory) / "object.ply"
         mesh.export(path)
         return run_isolated(load_scene, str(path), mass=settings.mass, friction=settings.friction)
-
-
-def _with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """The scene with what the object stands on; its free side is where the object is."""
-
-    def loaded() -> Scene:
-        scene = load()
-        if plane is None:
-            return scene
-        above = float(plane.normal @ scene.object.mesh.vertices.mean(0)) > plane.offset
-        return replace(scene, support=plane if above else Plane(-plane.normal, -plane.offset))
-
-    return loaded
-
-
-def _plane(target: Object) -> Plane | None:
-    """The support surface in the object's header's frame; None where all of its numbers are 0."""
-    a, b, c, d = map(float, target.surface.coef)
-    if not any((a, b, c, d)):
-        return None
-    length = float(np.linalg.norm([a, b, c]))
-    if not (np.isfinite([a, b, c, d]).all() and length > 0):
-        raise _bad(f"surface: {[a, b, c, d]} is no plane; its first three numbers are the normal")
-    return Plane(np.array([a, b, c]) / length, -d / length)
 
 
 def _solid(target: Object) -> trimesh.Trimesh:

@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 
 from graspd_core import load_arm, load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, FormatError
 from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
@@ -69,6 +69,16 @@ def _check_scene_config(path: str) -> None:
 def _check_arm(name: str) -> None:
     if name:
         load_arm(name)
+
+
+def _check_library(path: str) -> None:
+    if path:
+        from graspd_core.library.grasp_library import GraspLibrary
+
+        try:
+            GraspLibrary(Path(path)).checked()
+        except FormatError as error:
+            raise ConfigError(str(error)) from None
 
 
 def _check_corner(corner: Any) -> None:
@@ -141,6 +151,12 @@ class Settings:
         "path of a yaml file with settings of segmentation, reconstruction and obstacles, as of `graspd --scene`; "
         "empty: the defaults",
         check=_check_scene_config,
+    )
+    grasp_library: str = _setting(
+        "",
+        "path of a library of grasps, from `graspd library build`: what it knows is answered from it, and what is "
+        "planned for meshes is added; empty: none",
+        check=_check_library,
     )
     fixed_frame: str = _setting("", "frame that ~/add_view keeps views in, by /tf; empty: that of the first view")
     output_frame: str = _setting("", "frame of the results, by /tf; empty: the frame of the input")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -95,8 +95,9 @@ class Planner:
         reach = reach_of(request, lambda target, source: self._lookup(target, source, stamp, stop))
         newest = Time()
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
-        # What an earlier run found was not asked for these wishes, and an arm may have stood elsewhere.
-        known = excluded and request.steering is None and not reach
+        # What an earlier run found was not asked for these wishes, and an arm may have stood elsewhere. A library has
+        # what that run found, and more.
+        known = excluded and request.steering is None and not reach and request.known is None
         result, file = self._runs.next_best(request, excluded) if known else None, ""
         if result is None:
             poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
@@ -118,22 +119,26 @@ class Planner:
         """A run, without grasps like those excluded, and the file that it was written to."""
         settings = request.settings
         config = load_preset(settings.preset)
-        scene = request.load()
         steering = () if request.steering is None else (request.steering(),)
-        result = plan_grasps(
-            scene,
-            self._hand,
-            # Some may be like those excluded, which other starts make less likely.
-            count=settings.num_grasps + len(excluded),
-            seed=settings.seed + len(excluded),
-            preset=config,
-            verify=settings.verify,
-            deadline=max(request.time_left(), 1e-3),
-            device=settings.device,
-            restrictions=(*steering, *reach),
-            progress=tell,
-            stop=stop,
-        )
+        restrictions = (*steering, *reach)
+        plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": tell, "stop": stop}
+        # Of those that are planned some may be like those excluded, which other starts make less likely.
+        plan["seed"] = settings.seed + len(excluded)
+        if settings.grasp_library and request.known is not None:
+            from graspd_ros.known_objects import answer_known
+
+            result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
+        else:
+            scene = request.load()
+            result = plan_grasps(
+                scene,
+                self._hand,
+                count=settings.num_grasps + len(excluded),
+                verify=settings.verify,
+                deadline=max(request.time_left(), 1e-3),
+                restrictions=restrictions,
+                **plan,
+            )
         if excluded:
             result = without(result, excluded, settings.num_grasps)
         if not settings.output_dir or stop():
@@ -142,6 +147,7 @@ class Planner:
         # As planned: a mesh's grasps in the mesh's own frame, wherever it stands.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
         seconds = request.stamp.sec + 1e-9 * request.stamp.nanosec
+        scene = scene or request.load()
         save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
         return result, str(path)
 

@@ -75,16 +75,17 @@ MAY_IMPORT = {
     "trials": UP_TO_CONTACT,
     "formats": BASE | {"mesh", "scene", "hands", "methods", "metrics"},
     "planning": BELOW_PLANNING | {"arms"},
-    "__init__": BELOW_PLANNING | {"arms", "planning"},
+    "library": BELOW_PLANNING | {"planning"},
+    "__init__": BELOW_PLANNING | {"arms", "planning", "library"},
     "bench": BELOW_PLANNING | {"arms", "planning", "__init__"},
     "doctor": BELOW_PLANNING | {"planning", "__init__"},
     "viewer": BELOW_PLANNING | {"planning", "bench", "__init__"},
     "dataset": BELOW_PLANNING | {"planning", "bench", "__init__"},
-    "cli": BELOW_PLANNING | {"arms", "planning", "bench", "dataset", "doctor", "viewer", "__init__"},
+    "cli": BELOW_PLANNING | {"arms", "planning", "bench", "dataset", "library", "doctor", "viewer", "__init__"},
 }
 # What the node sees: the public names, values, the viewer, and what only a process that serves needs.
 NODE_SEES = {"__init__", "config", "types", "errors", "paths", "transforms", "bags", "viewer"}
-NODE_SEES |= {"runtime", "hands", "arms", "pointcloud", "formats", "planning"}
+NODE_SEES |= {"runtime", "hands", "arms", "pointcloud", "formats", "planning", "library"}
 
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {

@@ -159,9 +159,21 @@ def intrusion(
 
     `pregrasp` and `grasp` are base translations and joints; the base is turned alike in both.
     """
+    return (-gap_on_the_way(obstacles, kinematics, quaternion, pregrasp, grasp)).clamp_min(0.0)
+
+
+@torch.no_grad()
+def gap_on_the_way(
+    obstacles: ObstacleTensors,
+    kinematics: Kinematics,
+    quaternion: Float[Tensor, "batch 4"],
+    pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
+    grasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
+) -> Float[Tensor, "batch"]:
+    """Least signed distance [m] of the hand to any obstacle on the way of `intrusion`, negative inside."""
     rotation = rotation_from_quaternion(quaternion)
     back = rotation @ obstacles.retreat
     way = [(pregrasp[0] + RETREAT * share * back, pregrasp[1]) for share in RETREAT_SHARES]
     way += [(a * pregrasp[0] + (1 - a) * grasp[0], a * pregrasp[1] + (1 - a) * grasp[1]) for a in _WAY_SHARES]
     gaps = [obstacle_gaps(obstacles, SE3(rotation, at), forward(kinematics, joints)).amin(-1) for at, joints in way]
-    return (-torch.stack(gaps).amin(0)).clamp_min(0.0)
+    return torch.stack(gaps).amin(0)

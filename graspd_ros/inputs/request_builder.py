@@ -22,6 +22,7 @@ from graspd_ros.inputs.source_registry import (
     SourceInput,
     SourceObject,
     frame_loader,
+    known_mesh,
     latest_frame,
     mesh_loader,
     source_of,
@@ -75,8 +76,8 @@ class RequestBuilder:
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
         """A mesh named by its path alone. Raises MeshError."""
-        load = mesh_loader(uri, settings)
-        return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True)
+        load, known = mesh_loader(uri, settings), known_mesh(uri, settings)
+        return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True, known=known)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
         """What a camera showed unasked. Raises RequestError: it is too old."""
@@ -113,6 +114,8 @@ class RequestBuilder:
             listener=listener,
             timeless=timeless,
             object_key=found.key,
+            known=found.known,
+            surface=found.surface,
             exclude=tuple(message.exclude),
             exclude_poses=tuple(
                 (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))

@@ -15,6 +15,7 @@ from graspd_msgs.msg import Grasp, GraspArray, GraspProgress, GraspRequest
 from jaxtyping import Float
 
 from graspd_core import Scene, Steering, preset_names
+from graspd_core.types import Plane
 from graspd_ros.inputs.frames import matrix_of_pose
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
@@ -34,13 +35,28 @@ class Listener(Protocol):
     def ended(self, message: GraspArray) -> None: ...
 
 
+@dataclass(frozen=True)
+class KnownObject:
+    """An object as a request names it.
+
+    Attributes:
+        name: what the library calls it; empty: `path` is meant.
+        path: of its mesh file.
+        required: whether a library must know it.
+    """
+
+    name: str
+    path: str
+    required: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Request:
     """One object to grasp.
 
     Attributes:
         id: names the request in every answer.
-        source: name of its source (`source_registry`): mesh, cloud, latest_cloud or views.
+        source: name of its source (`source_registry`): mesh, cloud, latest_cloud, views or known.
         frame: the frame that the results are told in, unless the settings name an output_frame.
         stamp: when the object was as it was given.
         settings: the parameters at the time of the request, with what the request itself asks for.
@@ -52,6 +68,8 @@ class Request:
         object_key: same for requests of the very same object, as it is or was seen then; empty: none is the same.
         exclude: ids of grasps that the answer must not be like.
         exclude_poses: the same by frame and pose of the base link in it.
+        known: what a library of grasps may know the object by; None: nothing.
+        surface: what the object stands on, in its own frame; None: nothing.
         steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
             GraspdError. None where nothing is asked.
         accepted: when the request came, by the monotonic clock [s].
@@ -70,6 +88,8 @@ class Request:
     object_key: str = ""
     exclude: tuple[str, ...] = ()
     exclude_poses: tuple[tuple[str, Float[np.ndarray, "4 4"]], ...] = ()
+    known: KnownObject | None = None
+    surface: Plane | None = None
     steering: Callable[[], Steering] | None = None
     accepted: float = field(default_factory=time.monotonic)
 
@@ -114,6 +134,13 @@ def check_request(message: GraspRequest, hand: str) -> None:
     if message.use_target_point:
         point_of(message)
     check_camera_and_mask(message)
+    if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
+        raise _bad(f"surface: with source {message.source}, whose cloud shows it; valid with MESH=1 and KNOWN=4")
+    if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
+        told = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
+        raise _bad(
+            f"known_object: {message.known_object[:MOST_ID]!r} with {told}; valid with KNOWN=4, without mesh_uri"
+        )
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
         raise _bad(f"exclude: {len(message.exclude)} ids, {len(message.exclude_poses)} poses; valid: {MOST_EXCLUDED}")
 

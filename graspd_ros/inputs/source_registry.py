@@ -14,9 +14,10 @@ from sensor_msgs.msg import Image
 
 from graspd_core import Scene, Target, load_scene
 from graspd_core.runtime.worker_process import run_isolated
+from graspd_core.types import Plane
 from graspd_ros.inputs.camera_place import CameraPlace, masked_cloud, place_of, seen_by_camera
 from graspd_ros.inputs.mesh_path import resolve_mesh
-from graspd_ros.inputs.requests import point_of, pose_matrix
+from graspd_ros.inputs.requests import KnownObject, point_of, pose_matrix
 from graspd_ros.inputs.sensor_frames import (
     SensorFrame,
     Views,
@@ -26,6 +27,7 @@ from graspd_ros.inputs.sensor_frames import (
     trimmed,
     within,
 )
+from graspd_ros.inputs.support_surface import plane_of, with_support
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings
 
@@ -65,6 +67,8 @@ class SourceObject:
         load: reads the object; slow, may raise a GraspdError.
         T_frame_object: pose of the object's own frame in `frame`; None where they are one.
         key: same for the very same object, as it is or was seen then; empty where nobody can tell.
+        known: what a library of grasps may know it by; None: nothing.
+        surface: what it stands on, in its own frame; None: nothing, or the cloud shows it.
         shown: reads the points that the request's region_mask shows, in `frame` [m]; None where there is no image.
     """
 
@@ -73,6 +77,8 @@ class SourceObject:
     load: Callable[[], Scene]
     T_frame_object: Float[np.ndarray, "4 4"] | None = None
     key: str = ""
+    known: KnownObject | None = None
+    surface: Plane | None = None
     shown: Callable[[], Float[np.ndarray, "points 3"]] | None = None
 
 
@@ -108,6 +114,11 @@ def mesh_key(uri: str, settings: Settings) -> str:
     """Same for the same mesh in the same size, as long as the file is not written again."""
     changed = resolve_mesh(uri, settings.mesh_roots).stat().st_mtime_ns
     return f"mesh {uri} {changed} {settings.mesh_scale} {settings.mass} {settings.friction}"
+
+
+def known_mesh(uri: str, settings: Settings) -> KnownObject | None:
+    """What a library may know a mesh by; None where the node has no library."""
+    return KnownObject("", str(resolve_mesh(uri, settings.mesh_roots)), False) if settings.grasp_library else None
 
 
 def frame_loader(
@@ -150,8 +161,32 @@ def _from_cloud(given: SourceInput) -> SourceObject:
 def _from_mesh(given: SourceInput) -> SourceObject:
     header = given.message.header
     frame, pose = header.frame_id or given.settings.mesh_frame, pose_matrix(given.message.object_pose)
-    load = mesh_loader(given.message.mesh_uri, given.settings)
-    return SourceObject(frame, header.stamp, load, pose, mesh_key(given.message.mesh_uri, given.settings))
+    uri, settings = given.message.mesh_uri, given.settings
+    surface = plane_of(given.message.surface, np.linalg.inv(pose))
+    load = with_support(mesh_loader(uri, settings), surface)
+    known = known_mesh(uri, settings)
+    # Grasps of an earlier run stand for another one where the same things stand about the object.
+    stands = "" if surface is None else f" {surface.normal.round(4)} {surface.offset:.4f}"
+    key = mesh_key(uri, settings) + stands
+    return SourceObject(frame, header.stamp, load, pose, key, known=known, surface=surface)
+
+
+def _from_known(given: SourceInput) -> SourceObject:
+    message, settings = given.message, given.settings
+    if not settings.grasp_library:
+        raise RequestError(ErrorCode.BAD_REQUEST, "source: KNOWN=4, and the parameter grasp_library names no library")
+    if not message.known_object:
+        found = _from_mesh(given)
+        return replace(found, known=found.known and replace(found.known, required=True))
+    # A node without a library imports nothing of it.
+    from graspd_ros.known_objects import named_loader
+
+    known = KnownObject(message.known_object, "", True)
+    pose, header = pose_matrix(message.object_pose), message.header
+    surface = plane_of(message.surface, np.linalg.inv(pose))
+    load = with_support(named_loader(known, settings), surface)
+    frame, key = header.frame_id or settings.mesh_frame, f"known {message.known_object}"
+    return SourceObject(frame, header.stamp, load, pose, key, known=known, surface=surface)
 
 
 def _from_latest_cloud(given: SourceInput) -> SourceObject:
@@ -172,6 +207,7 @@ SOURCES: dict[int, Source] = {
     GraspRequest.MESH: Source("mesh", _from_mesh),
     GraspRequest.LATEST_CLOUD: Source("latest_cloud", _from_latest_cloud),
     GraspRequest.VIEWS: Source("views", _from_views),
+    GraspRequest.KNOWN: Source("known", _from_known),
 }
 
 

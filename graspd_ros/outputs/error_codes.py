@@ -7,6 +7,7 @@ from enum import StrEnum
 from graspd_core.errors import (
     CloudError,
     ConfigError,
+    FormatError,
     GraspdError,
     HandError,
     MeshError,
@@ -23,6 +24,7 @@ class ErrorCode(StrEnum):
     BAD_REQUEST = "BAD_REQUEST"  # a field is out of range or unknown
     BAD_MESH = "BAD_MESH"  # the mesh cannot be read, used or reached
     BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows nothing usable
+    BAD_LIBRARY = "BAD_LIBRARY"  # grasp_library is torn, of another version, locked or gone
     NO_OBJECT = "NO_OBJECT"  # the scene was seen, and what was asked for is not in it
     NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD, and none has come; VIEWS, and none is kept
     STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
@@ -56,6 +58,7 @@ _CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
     (TransformError, ErrorCode.NO_TRANSFORM),
     (HandError, ErrorCode.WRONG_HAND),
     (ConfigError, ErrorCode.BAD_REQUEST),
+    (FormatError, ErrorCode.BAD_LIBRARY),
     (ResourceError, ErrorCode.OUT_OF_MEMORY),
     (MemoryError, ErrorCode.OUT_OF_MEMORY),
 )

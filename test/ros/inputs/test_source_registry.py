@@ -34,7 +34,9 @@ def test_every_constant_of_the_message_has_its_row():
 
 def test_a_source_without_a_row_is_refused_and_the_rows_are_named(builder, monkeypatch: pytest.MonkeyPatch):
     request = GraspRequest(source=SCANNER)
-    with pytest.raises(RequestError, match=r"source: 9; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3$") as refused:
+    with pytest.raises(
+        RequestError, match=r"source: 9; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3, KNOWN=4$"
+    ) as refused:
         builder.from_message("r", Settings(), request)
     assert refused.value.code is ErrorCode.BAD_REQUEST
     monkeypatch.setitem(SOURCES, 7, replace(SOURCES[GraspRequest.CLOUD], name="lidar"))

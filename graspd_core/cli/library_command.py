@@ -1,0 +1,101 @@
+"""`graspd library`: verified grasps of known objects in a file, and what is in one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_core.cli.planning_options import add_planning_options, planning_options
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
+from graspd_core.errors import ConfigError, MeshError
+
+if TYPE_CHECKING:
+    from graspd_core.library.grasp_library import GraspLibrary
+    from graspd_core.library.library_entry import LibraryEntry
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("library", help="verified grasps of known objects, kept in a file")
+    actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
+    build = actions.add_parser("build", help="plan for meshes and add what holds; what is there already is kept")
+    build.set_defaults(run=_build)
+    build.add_argument("meshes", nargs="*", metavar="MESH", help="mesh files, folders of them, or shape:NAME")
+    build.add_argument("--out", type=Path, required=True, metavar="FILE", help="the library; made where there is none")
+    build.add_argument("--scales", type=float, nargs="+", default=(1.0,), metavar="S", help="metres per unit of a file")
+    add_planning_options(build)
+    shown = actions.add_parser("list", help="the objects of a library")
+    shown.set_defaults(run=_list)
+    shown.add_argument("library", type=Path, metavar="FILE")
+
+
+def _build(options: argparse.Namespace) -> int:
+    """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 after Ctrl-C."""
+    from graspd_core.bench.study import object_sources
+    from graspd_core.hands.library import load_hand
+    from graspd_core.library.grasp_library import GraspLibrary
+
+    config, request = planning_options(options)
+    if options.verify == "none":
+        raise ConfigError("verify: none; a library holds verified grasps: standard, full, hard or hard_full")
+    sources, hand = object_sources(options.meshes), load_hand(options.hand)
+    library = GraspLibrary(options.out)
+    library.create()
+    library.checked()
+    short = 0
+    with Interrupt() as interrupt:
+        for source, scale in [(source, scale) for source in sources for scale in options.scales]:
+            if interrupt.came():
+                break
+            try:
+                has = _add_object(options, library, source, scale, hand, config, request, interrupt.came)
+            except MeshError as error:
+                print(f"graspd: {error}", file=sys.stderr)
+                has = 0
+            short += has < options.count
+    return EXIT_INTERRUPTED if interrupt.came() else EXIT_TOO_FEW if short else EXIT_OK
+
+
+def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
+    """Plan what an object lacks and add it; how many grasps it has then."""
+    from graspd_core.library.known_grasps import add_planned
+    from graspd_core.library.library_entry import entry_of
+    from graspd_core.planning.plan_grasps import plan_grasps
+    from graspd_core.scene.load_scene import load_scene
+
+    hand, config, request, stop = rest
+    scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)
+    for warning in scene.object.warnings:
+        print(f"graspd: {warning}", file=sys.stderr)
+    entry = entry_of(scene.object, hand, options.verify)
+    _refuse_name(library, entry)
+    has = len(library.grasps(entry, hand))
+    if has >= options.count:
+        print(f"{entry.name}: {has} grasps are there")
+        return has
+    asked = {**request, "count": options.count - has, "seed": options.seed + has}
+    result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, stop=stop, **asked)
+    has = add_planned(library, scene, hand, config, result.grasps, options.verify) or has
+    print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)
+    return has
+
+
+def _refuse_name(library: GraspLibrary, entry: LibraryEntry) -> None:
+    """Refuse an object that would go by the name of another one. Raises ConfigError."""
+    for other, _ in library.entries(name=entry.name):
+        if other.source != entry.source and other.mesh_sha256 != entry.mesh_sha256:
+            told = f"{entry.source}: the library {library.path} has another {entry.name!r}, of {other.source}"
+            raise ConfigError(f"{told}; give one of the files another name")
+
+
+def _list(options: argparse.Namespace) -> int:
+    from graspd_core.library.grasp_library import GraspLibrary
+
+    rows = GraspLibrary(options.library).checked().entries()
+    for entry, grasps in rows:
+        physics = f"{entry.mass:g} kg, friction {entry.friction:g}, {entry.verify}"
+        print(f"{entry.name:24} {entry.hand:20} {grasps:4} grasps  {physics:32} {entry.source}")
+    print(f"{options.library}: {len(rows)} records, {sum(grasps for _, grasps in rows)} grasps")
+    return EXIT_OK

@@ -1,0 +1,222 @@
+"""Grasps of an object that a library knows, in the scene that it is in now; what is missing is planned and added.
+
+On an object with nothing about it they are as good as on the day that they were tried. Where something stands about it,
+a hand that would reach into that is refused, one that comes near is tried again, and all others stay as they are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.errors import FormatError
+from graspd_core.hands.kinematics import make_kinematics
+from graspd_core.hands.model import HandModel
+from graspd_core.library.grasp_library import GraspLibrary
+from graspd_core.library.library_entry import entry_of
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods.obstacle_distance import gap_on_the_way, make_obstacle_tensors
+from graspd_core.methods.plan_config import PlanConfig, load_preset
+from graspd_core.methods.restrictions import BoundRestrictions, Restriction, restrictions_in_words
+from graspd_core.planning.plan_grasps import check_request, plan_grasps
+from graspd_core.scene.scene import Scene, object_parts
+from graspd_core.trials.trial_registry import build_worlds, grasp_trials
+from graspd_core.trials.world import PROTOCOLS, at_friction
+from graspd_core.types import Grasp, GraspResult, Outcome, Posture, StopHook, Timing, Verdict
+
+# Where hand or object is nearer to something than this [m], a grasp is tried again.
+NEAR = 0.03
+# Deeper in something than this is no grasp [m]: the search itself allows as much.
+_DEEP = 0.005
+
+Wanted = Callable[[Sequence[Grasp]], Sequence[Grasp]]
+
+
+def known_grasps(
+    library: GraspLibrary,
+    scene: Scene,
+    hand: HandModel,
+    *,
+    count: int = 16,
+    restrictions: Sequence[Restriction] = (),
+    verify: str = "standard",
+    wanted: Wanted = list,
+    stop: StopHook | None = None,
+) -> GraspResult:
+    """At most `count` grasps that the library has of the scene's object, all verified; none where it does not know it.
+
+    Args:
+        library: from `GraspLibrary(path).checked()`.
+        scene: known by its mesh, mass and friction; support and obstacles are looked at.
+        hand: known by its content.
+        count: grasps wanted.
+        restrictions: as of `plan_grasps`.
+        verify: trials that they must have passed; stricter ones are good too.
+        wanted: chooses of the stored grasps those that may be given.
+        stop: polled; true ends the trials.
+
+    Raises:
+        FormatError: the library is torn, of another version or not there.
+        ConfigError: a number or a restriction is not valid.
+    """
+    began = time.perf_counter()
+    check_request(count=count, seed=0, verify=verify, deadline=None, device="cpu")
+    bound = BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
+    entries = library.of_mesh(entry_of(scene.object, hand, verify))
+    stored = [grasp for entry in entries for grasp in library.grasps(entry, hand)]
+    admitted, refused = bound.admit(tuple(wanted(stored)))
+    good: list[Grasp] = []
+    for grasp, reason in _held(scene, hand, admitted, verify, stop or (lambda: False)):
+        if reason:
+            refused[reason] += 1
+            continue
+        good.append(grasp)
+        if len(good) == count:
+            break
+    told = restrictions_in_words(bound, refused, len(good), len(admitted)) if refused else ""
+    result = library_result(library, good, count, time.perf_counter() - began)
+    return replace(result, message="; ".join(filter(None, (result.message, told))), refused=refused)
+
+
+def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
+    """Grasps of a library as a result of `count` wanted, which took so long."""
+    outcome = Outcome.SUCCEEDED if len(grasps) >= count else Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
+    timing = Timing(first_verified=seconds if grasps else None, total=seconds)
+    told = f"{len(grasps)} grasps of the library {library.path.name}"
+    return GraspResult(outcome, tuple(grasps), timing, 0, "library", told)
+
+
+def known_or_planned(
+    library: GraspLibrary,
+    scene: Scene,
+    hand: HandModel,
+    *,
+    count: int = 16,
+    seed: int = 0,
+    preset: str | PlanConfig = "balanced",
+    verify: str = "standard",
+    restrictions: Sequence[Restriction] = (),
+    wanted: Wanted = list,
+    name: str = "",
+    **request: Any,
+) -> GraspResult:
+    """What the library has, and what is missing of `count` grasps from `plan_grasps`, whose verified ones are added.
+
+    `wanted` chooses which grasps count, stored and planned ones; `name` is what the library is to call the object;
+    all else is as of `plan_grasps`. A library that cannot be written is a warning in the result.
+    """
+    began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
+    left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
+    over = lambda: (stop is not None and stop()) or (left() or 1.0) <= 0  # noqa: E731
+    asked: dict[str, Any] = {"verify": verify, "restrictions": restrictions}
+    known = known_grasps(library, scene, hand, count=count, wanted=wanted, stop=over, **asked)
+    found = len(known.grasps)
+    if found >= count:
+        return known
+    config = load_preset(preset) if isinstance(preset, str) else preset
+    rest = None if deadline is None else max(left() or 0.0, 1e-3)
+    # Another seed than that of the stored grasps, which would be found again.
+    asked |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
+    planned = plan_grasps(scene, hand, **asked, **request)
+    warnings = planned.warnings
+    try:
+        add_planned(library, scene, hand, config, planned.grasps, verify, name)
+    except FormatError as error:
+        warnings = (*warnings, f"{error}; what was planned is not kept")
+    new = wanted([grasp for grasp in planned.grasps if grasp.usable])
+    outcome = planned.outcome
+    if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
+        outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
+    told = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
+    return replace(
+        planned,
+        outcome=outcome,
+        grasps=(*known.grasps, *new, *(grasp for grasp in planned.grasps if not grasp.usable)),
+        message="; ".join(filter(None, (told, planned.message))),
+        warnings=warnings,
+        refused=Counter(known.refused) + Counter(planned.refused),
+    )
+
+
+def add_planned(
+    library: GraspLibrary,
+    scene: Scene,
+    hand: HandModel,
+    config: PlanConfig,
+    grasps: Iterable[Grasp],
+    verify: str,
+    name: str = "",
+) -> int:
+    """Put the verified ones of a run into the library, with the trial of the object alone; how many it has then.
+
+    Raises FormatError: the library cannot be written.
+    """
+    if verify == "none":
+        return 0
+    alone = [
+        replace(grasp, trials=tuple(trial for trial in grasp.trials if trial.name == "hold"))
+        for grasp in grasps
+        if grasp.verdict is Verdict.VERIFIED
+    ]
+    return library.add(entry_of(scene.object, hand, verify, name), scene.object, hand, config, alone) if alone else 0
+
+
+def _held(
+    scene: Scene, hand: HandModel, grasps: Sequence[Grasp], verify: str, stop: StopHook
+) -> Iterable[tuple[Grasp, str]]:
+    """Each grasp, tried again where something stands near, and why it is none here; one at a time."""
+    gaps = clearance(scene, hand, grasps)
+    gaps = np.minimum(gaps, NEAR / 2) if _hemmed_in(scene) else gaps
+    worlds = None
+    # Those that need no trial come first.
+    for index in np.argsort(gaps < NEAR, kind="stable"):
+        grasp, gap = grasps[index], gaps[index]
+        if gap < -_DEEP:
+            yield grasp, "with a link in what stands about the object"
+        elif gap >= NEAR:
+            yield grasp, ""
+        else:
+            if stop():
+                return
+            if worlds is None:
+                protocol = at_friction(PROTOCOLS["standard" if verify == "none" else verify], scene.object.friction)
+                worlds = build_worlds(scene, hand, object_parts(scene.object), protocol)
+            tried = replace(grasp, trials=grasp_trials(worlds, grasp, stop))
+            yield tried, "" if tried.verdict is Verdict.VERIFIED else "that did not hold beside what stands near"
+
+
+def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
+    """Least distance [m] of each hand to support and obstacles from its retreat to its squeeze, negative inside.
+
+    Infinite where it can reach none.
+    """
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
+    if obstacles is None or not grasps:
+        return np.full(len(grasps), np.inf)
+
+    def ends(stage: str) -> tuple[torch.Tensor, torch.Tensor]:
+        postures: list[Posture] = [getattr(grasp, stage) for grasp in grasps]
+        return _rows([p.position for p in postures]), _rows([p.joint_positions for p in postures])
+
+    turns = _rows([grasp.grasp.quaternion_wxyz for grasp in grasps])
+    kinematics = make_kinematics(hand, dtype=torch.float64)
+    ways = [("pregrasp", "grasp"), ("grasp", "squeeze")]
+    gaps = [gap_on_the_way(obstacles, kinematics, turns, ends(a), ends(b)) for a, b in ways]
+    return torch.stack(gaps).amin(0).numpy()
+
+
+def _hemmed_in(scene: Scene) -> bool:
+    """Whether an obstacle is so near to the object that the object itself may strike it."""
+    vertices = torch.as_tensor(scene.object.mesh.vertices)
+    return any(float(sample_sdf(o.sdf, vertices.to(o.sdf.field))[0].min()) < NEAR for o in scene.obstacles)
+
+
+def _rows(values: Sequence[np.ndarray]) -> torch.Tensor:
+    return torch.as_tensor(np.stack(values)).double()

@@ -1,0 +1,84 @@
+"""Answers from a library of grasps: at once where nothing stands about the object; what it lacks is planned."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_core import HandModel, Reach, Scene, Steering, load_scene
+from graspd_core.library.find_entry import Physics, entry_by_file, entry_by_name
+from graspd_core.library.grasp_library import GraspLibrary
+from graspd_core.library.known_grasps import known_or_planned, library_result
+from graspd_core.library.library_entry import LibraryEntry, hand_hash
+from graspd_core.runtime.worker_process import run_isolated
+from graspd_core.types import GraspResult
+from graspd_ros.inputs.requests import KnownObject, Request
+from graspd_ros.parameters import Settings
+from graspd_ros.recovery import unlike
+
+
+def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -> LibraryEntry | None:
+    """What the library has for a request and a hand, any where that is None; None where it need not know the object.
+
+    Raises:
+        GraspdError: the library must know the object and does not, or cannot be read.
+    """
+    library = GraspLibrary(Path(settings.grasp_library))
+    physics = Physics(settings.mass, settings.friction, settings.verify)
+    if known.name:
+        return entry_by_name(library, hand, known.name, physics)
+    return entry_by_file(library, hand, known.path, settings.mesh_scale, physics, required=known.required)
+
+
+def warm_up_library(settings: Settings, hand: HandModel) -> None:
+    """Do the first-use work of a look-up. Raises FormatError: the library cannot be read."""
+    library = GraspLibrary(Path(settings.grasp_library))
+    for entry, _ in library.entries(hand_content=hand_hash(hand))[:1]:
+        library.grasps(entry, hand)
+
+
+def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
+    """A function that reads the mesh of an object by its name in the library."""
+
+    def load() -> Scene:
+        entry = find_entry(known, settings, None)
+        assert entry is not None
+        numbers = {"mass": entry.mass, "friction": entry.friction, "scale": entry.scale}
+        return run_isolated(load_scene, entry.source, **numbers)
+
+    return load
+
+
+def answer_known(
+    request: Request,
+    known: KnownObject,
+    hand: HandModel,
+    excluded: Sequence[np.ndarray],
+    restrictions: Sequence[Steering | Reach],
+    **plan: Any,
+) -> tuple[GraspResult, Scene | None]:
+    """Grasps of the library, and planned ones where they are too few; and the scene if it was read.
+
+    None is like those excluded.
+
+    Raises GraspdError: see `find_entry`, and what loading and planning raise.
+    """
+    began, settings = time.perf_counter(), request.settings
+    count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))
+    entry = find_entry(known, settings, hand)
+    if entry is not None and not restrictions and request.surface is None:
+        grasps = unlike(library.grasps(entry, hand), excluded)[:count]
+        if len(grasps) >= count:
+            return library_result(library, grasps, count, time.perf_counter() - began), None
+    scene = request.load()
+    plan |= {
+        "deadline": max(request.time_left(), 1e-3),
+        "count": count,
+        "verify": settings.verify,
+        "restrictions": restrictions,
+    }
+    return known_or_planned(library, scene, hand, wanted=lambda grasps: unlike(grasps, excluded), **plan), scene

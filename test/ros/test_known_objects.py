@@ -1,0 +1,215 @@
+"""Requests for objects that a library knows: what answers them, what is planned for them, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, Vector3
+from graspd_msgs.msg import GraspArray, GraspRequest
+from shape_msgs.msg import Plane
+from std_msgs.msg import Header
+
+from graspd_core import HandModel, Outcome, TriangleMesh, load_hand, load_scene, make_shape
+from graspd_core.errors import ConfigError, GraspdError, MeshError
+from graspd_core.library.grasp_library import GraspLibrary
+from graspd_core.library.known_grasps import known_or_planned
+from graspd_core.mesh.mesh_files import save_mesh
+from graspd_ros import known_objects
+from graspd_ros.inputs import source_registry
+from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.outputs.error_codes import ErrorCode, code_of
+from graspd_ros.parameters import Settings
+from graspd_ros.request_planner import Planned, Planner
+from graspd_ros.worker import StopHook
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return load_hand("allegro_right")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory, hand: HandModel) -> Path:
+    """A folder with a mesh and a library that knows it."""
+    folder = tmp_path_factory.mktemp("known")
+    save_mesh(make_shape("sphere"), folder / "ball.obj")
+    library = GraspLibrary(folder / "known.grasps")
+    library.create()
+    known_or_planned(library, load_scene(folder / "ball.obj"), hand, count=3, preset="fast")
+    return folder
+
+
+@pytest.fixture
+def folder(built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, in which the node runs; its mesh stands where the library says."""
+    shutil.copytree(built, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class Node:
+    """What the node does with a message, without ROS around it."""
+
+    def __init__(self, hand: HandModel, **settings: object) -> None:
+        usual = {"preset": "fast", "num_grasps": 2, "grasp_library": "known.grasps", "mesh_roots": ["."]}
+        self.settings = Settings(**{**usual, **settings})
+        self._builder = RequestBuilder(hand.name, lambda: Time(sec=1), lambda *_: np.eye(4))
+        self._planner = Planner(hand, self._lookup)
+
+    @staticmethod
+    def _lookup(target: str, source: str, stamp: Time, stop: StopHook) -> np.ndarray:
+        return np.eye(4)
+
+    def answer(self, **fields: object) -> Planned:
+        fields.setdefault("id", "r")
+        request = self._builder.from_message(str(fields["id"]), self.settings, GraspRequest(**fields))
+        return self._planner.plan(request, lambda: False, lambda _: None)
+
+    def answer_path(self, path: str) -> Planned:
+        request = self._builder.from_mesh("r", self.settings, path)
+        return self._planner.plan(request, lambda: False, lambda _: None)
+
+
+def known(**fields: object) -> dict[str, object]:
+    return {"source": GraspRequest.KNOWN, "known_object": "ball", **fields}
+
+
+@pytest.fixture
+def unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No mesh is read."""
+
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("a mesh was read")
+
+    for module in (known_objects, source_registry):
+        monkeypatch.setattr(module, "run_isolated", read)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        known(),
+        {"source": GraspRequest.KNOWN, "mesh_uri": "ball.obj"},
+        {"source": GraspRequest.MESH, "mesh_uri": "ball.obj"},
+    ],
+)
+def test_a_known_object_is_answered_where_it_stands_without_its_mesh_being_read(folder, hand, unread, fields):
+    there = Pose(position=Point(x=5.0))
+    planned = Node(hand).answer(**fields, header=Header(frame_id="world"), object_pose=there)
+    assert planned.result.outcome is Outcome.SUCCEEDED
+    assert len(planned.result.grasps) == 2
+    assert all(abs(grasp.grasp.position[0] - 5.0) < 0.3 for grasp in planned.result.grasps)
+    assert "2 grasps of the library known.grasps" in planned.result.message
+
+
+def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandModel, unread: None):
+    assert "2 grasps of the library known.grasps" in Node(hand).answer_path("ball.obj").result.message
+
+
+def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unread: None):
+    node = Node(hand, num_grasps=1)
+    first = node.answer(**known(id="a")).result.grasps[0]
+    second = node.answer(**known(id="b", exclude=["a/0"])).result.grasps[0]
+    assert np.abs(first.grasp.position - second.grasp.position).max() > 1e-3
+
+
+def test_what_is_missing_is_planned_and_added(folder: Path, hand: HandModel):
+    planned = Node(hand, num_grasps=5).answer(**known())
+    assert planned.result.outcome is Outcome.SUCCEEDED
+    assert "3 grasps of the library known.grasps, 2 planned" in planned.result.message
+    assert [count for _, count in GraspLibrary(folder / "known.grasps").entries()] == [5]
+
+
+def test_a_mesh_that_is_new_is_planned_for_once(folder: Path, hand: HandModel, monkeypatch: pytest.MonkeyPatch):
+    node, new = Node(hand), {"source": GraspRequest.MESH, "mesh_uri": "new.obj"}
+    save_mesh(make_shape("capsule"), folder / "new.obj")
+    assert "0 grasps of the library known.grasps, 2 planned" in node.answer(**new).result.message
+    monkeypatch.setattr(known_objects, "known_or_planned", None)
+    assert "2 grasps of the library known.grasps" in node.answer(**new).result.message
+
+
+def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
+    node, lowest = Node(hand), float(make_shape("sphere").vertices[:, 2].min())
+    turned = {"approach_direction": Vector3(z=-1.0), "approach_angle": 0.6}
+    surface = Plane(coef=[0.0, 0.0, 1.0, -(1.0 + lowest)])
+    found = node.answer(**known(object_pose=Pose(position=Point(z=1.0)), surface=surface, **turned)).result
+    assert found.outcome is Outcome.SUCCEEDED
+    for grasp in found.grasps:
+        w, x, y, z = grasp.grasp.quaternion_wxyz
+        a = hand.approach
+        # The third row of the rotation.
+        down = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]) @ a
+        assert down <= -np.cos(0.6) + 1e-6
+        assert grasp.grasp.position[2] > 1.0 + lowest
+
+
+@pytest.mark.parametrize(
+    ("fields", "settings", "error", "told"),
+    [
+        (known(known_object="bell"), {}, ConfigError, "'bell' is not in the library known.grasps; it has ball"),
+        (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4, and the parameter grasp_library names no library"),
+        (known(), {"verify": "hard"}, ConfigError, "ball: not with 0.1 kg, friction 0.6, hard trials"),
+        (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid with KNOWN=4"),
+        (
+            {"source": GraspRequest.KNOWN, "mesh_uri": "ball.obj", "mesh_scale": 0.5},
+            {},
+            ConfigError,
+            "ball.obj: not at scale 0.5 in the library known.grasps; it has it at 1",
+        ),
+        (
+            {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},
+            {},
+            GraspdError,
+            "surface: with source 2, whose cloud shows it; valid with MESH=1 and KNOWN=4",
+        ),
+        (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is no plane"),
+    ],
+)
+def test_what_cannot_be_answered_is_named(folder: Path, hand: HandModel, fields, settings, error, told: str):
+    with pytest.raises(error, match=told) as refused:
+        Node(hand, **settings).answer(**fields)
+    assert code_of(refused.value) is ErrorCode.BAD_REQUEST
+
+
+def test_a_mesh_that_changed_and_a_library_that_was_torn_are_told(built: Path, folder: Path, hand: HandModel):
+    mesh, node = make_shape("sphere"), Node(hand)
+    save_mesh(TriangleMesh(mesh.vertices * 1.1, mesh.faces), built / "ball.obj")
+    try:
+        with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball came into the library"):
+            node.answer(**known())
+    finally:
+        save_mesh(mesh, built / "ball.obj")
+    Path("known.grasps").write_bytes(b"no library" * 1000)
+    with pytest.raises(GraspdError, match=r"known\.grasps: torn or no library") as refused:
+        node.answer(**known())
+    assert code_of(refused.value) is ErrorCode.BAD_LIBRARY
+
+
+def test_a_node_without_a_library_imports_none_of_it():
+    code = "import sys, graspd_ros.grasp_node; print([m for m in sys.modules if 'sqlite3' in m or 'core.library' in m])"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+@pytest.mark.timeout(300)
+def test_a_node_answers_another_process_from_its_library(client, start_node, folder: Path):
+    process = start_node(grasp_library="known.grasps", num_grasps=2)
+    began = time.monotonic()
+    client.send_request(**known(id="first"))
+    answer = client.answer("first")
+    # Planning would take longer than this; a library takes some ten milliseconds.
+    assert time.monotonic() - began < 30
+    assert (answer.status, len(answer.grasps)) == (GraspArray.SUCCEEDED, 2), answer.message
+    assert "2 grasps of the library known.grasps" in answer.message
+    client.send_request(**known(id="none", known_object="bell"))
+    refused = client.answer("none")
+    assert (refused.status, refused.error_code) == (GraspArray.FAILED, "BAD_REQUEST")
+    assert "it has ball" in refused.message
+    assert process.alive()
