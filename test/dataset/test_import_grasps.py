@@ -103,6 +103,7 @@ def test_a_pose_alone_is_closed_and_pressed(exported, tmp_path: Path, graspd, ca
 def test_an_order_by_name_and_a_moved_object(exported, tmp_path: Path):
     """The same grasp with its joints turned round and everything moved in the world is the same grasp."""
     path, values = one_npy(exported)
+    values["obj_scale"] = np.float32(2.0)
     names = list(all_joint_names(HAND))[::-1]
     turn, shift = Rotation.from_rotvec([0.3, -1.0, 0.5]), np.array([1.0, -2.0, 0.5])
     for key in ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos"):
@@ -112,6 +113,7 @@ def test_an_order_by_name_and_a_moved_object(exported, tmp_path: Path):
     values["obj_pose"] = np.concatenate([shift, np.roll(turn.as_quat(), 1)])
     (moved,) = read_foreign(written(tmp_path, values), HAND, mesh="shape:mug", order=names)
     (still,) = read_foreign(path, HAND)
+    assert (moved.scale, still.scale) == (2.0, 1.0)
     assert np.abs(links_at(moved.grasp) - links_at(still.grasp)).max() < 1e-6
 
 
@@ -288,3 +290,51 @@ def test_coupled_joints_may_be_named_and_must_follow():
     coupled = next(mimic.name for mimic in hand.mimics)
     with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; by the joint that it follows"):
         joints_by_name({**values, coupled: values[coupled] + 0.1}, hand, "x")
+
+
+def test_a_bench_tries_them_beside_ours(exported, tmp_path: Path, graspd, capsys):
+    """Each of ours that was exported holds again, and a grasp from which the hand was taken away does not."""
+    _, values = one_npy(exported)
+    for stage in STAGES:
+        values[f"{stage}_qpos"][:3] += 1.0
+    good, away = one_npy(exported)[0], tmp_path / "two"
+    away.mkdir()
+    np.save(away / "0.npy", np.load(good, allow_pickle=True), allow_pickle=True)
+    np.save(away / "1.npy", np.array(values, dtype=object), allow_pickle=True)
+    words = (
+        "bench",
+        "--import",
+        away,
+        "--objects",
+        *(exported[0] / "dexgraspbench" / "objects").rglob("simplified.obj"),
+    )
+    words += ("--hand", "allegro_right", "--presets", "fast", "--trials", "standard,gravity", "--out", tmp_path / "out")
+    assert graspd(*words) == 0
+    (record,) = json.loads((tmp_path / "out" / "results.json").read_text())["records"]
+    assert [grasp["standard"]["passed"] for grasp in record["grasps"]["imported"]] == [True, False]
+    assert [len(grasps) for grasps in record["grasps"].values()] == [2, 2, 2]
+    assert all(grasp["standard"]["passed"] for grasp in record["grasps"]["planned"])
+    assert record["grasps"]["imported"][0]["gravity"]["displacement_cm"] < 1.0
+    assert record["grasps"]["imported"][1]["metrics"]["contact_links"] == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert "penetration mm" in lines[0]
+    assert [line.split(" | ")[1:4] for line in lines[1:]] == [
+        ["imported", "2 of 2", "50%"],
+        ["graspd, as ranked", "2 of 2", lines[2].split(" | ")[3]],
+        ["graspd, verified", "2 of 2", "100%"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("imported",), "imported: give --import FOLDER, and --hand"),
+        (("--import", "x"), "imported: give --import FOLDER, and --hand"),
+        (("--import", "nowhere", "--hand", "allegro_right"), "nowhere: no such file or folder"),
+        (("--import", "x", "--hand", "allegro_right", "--trials", "luck"), "trials: 'luck'; valid: standard"),
+        (("steered", "--import", "x"), "imported: steered does not look at it"),
+    ],
+)
+def test_a_bench_without_what_it_needs_is_refused(tmp_path: Path, graspd, capsys, words: tuple[str, ...], message: str):
+    assert graspd("bench", *words, "--out", tmp_path) == 2
+    assert message in capsys.readouterr().err

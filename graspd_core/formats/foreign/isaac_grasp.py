@@ -35,8 +35,10 @@ def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> li
     if entry(document, "format", f"{path}") != "isaac_grasp" or document.get("format_version") != 1.0:
         told = f"{shown(document['format'])} {shown(document.get('format_version'))}"
         raise FormatError(f"{path}: format {told}; valid: isaac_grasp 1.0")
-    mesh = mesh or find_beside(document.get("object_frame_link"), path, f"{path}: object_frame_link")
-    frame = str(document.get("gripper_frame_link", "")).rpartition("/")[2]
+    # Isaac Sim writes the former names, Isaac ROS describes the latter.
+    target, frame = (document.get(f"{of}_frame_link", document.get(f"{of}_frame")) for of in ("object", "gripper"))
+    mesh = mesh or find_beside(target, path, f"{path}: object_frame_link")
+    frame = str(frame).rpartition("/")[2]
     grasps = entry(document, "grasps", f"{path}")
     if not isinstance(grasps, dict):
         raise FormatError(f"{path}: grasps: {shown(grasps)}; expected grasps by name")
