@@ -16,6 +16,8 @@ from graspd_core.types import Posture
 
 # A coupled joint may be so far from where it follows to [rad] or [m], and a quaternion's length from one.
 _COUPLED, _UNIT = 1e-3, 0.01
+# No position, angle or scale is larger; what is computed of such numbers stays finite.
+_LARGEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,15 @@ class ImportedGrasp:
 
 
 def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """A value as finite numbers of a shape. Raises FormatError: it is something else."""
+    """A value as numbers of a shape, none of them huge. Raises FormatError: it is something else."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         numbers = None
-    if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all():
-        wanted = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    # Of NaN this is false.
+    if numbers is None or numbers.shape != shape or not (np.abs(numbers) <= _LARGEST).all():
+        wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        wanted += f" of at most {_LARGEST:.0e}"
         raise FormatError(f"{where}: {' '.join(shown(value).split())}; expected {wanted}")
     return numbers
 
