@@ -150,7 +150,7 @@ STUDIES: dict[str, Study] = {
         imported.imported_sections,
         _IMPORTED,
         (*_PLANS, "trials", "imported", "joint_order"),
-        lambda case: 5.0 + 8.0 * case.count,
+        lambda case: 10.0 + 18.0 * case.count,
         usual=False,
     ),
     "mano": Study(
