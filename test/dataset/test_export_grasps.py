@@ -138,7 +138,7 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
         data.qpos[:] = grasp["grasp_qpos"]
         mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
         (back,) = read_foreign(path, load_hand("allegro_right"))
-        read = {f"grasp_{name}": getattr(back.grasp, name) for name in ("position", "quaternion_wxyz", "joint_positions")}
+        read = {f"grasp_{name}": value for name, value in vars(back.grasp).items()}
         # The last link of every finger; a fingertip sits on it, fixed.
         ends = {"ff3": "link_3.0", "mf3": "link_7.0", "rf3": "link_11.0", "th3": "link_15.0"}
         for ours in (link_positions(row), link_positions(read)):
