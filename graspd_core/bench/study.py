@@ -70,6 +70,8 @@ class Request:
         hand: name or path.
         trials: of raw grasps.
         quick: a small run that takes minutes.
+        imported: file or folder of somebody else's grasps.
+        joint_order: of the joints in its npy files, by name.
     """
 
     presets: tuple[str, ...] = ()
@@ -80,6 +82,8 @@ class Request:
     hand: str = ""
     trials: tuple[str, ...] = ()
     quick: bool = False
+    imported: str = ""
+    joint_order: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.count is not None and not 1 <= self.count <= 1024:

@@ -12,6 +12,7 @@ from graspd_core.bench.studies import (
     early_ends,
     frames,
     human_hand,
+    imported,
     rgbd_table,
     robust_ranking,
     seen_objects,
@@ -21,6 +22,8 @@ from graspd_core.bench.studies import (
 from graspd_core.bench.study import Study
 
 _CELLS = ("measurements/*.py", "bullet/*.py", "object_case.py")
+_IMPORTED = ("studies/imported.py", "object_case.py", "measurements/benchmark_trials.py", "bullet/*.py")
+_IMPORTED = (*_IMPORTED, "../formats/foreign/*.py")
 _RAW = ("objects", "seeds", "count", "hand", "trials", "quick")
 _PLANS = ("presets", "objects", "seeds", "count", "hand", "quick")
 
@@ -139,6 +142,16 @@ STUDIES: dict[str, Study] = {
         _PLANS,
         lambda case: 10.0,
         came=arm_reach.came,
+    ),
+    "imported": Study(
+        "somebody else's grasps beside ours on the same objects and hand (--import FOLDER --hand NAME)",
+        imported.imported_cases,
+        imported.run_imported,
+        imported.imported_sections,
+        _IMPORTED,
+        (*_PLANS, "trials", "imported", "joint_order"),
+        lambda case: 10.0 + 18.0 * case.count,
+        usual=False,
     ),
     "mano": Study(
         "a human hand of the user's, in the units of the Grasp'D paper",

@@ -1,6 +1,6 @@
 """The command line, one file a command; heavy imports wait for who needs them.
 
-graspd synthesize | view | replay | reconstruct | bench | dataset | library | hands | doctor
+graspd synthesize | view | replay | reconstruct | bench | dataset | import | library | hands | doctor
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import NoReturn
 from graspd_core.cli import bench_command as bench
 from graspd_core.cli import dataset_command as dataset
 from graspd_core.cli import hands_command as hands
+from graspd_core.cli import import_command as imports
 from graspd_core.cli import library_command as library
 from graspd_core.cli import reconstruct_command as reconstruct
 from graspd_core.cli import replay_command as replay
@@ -69,6 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
     reconstruct.add_command(commands)
     bench.add_command(commands)
     dataset.add_command(commands)
+    imports.add_command(commands)
     library.add_command(commands)
     hands.add_command(commands)
     doctor = commands.add_parser("doctor", help="check the installation")

@@ -37,6 +37,8 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument("--trials", default="", metavar="A,B", help="of raw grasps (docs/bench.md lists them)")
+    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps of others, beside ours")
+    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of imported npy files")
     parser.add_argument("--quick", action="store_true", help="few objects and grasps: minutes")
     parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="for finished cases")
     parser.add_argument("--processes", type=int, default=1, help="cases at a time, each on one thread (default 1)")
@@ -67,8 +69,10 @@ def run(options: argparse.Namespace) -> int:
         hand=options.hand,
         trials=tuple(name for name in options.trials.split(",") if name),
         quick=options.quick,
+        imported=options.imported,
+        joint_order=tuple(name for name in options.joint_order.split(",") if name),
     )
-    studies = studies_of([*options.studies, *options.suite] or ["main"])
+    studies = studies_of([*options.studies, *options.suite] or ["imported" if options.imported else "main"])
     old_code = options.any_code or options.no_run
     plan = make_plan(studies, request, options.out, any_code=old_code, failed=options.no_run)
     old = read_results(options.compare) if options.compare else None

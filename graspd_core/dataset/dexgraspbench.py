@@ -15,21 +15,18 @@ from typing import Any
 import numpy as np
 
 from graspd_core.errors import ConfigError
+from graspd_core.formats.foreign.dexgraspbench_npy import PALMS, STAGES
 from graspd_core.formats.grasps_json import save_text
 from graspd_core.runtime.whole_files import save_bytes
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import object_parts
 from graspd_core.types import TriangleMesh
 
-# The palm in the frame of the qpos, wxyz, of every hand that is known there and here.
-_PALMS = {"allegro_right": (0.0, 1.0, 0.0, 1.0)}
-_STAGES = ("pregrasp", "grasp", "squeeze")
-
 
 def refuse_hand(name: str) -> None:
     """Raises ConfigError: that bench's model of the hand is not known here."""
-    if name not in _PALMS:
-        raise ConfigError(f"to dexgraspbench: hand {name!r}; valid: {', '.join(_PALMS)}")
+    if name not in PALMS:
+        raise ConfigError(f"to dexgraspbench: hand {name!r}; valid: {', '.join(PALMS)}")
 
 
 def write_dexgraspbench(rows: Sequence[dict[str, Any]], mesh: TriangleMesh, out: Path) -> None:
@@ -37,7 +34,7 @@ def write_dexgraspbench(rows: Sequence[dict[str, Any]], mesh: TriangleMesh, out:
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):
         grasp = {"obj_path": f"objects/{name}", "obj_scale": 1.0, "obj_pose": np.array([0, 0, 0, 1, 0, 0, 0.0])}
-        grasp |= {f"{stage}_qpos": qpos(row, stage) for stage in _STAGES}
+        grasp |= {f"{stage}_qpos": qpos(row, stage) for stage in STAGES}
         buffer = BytesIO()
         np.save(buffer, np.array(grasp, dtype=object), allow_pickle=True)
         save_bytes(out / row["hand_name"] / name / f"{number}.npy", buffer.getvalue())
@@ -55,7 +52,7 @@ def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
     """A posture as that bench has it: position, quaternion wxyz, joints."""
     from scipy.spatial.transform import Rotation
 
-    palm = Rotation.from_quat(np.roll(_PALMS[row["hand_name"]], -1))
+    palm = Rotation.from_quat(np.roll(PALMS[row["hand_name"]], -1))
     turned = Rotation.from_quat(np.roll(row[f"{stage}_quaternion_wxyz"], -1)) * palm.inv()
     return np.concatenate([row[f"{stage}_position"], np.roll(turned.as_quat(), 1), row[f"{stage}_joint_positions"]])
 

@@ -32,6 +32,8 @@ _DEEPEST = 0.0015
 _AT_ONCE = 128
 # What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
 _KNOCK_COST = 100.0
+# A score that no candidate has.
+_WORST = -1e3
 
 
 @dataclass(frozen=True)
@@ -77,14 +79,15 @@ def assemble(
     grasps: list[Grasp] = []
     for first in range(0, len(poses.translation), _AT_ONCE):
         rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
-        grasps += _assemble(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+        some = staged(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+        grasps += [grasp for grasp in some if grasp.score > _WORST]
     return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
 
 
-def _assemble(
-    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool]
+def staged(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> list[Grasp]:
-    """`assemble` for so many poses as memory is there for, in any order."""
+    """Three postures and a score for every pose, in their order, for so many as memory is there for."""
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
@@ -100,8 +103,7 @@ def _assemble(
         depth = intrusion(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
         knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
-    kept = torch.nonzero(scores > -1e3).flatten().tolist()
-    return [_grasp(hand, i, poses, opened, pressed, contact_set, float(scores[i])) for i in kept]
+    return [_grasp(hand, i, poses, opened, pressed, contact_set, float(scores[i])) for i in range(len(scores))]
 
 
 def score(

@@ -15,6 +15,7 @@ from graspd_core import load_hand, load_mesh
 from graspd_core.dataset.blocks import DatasetRequest, blocks_of
 from graspd_core.dataset.dataset_stats import tables_of
 from graspd_core.dataset.dataset_store import DatasetStore
+from graspd_core.formats.foreign.read_foreign import read_foreign
 from graspd_core.hands.kinematics import link_poses
 
 
@@ -136,10 +137,12 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
         grasp = np.load(path, allow_pickle=True).item()
         data.qpos[:] = grasp["grasp_qpos"]
         mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-        ours = link_positions(row)
+        (back,) = read_foreign(path, load_hand("allegro_right"))
+        read = {f"grasp_{name}": value for name, value in vars(back.grasp).items()}
         # The last link of every finger; a fingertip sits on it, fixed.
         ends = {"ff3": "link_3.0", "mf3": "link_7.0", "rf3": "link_11.0", "th3": "link_15.0"}
-        assert max(np.linalg.norm(data.body(end).xpos - ours[link]) for end, link in ends.items()) < 1e-5
+        for ours in (link_positions(row), link_positions(read)):
+            assert max(np.linalg.norm(data.body(end).xpos - ours[link]) for end, link in ends.items()) < 1e-5
         assert grasp["squeeze_qpos"].shape == grasp["pregrasp_qpos"].shape == (23,)
     folder = tmp_path / grasp["obj_path"]
     assert json.loads((folder / "info" / "simplified.json").read_text())["mass"] == 0.1

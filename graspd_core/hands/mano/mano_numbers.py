@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
-from graspd_core.hands.mano.mano_pickle import Inert
+from graspd_core.runtime.inert_arrays import array_of, is_shape
+from graspd_core.runtime.inert_pickle import Inert
 
 # The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
 _MAX_DENSE, _MAX_DEPTH = 2**22, 8
-# Types of numbers that an array may hold: booleans, integers, floats.
-_NUMERIC = {"b1", *(kind + size for kind in "iu" for size in "1248"), "f2", "f4", "f8"}
-# More axes than any array has.
-_MOST_AXES = 8
 
 
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
@@ -29,7 +25,7 @@ def numbers(value: Any, depth: int = 0) -> np.ndarray:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
     kind = value.kind if isinstance(value, Inert) else ""
     if kind == "array":
-        return _array(value)
+        return array_of(value)
     if kind.startswith("sparse"):
         return _dense(value, depth + 1)
     if kind == "leaf":
@@ -46,45 +42,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, float) or (isinstance(value, int) and -(2**63) <= value < 2**63)
 
 
-def _shown(value: object) -> str:
-    """A value for an error. What is not text is not written out: lists in lists can be endless."""
-    return repr(value[:40]) if isinstance(value, str) else f"a {type(value).__name__}"
-
-
-def _is_shape(value: object) -> bool:
-    return (
-        isinstance(value, tuple) and len(value) <= _MOST_AXES and all(type(n) is int and 0 <= n < 2**40 for n in value)
-    )
-
-
-def _array(value: Inert) -> np.ndarray:
-    state = value.state
-    if not isinstance(state, tuple) or len(state) != 5:
-        raise ValueError("holds an array without content")
-    _, shape, dtype, fortran, raw = state
-    kind = _dtype(dtype)
-    if isinstance(raw, Inert) and raw.kind == "encoded" and raw.arguments[1:] in ((), ("latin1",), ("latin-1",)):
-        raw = raw.arguments[0] if raw.arguments else None
-    raw = raw.encode("latin1") if isinstance(raw, str) else raw
-    if not isinstance(raw, bytes) or not _is_shape(shape):
-        raise ValueError("holds an array whose content is no block of numbers")
-    flat = np.frombuffer(raw, dtype=kind)
-    # Of Python's integers, which cannot overflow.
-    if math.prod(shape) != len(flat):
-        raise ValueError(f"holds {len(flat)} numbers for an array of shape {shape}")
-    return flat.astype(kind.newbyteorder("=")).reshape(shape, order="F" if fortran else "C")
-
-
-def _dtype(value: Any) -> np.dtype:
-    code = value.arguments[0] if isinstance(value, Inert) and value.kind == "dtype" and value.arguments else None
-    if not isinstance(code, str) or code not in _NUMERIC:
-        raise ValueError(f"holds an array of {_shown(code)}, which is no type of numbers")
-    order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
-    if order not in ("<", ">", "|", "="):
-        raise ValueError(f"holds an array in byte order {_shown(order)}")
-    return np.dtype(("<" if order in ("|", "=") else order) + code)
-
-
 def _dense(value: Inert, depth: int) -> np.ndarray:
     data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
     if indices.dtype.kind not in "iu" or starts.dtype.kind not in "iu":
@@ -92,7 +49,7 @@ def _dense(value: Inert, depth: int) -> np.ndarray:
     # Signed: of unsigned ones the difference is never negative, and may be huge.
     indices, starts = indices.astype(np.int64), starts.astype(np.int64)
     shape = value.state.get("_shape", value.state.get("shape"))
-    if not _is_shape(shape) or len(shape) != 2 or 0 in shape:
+    if not is_shape(shape) or len(shape) != 2 or 0 in shape:
         raise ValueError("holds a sparse matrix of shape other than two numbers")
     if shape[0] * shape[1] > _MAX_DENSE:
         raise ValueError(f"holds a sparse matrix of shape {shape!r}, larger than any of MANO's")

@@ -1,162 +1,24 @@
-"""A pickle reader for MANO's files that runs nothing that a file asks for.
-
-A pickle is a program: it names classes and functions, and calls them. Here every name that MANO's format uses stands
-for an inert stand-in of this module, from which the numbers are read afterwards; neither numpy, scipy nor chumpy is
-called by the file, and every other name is refused. What bounds time and memory: the size of the file, a memo that is
-a dictionary (the C reader allocates as many slots as a file says), no opcode that reserves memory beforehand, few
-arguments to a call, and keys that are text or small numbers: to hash a tuple of tuples takes time without bound, or
-more stack than there is.
-
-Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
-"""
+"""What a MANO file may name; every other name is refused, and none is called (`runtime/inert_pickle`)."""
 
 from __future__ import annotations
 
-import io
-import pickle
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from graspd_core.errors import HandError
+from graspd_core.runtime.inert_pickle import NUMPY_NAMES, load_inert, makers, read_bounded
 
-# The licensed file has 3.8 MB.
-MAX_BYTES = 64 * 2**20
-# The most arguments of any call that the format needs is four. Each call copies its arguments.
-_MOST_ARGUMENTS = 8
-# Opcodes that reach outside the file or reserve memory before they read.
-_REFUSED_OPCODES = (
-    pickle.PERSID, pickle.BINPERSID, pickle.EXT1, pickle.EXT2, pickle.EXT4,
-    pickle.BYTEARRAY8, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
-)  # fmt: skip
-
-
-@dataclass(eq=False)
-class Inert:
-    """An object of the file that is only kept.
-
-    Attributes:
-        kind: what it stands for, of those in `ADMITTED`.
-        arguments: what it was made with.
-        state: what it was told to become, None where nothing.
-    """
-
-    kind: str
-    arguments: tuple[Any, ...] = ()
-    state: Any = None
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-
-@dataclass(frozen=True)
-class Maker:
-    """What stands for a class or function that a file names: it makes an `Inert`, and can do nothing else."""
-
-    kind: str
-
-    def __call__(self, *arguments: Any) -> Inert:
-        # `copy_reg._reconstructor`, by which protocol 0 makes an object of the class that it is given.
-        if self.kind == "rebuilt":
-            if not arguments or not isinstance(arguments[0], Maker):
-                raise pickle.UnpicklingError("an object of no known class")
-            return arguments[0]()
-        return Inert(self.kind, arguments)
-
-    def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError(f"{self.kind} has no state")
-
-
-# Everything that a file may name, and what it stands for. An array's state is version, shape, type, whether it is in
-# Fortran's order, and the raw bytes; a sparse matrix's holds data, indices, indptr and the shape. A leaf of chumpy's
-# has the value `x`; a selection is `a` flattened, taken at `idxs`, in `preferred_shape`. As "encoded" text Python 3
-# writes bytes into old protocols. Python 2 and 3, old and new numpy and scipy have different names for the same.
-ADMITTED = {
-    (module, name): Maker(kind)
-    for kind, modules, names in (
-        ("array", ("numpy.core.multiarray", "numpy._core.multiarray"), ("_reconstruct",)),
-        ("array", ("numpy",), ("ndarray",)),
-        ("dtype", ("numpy",), ("dtype",)),
-        ("scalar", ("numpy.core.multiarray", "numpy._core.multiarray"), ("scalar",)),
-        ("sparse columns", ("scipy.sparse.csc", "scipy.sparse._csc"), ("csc_matrix",)),
-        ("sparse rows", ("scipy.sparse.csr", "scipy.sparse._csr"), ("csr_matrix",)),
-        ("leaf", ("chumpy.ch", "chumpy"), ("Ch",)),
-        ("selection", ("chumpy.reordering",), ("Select",)),
-        ("rebuilt", ("copy_reg", "copyreg"), ("_reconstructor",)),
-        ("encoded", ("_codecs",), ("encode",)),
-        ("object", ("__builtin__", "builtins"), ("object", "set", "frozenset")),
-    )
-    for module in modules
-    for name in names
-}
-
-
-def _is_plain(key: object) -> bool:
-    """Whether a dictionary may have this key: hashed in a step, and no collisions by choice."""
-    return isinstance(key, (str, bytes)) or (isinstance(key, int) and 0 <= key < 2**32)
-
-
-def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
-    """The base class's act, after a look at the keys, which lie in its stack at `keys`."""
-
-    def act(reader: Any) -> None:
-        if not all(map(_is_plain, reader.stack[keys])):
-            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
-        getattr(pickle._Unpickler, name)(reader)
-
-    return act
-
-
-class _Reader(pickle._Unpickler):
-    """The stand-ins for what a file names; a name outside `ADMITTED` is refused."""
-
-    # What the base class has, though its stubs do not say so.
-    stack: list[Any]
-    memo: dict[int, Any]
-    readline: Any
-
-    def _call(self) -> None:
-        """REDUCE and NEWOBJ: a call, or an object of a class."""
-        arguments = self.stack.pop()
-        if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
-            raise pickle.UnpicklingError(f"a call with other than at most {_MOST_ARGUMENTS} arguments")
-        self.stack[-1] = self.stack[-1](*arguments)
-
-    def _put(self) -> None:
-        """PUT: the one opcode that names a place in the memo by a number of any length."""
-        place = int(self.readline()[:-1])
-        if not _is_plain(place):
-            raise pickle.UnpicklingError("a place in the memo that no file needs")
-        self.memo[place] = self.stack[-1]
-
-    dispatch: ClassVar[dict[int, Any]] = {
-        code: act for code, act in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
-    }
-    dispatch |= {
-        pickle.REDUCE[0]: _call,
-        pickle.NEWOBJ[0]: _call,
-        pickle.SETITEM[0]: _with_plain_keys("load_setitem", slice(-2, None, 2)),
-        pickle.SETITEMS[0]: _with_plain_keys("load_setitems", slice(0, None, 2)),
-        pickle.DICT[0]: _with_plain_keys("load_dict", slice(0, None, 2)),
-        pickle.PUT[0]: _put,
-        # Sets carry no numbers: kept as lists, nothing in them is hashed.
-        pickle.EMPTY_SET[0]: dispatch[pickle.EMPTY_LIST[0]],
-        pickle.ADDITEMS[0]: dispatch[pickle.APPENDS[0]],
-        pickle.FROZENSET[0]: dispatch[pickle.LIST[0]],
-    }
-
-    def find_class(self, module: str, name: str) -> Any:
-        """The stand-in for a name."""
-        try:
-            return ADMITTED[module, name]
-        except KeyError:
-            shown = f"{module}.{name}"[:200]
-            raise _RefusedError(shown if shown.isprintable() else ascii(shown)) from None
-
-
-class _RefusedError(Exception):
-    """A name that is not in `ADMITTED`."""
+# A sparse matrix's state holds data, indices, indptr and the shape. A leaf of chumpy's has the value `x`; a selection
+# is `a` flattened, taken at `idxs`, in `preferred_shape`. Python 2 and 3, old and new scipy have different names for
+# the same.
+ADMITTED = NUMPY_NAMES | makers(
+    ("sparse columns", ("scipy.sparse.csc", "scipy.sparse._csc"), ("csc_matrix",)),
+    ("sparse rows", ("scipy.sparse.csr", "scipy.sparse._csr"), ("csr_matrix",)),
+    ("leaf", ("chumpy.ch", "chumpy"), ("Ch",)),
+    ("selection", ("chumpy.reordering",), ("Select",)),
+    ("rebuilt", ("copy_reg", "copyreg"), ("_reconstructor",)),
+    ("object", ("__builtin__", "builtins"), ("object", "set", "frozenset")),
+)
 
 
 def read_pickle(path: Path) -> Any:
@@ -166,19 +28,6 @@ def read_pickle(path: Path) -> Any:
         HandError: no such file, too large, not a pickle, or one that names anything but `ADMITTED`; names the culprit.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise HandError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(content) > MAX_BYTES:
-        raise HandError(f"{path}: more than {MAX_BYTES // 2**20} MB, which no MANO file has")
-    try:
-        return _Reader(io.BytesIO(content), encoding="latin1").load()
-    except _RefusedError as refused:
-        raise HandError(
-            f"{path}: asks for {refused}, which a MANO file does not need: refused, and nothing of it was run"
-        ) from None
-    # A file that is no pickle fails in whatever way its bytes happen to; the file is the culprit.
-    except Exception as error:
-        told = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise HandError(f"{path}: not a MANO pickle: {told[:200]}") from error
+        return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")
+    except ValueError as error:
+        raise HandError(f"{path}: {error}") from error

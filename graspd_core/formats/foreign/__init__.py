@@ -1,0 +1,1 @@
+"""Grasps in the files of others."""

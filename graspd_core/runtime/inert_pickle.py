@@ -1,0 +1,182 @@
+"""A pickle reader that runs nothing that a file asks for.
+
+A pickle is a program: it names classes and functions, and calls them. Here every name that a format uses stands for an
+inert stand-in of this module, from which the numbers are read afterwards (`inert_arrays`); neither numpy nor any other
+library is called by the file, and every other name is refused. What bounds time and memory: the size of the file, a
+memo that is a dictionary (the C reader allocates as many slots as a file says), no opcode that reserves memory
+beforehand, few arguments to a call, and keys that are text or small numbers: to hash a tuple of tuples takes time
+without bound, or more stack than there is.
+
+Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+# MANO's licensed file has 3.8 MB.
+MAX_BYTES = 64 * 2**20
+# The most arguments of any call that the format needs is four. Each call copies its arguments.
+_MOST_ARGUMENTS = 8
+# Opcodes that reach outside the file or reserve memory before they read.
+_REFUSED_OPCODES = (
+    pickle.PERSID, pickle.BINPERSID, pickle.EXT1, pickle.EXT2, pickle.EXT4,
+    pickle.BYTEARRAY8, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
+)  # fmt: skip
+
+
+@dataclass(eq=False)
+class Inert:
+    """An object of the file that is only kept.
+
+    Attributes:
+        kind: what it stands for.
+        arguments: what it was made with.
+        state: what it was told to become, None where nothing.
+    """
+
+    kind: str
+    arguments: tuple[Any, ...] = ()
+    state: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+@dataclass(frozen=True)
+class Maker:
+    """What stands for a class or function that a file names: it makes an `Inert`, and can do nothing else."""
+
+    kind: str
+
+    def __call__(self, *arguments: Any) -> Inert:
+        # `copy_reg._reconstructor`, by which protocol 0 makes an object of the class that it is given.
+        if self.kind == "rebuilt":
+            if not arguments or not isinstance(arguments[0], Maker):
+                raise pickle.UnpicklingError("an object of no known class")
+            return arguments[0]()
+        return Inert(self.kind, arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError(f"{self.kind} has no state")
+
+
+def makers(*rows: tuple[str, tuple[str, ...], tuple[str, ...]]) -> dict[tuple[str, str], Maker]:
+    """What a file may name, by module and name: of rows of a kind, its modules and its names."""
+    return {(module, name): Maker(kind) for kind, modules, names in rows for module in modules for name in names}
+
+
+# What arrays of numpy name. An array's state is version, shape, type, whether it is in Fortran's order, and the raw
+# bytes. As "encoded" text Python 3 writes bytes into old protocols. Old and new numpy have different names for one.
+NUMPY_NAMES = makers(
+    ("array", ("numpy.core.multiarray", "numpy._core.multiarray"), ("_reconstruct",)),
+    ("array", ("numpy",), ("ndarray",)),
+    ("dtype", ("numpy",), ("dtype",)),
+    ("scalar", ("numpy.core.multiarray", "numpy._core.multiarray"), ("scalar",)),
+    ("encoded", ("_codecs",), ("encode",)),
+)
+
+
+def _is_plain(key: object) -> bool:
+    """Whether a dictionary may have this key: hashed in a step, and no collisions by choice."""
+    return isinstance(key, (str, bytes)) or (isinstance(key, int) and 0 <= key < 2**32)
+
+
+def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
+    """The base class's act, after a look at the keys, which lie in its stack at `keys`."""
+
+    def act(reader: Any) -> None:
+        if not all(map(_is_plain, reader.stack[keys])):
+            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
+        getattr(pickle._Unpickler, name)(reader)
+
+    return act
+
+
+class _Reader(pickle._Unpickler):
+    """The stand-ins for what a file names; a name that is not admitted is refused."""
+
+    # What the base class has, though its stubs do not say so.
+    stack: list[Any]
+    memo: dict[int, Any]
+    readline: Any
+
+    def _call(self) -> None:
+        """REDUCE and NEWOBJ: a call, or an object of a class."""
+        arguments = self.stack.pop()
+        if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
+            raise pickle.UnpicklingError(f"a call with other than at most {_MOST_ARGUMENTS} arguments")
+        self.stack[-1] = self.stack[-1](*arguments)
+
+    def _put(self) -> None:
+        """PUT: the one opcode that names a place in the memo by a number of any length."""
+        place = int(self.readline()[:-1])
+        if not _is_plain(place):
+            raise pickle.UnpicklingError("a place in the memo that no file needs")
+        self.memo[place] = self.stack[-1]
+
+    dispatch: ClassVar[dict[int, Any]] = {
+        code: act for code, act in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
+    }
+    dispatch |= {
+        pickle.REDUCE[0]: _call,
+        pickle.NEWOBJ[0]: _call,
+        pickle.SETITEM[0]: _with_plain_keys("load_setitem", slice(-2, None, 2)),
+        pickle.SETITEMS[0]: _with_plain_keys("load_setitems", slice(0, None, 2)),
+        pickle.DICT[0]: _with_plain_keys("load_dict", slice(0, None, 2)),
+        pickle.PUT[0]: _put,
+        # Sets carry no numbers: kept as lists, nothing in them is hashed.
+        pickle.EMPTY_SET[0]: dispatch[pickle.EMPTY_LIST[0]],
+        pickle.ADDITEMS[0]: dispatch[pickle.APPENDS[0]],
+        pickle.FROZENSET[0]: dispatch[pickle.LIST[0]],
+    }
+
+    def __init__(self, content: bytes, admitted: Mapping[tuple[str, str], Maker]) -> None:
+        super().__init__(io.BytesIO(content), encoding="latin1")
+        self._admitted = admitted
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The stand-in for a name."""
+        try:
+            return self._admitted[module, name]
+        except KeyError:
+            shown = f"{module}.{name}"[:200]
+            raise _RefusedError(shown if shown.isprintable() else ascii(shown)) from None
+
+
+class _RefusedError(Exception):
+    """A name that is not admitted."""
+
+
+def read_bounded(path: Path, what: str) -> bytes:
+    """The content of a file. Raises ValueError: it cannot be read, or is larger than any `what`, "MANO file" say."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror or error}") from error
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"more than {MAX_BYTES // 2**20} MB, which no {what} has")
+    return content
+
+
+def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
+    """What a pickle holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+
+    Raises:
+        ValueError: not a pickle, or one that names anything but `admitted`; says why, and names the culprit.
+    """
+    try:
+        return _Reader(content, admitted).load()
+    except _RefusedError as refused:
+        told = f"asks for {refused}, which a {what} does not need: refused, and nothing of it was run"
+        raise ValueError(told) from None
+    # A file that is no pickle fails in whatever way its bytes happen to; the file is the culprit.
+    except Exception as error:
+        told = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise ValueError(f"not the pickle of a {what}: {told[:200]}") from error
