@@ -48,7 +48,7 @@ demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and 
 	$(RUN)/python examples/demo.py
 
 BENCH := $(RUN)/graspd bench --processes 2
-PAGES := README.md docs/bench.md docs/hands.md docs/clouds.md docs/stress.md docs/metrics.md
+PAGES := README.md $(addprefix docs/,bench.md hands.md clouds.md stress.md metrics.md usage.md arms.md)
 
 bench: setup  ## every study: the charts and tables of README and docs/ anew (under 90 minutes on two cores; resumable)
 	@mkdir -p results

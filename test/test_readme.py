@@ -49,7 +49,7 @@ def test_the_format_page_is_of_the_version_written():
 
 def test_presets_named_in_the_documents_exist(tmp_path: Path):
     named = re.search(r"preset \(([a-z, ]+), or", USAGE).group(1).split(", ")  # pyright: ignore[reportOptionalMemberAccess]
-    table = README.split("<!-- bench-short:begin -->")[1].split("<!-- bench-short:end -->")[0]
+    table = README.split("<!-- bench:begin -->")[1].split("<!-- bench:end -->")[0]
     for name in [*named, *re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)]:
         load_preset(name)
     (own,) = re.findall(r"```yaml\n(.*?)```", USAGE, re.DOTALL)
