@@ -63,8 +63,8 @@ def test_forces_only_push_stay_in_the_cone_and_oppose_the_motion(seed):
     forces = contact_forces(height, normals, velocities, **PUBLISHED, leak=0.1)
     along = (forces * normals[:, :, None]).sum(-1)
     side = (forces - along[..., None] * normals[:, :, None]).norm(dim=-1)
-    # Forces up to 1e4 N round to 1e-12, more where the motion is nearly along the normal: the square of the slip is what
-    # two squares differ by, so its relative error is that of the numbers times the square of their ratio.
+    # Forces up to 1e4 N round to 1e-12, more where the motion is nearly along the normal: the square of the slip is
+    # what two squares differ by, so its relative error is that of the numbers times the square of their ratio.
     sliding = velocities - (normals @ velocities.T)[..., None] * normals[:, :, None]
     ratio = velocities.norm(dim=-1) / sliding.norm(dim=-1).clamp_min(1e-300)
     assert (along <= 1e-9).all()
