@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graspd_core.cli.arm_options import add_arm_options, reach_of
 from graspd_core.cli.cloud_options import add_object_options, scene_config_of, target_of
 from graspd_core.cli.deadline import Deadline, DeadlinePassed
 from graspd_core.cli.planning_options import (
@@ -18,8 +17,8 @@ from graspd_core.cli.planning_options import (
     planning_options,
     summary,
 )
+from graspd_core.cli.restriction_options import add_restriction_options, restrictions_of
 from graspd_core.cli.running import Interrupt, Reporter
-from graspd_core.cli.steering_options import add_steering_options, steering_of
 from graspd_core.cli.view_command import add_address, watched
 from graspd_core.types import GraspResult
 
@@ -38,8 +37,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("object", metavar="OBJECT", help="mesh or cloud file, or shape:NAME")
     add_planning_options(parser)
     add_object_options(parser)
-    add_steering_options(parser)
-    add_arm_options(parser)
+    add_restriction_options(parser)
     sizes = parser.add_mutually_exclusive_group()
     sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file")
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
@@ -57,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.scene.load_scene import load_scene
 
     config, request = planning_options(options)
-    request["restrictions"] = (*steering_of(options), *reach_of(options))
+    request["restrictions"] = restrictions_of(options)
     deadline = Deadline(options.deadline, options.began)
     # A run whose result could not be written would be lost.
     for path in (options.out, options.html):

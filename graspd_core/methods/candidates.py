@@ -14,7 +14,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.method_registry import METHODS
-from graspd_core.methods.obstacle_distance import intrusion
+from graspd_core.methods.obstacle_distance import gap_on_the_way
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses
@@ -100,7 +100,7 @@ def staged(
     scores = score(contact_set, pressed, clearance, overlap)
     if problem.obstacles is not None:
         ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
-        depth = intrusion(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
+        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
         knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     return [_grasp(hand, i, poses, opened, pressed, contact_set, float(scores[i])) for i in range(len(scores))]

@@ -148,21 +148,6 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Te
 
 
 @torch.no_grad()
-def intrusion(
-    obstacles: ObstacleTensors,
-    kinematics: Kinematics,
-    quaternion: Float[Tensor, "batch 4"],
-    pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
-    grasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
-) -> Float[Tensor, "batch"]:
-    """Greatest depth [m] of the hand in any obstacle, from the retreat over the pregrasp to the grasp; not below zero.
-
-    `pregrasp` and `grasp` are base translations and joints; the base is turned alike in both.
-    """
-    return (-gap_on_the_way(obstacles, kinematics, quaternion, pregrasp, grasp)).clamp_min(0.0)
-
-
-@torch.no_grad()
 def gap_on_the_way(
     obstacles: ObstacleTensors,
     kinematics: Kinematics,
@@ -170,7 +155,10 @@ def gap_on_the_way(
     pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
     grasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
 ) -> Float[Tensor, "batch"]:
-    """Least signed distance [m] of the hand to any obstacle on the way of `intrusion`, negative inside."""
+    """Least signed distance [m] of the hand to any obstacle, from the retreat over the pregrasp to the grasp.
+
+    It is negative inside. `pregrasp` and `grasp` are base translations and joints; the base is turned alike in both.
+    """
     rotation = rotation_from_quaternion(quaternion)
     back = rotation @ obstacles.retreat
     way = [(pregrasp[0] + RETREAT * share * back, pregrasp[1]) for share in RETREAT_SHARES]

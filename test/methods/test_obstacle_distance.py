@@ -18,7 +18,13 @@ from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks
-from graspd_core.methods.obstacle_distance import RETREAT, hand_reach, intrusion, make_obstacle_tensors, obstacle_gaps
+from graspd_core.methods.obstacle_distance import (
+    RETREAT,
+    gap_on_the_way,
+    hand_reach,
+    make_obstacle_tensors,
+    obstacle_gaps,
+)
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.methods.poses import pack
 from graspd_core.methods.problem import Problem, build_problem, evaluate
@@ -175,4 +181,4 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
             for p in (grasp.pregrasp, grasp.grasp)
         ]
         quaternion = torch.as_tensor(grasp.grasp.quaternion_wxyz)[None]
-        assert float(intrusion(obstacles, kinematics, quaternion, ends[0], ends[1])) < 0.0016
+        assert -float(gap_on_the_way(obstacles, kinematics, quaternion, ends[0], ends[1])) < 0.0016

@@ -1,4 +1,4 @@
-"""Options that say where a hand comes from, how it is rolled, what it touches and what it keeps away from."""
+"""Options that restrict grasps: where a hand comes from, what it touches and keeps away from, what an arm reaches."""
 
 from __future__ import annotations
 
@@ -11,13 +11,30 @@ import numpy as np
 from graspd_core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from graspd_core.methods.restrictions import Restriction
+    from graspd_core.planning.reach import Reach
     from graspd_core.planning.steering.regions import Region
     from graspd_core.planning.steering.steering import Steering
 
 _FORMS = "box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"
 
 
-def add_steering_options(parser: argparse.ArgumentParser) -> None:
+def add_restriction_options(parser: argparse.ArgumentParser) -> None:
+    """Steering, and an arm."""
+    _add_steering_options(parser)
+    _add_arm_options(parser)
+
+
+def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
+    """What the options ask for; none where they ask for nothing.
+
+    Raises:
+        ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
+    """
+    return (*_steering(options), *_reach(options))
+
+
+def _add_steering_options(parser: argparse.ArgumentParser) -> None:
     """Approach, roll, region and avoided boxes; all in the object's frame."""
     group = parser.add_argument_group("steering (docs/usage.md)")
     group.add_argument(
@@ -37,24 +54,17 @@ def add_steering_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def steering_of(options: argparse.Namespace) -> tuple[Steering, ...]:
-    """The `Steering` that the options ask for; none where they ask for nothing.
-
-    Raises:
-        ConfigError: a value is out of its range, or an option lacks another.
-    """
-    asked = (options.approach, options.roll, options.region)
-    if all(value is None for value in asked) and not options.avoid:
-        _refuse_alone("approach-angle", options.approach_angle, "approach")
-        _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
-        return ()
-    from graspd_core.planning.steering.regions import Box
-    from graspd_core.planning.steering.steering import Steering
-
+def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
     if options.approach is None:
         _refuse_alone("approach-angle", options.approach_angle, "approach")
     if options.roll is None:
         _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
+    asked = (options.approach, options.roll, options.region)
+    if all(value is None for value in asked) and not options.avoid:
+        return ()
+    from graspd_core.planning.steering.regions import Box
+    from graspd_core.planning.steering.steering import Steering
+
     angles = {"approach_angle": options.approach_angle, "roll": options.roll, "roll_tolerance": options.roll_tolerance}
     wishes: dict[str, Any] = {name: float(np.radians(value)) for name, value in angles.items() if value is not None}
     region = None if options.region is None else _region(options.region)
@@ -86,3 +96,36 @@ def _region(words: list[str]) -> Region:
         return Sphere(numbers[:3], numbers[3])
     points = np.concatenate([view.points for view in load_views(kind)])
     return NearPoints(points, *numbers)
+
+
+def _add_arm_options(parser: argparse.ArgumentParser) -> None:
+    """Which arm, and where it stands."""
+    parser.add_argument(
+        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
+    )
+    parser.add_argument(
+        "--arm-base",
+        type=float,
+        nargs="+",
+        default=None,
+        metavar="N",
+        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
+    )
+
+
+def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
+    if options.arm is None and options.arm_base is None:
+        return ()
+    if options.arm is None:
+        raise ConfigError("--arm-base: there is no arm; give --arm NAME or FILE")
+    from graspd_core.arms.arm_file import load_arm
+    from graspd_core.planning.reach import Reach
+
+    arm, base = load_arm(options.arm), options.arm_base
+    if base is None:
+        raise ConfigError("--arm: say where it stands, --arm-base X Y Z or X Y Z QW QX QY QZ")
+    if len(base) not in (3, 7):
+        raise ConfigError(f"--arm-base: {len(base)} numbers; valid: X Y Z, or X Y Z QW QX QY QZ")
+    x, y, z, *turn = base
+    w, i, j, k = turn or (1.0, 0.0, 0.0, 0.0)
+    return (Reach(arm, (x, y, z), (w, i, j, k)),)
