@@ -60,7 +60,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
         try:
             ray.init(**{"address": address, **options})
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise ConfigError(f"address: {address}: {' '.join(str(error).split())[:200]}") from None
+            raise ConfigError(f"address: {address}: {' '.join(str(error).split())[-200:]}") from None
         try:
             yield ray
         finally:

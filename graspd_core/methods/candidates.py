@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel
@@ -20,9 +19,10 @@ from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
 from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
-from graspd_core.methods.stages.contact_set import ContactSet, find_contacts, self_overlap
+from graspd_core.methods.stages.contact_set import find_contacts, self_overlap
 from graspd_core.methods.stages.pregrasp import approach_depth, find_pregrasp
-from graspd_core.methods.stages.squeeze import Squeeze, squeeze
+from graspd_core.methods.stages.ranking import Staged, score
+from graspd_core.methods.stages.squeeze import squeeze
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 
@@ -79,15 +79,29 @@ def assemble(
     grasps: list[Grasp] = []
     for first in range(0, len(poses.translation), _AT_ONCE):
         rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
-        some = staged(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+        some = finished(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
         grasps += [grasp for grasp in some if grasp.score > _WORST]
     return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
 
 
-def staged(
+def finished(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> list[Grasp]:
     """Three postures and a score for every pose, in their order, for so many as memory is there for."""
+    some = staged(problem, hand, poses, config, stop)
+    scores = score(problem, some)
+    if problem.obstacles is not None:
+        ends = (some.opened.translation, some.opened.joints), (poses.translation, poses.joints)
+        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
+        knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
+        scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
+    return [_grasp(hand, i, some, float(scores[i])) for i in range(len(scores))]
+
+
+def staged(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
+) -> Staged:
+    """Contacts, squeeze, pregrasp and what is known of them, for every pose."""
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
@@ -97,49 +111,11 @@ def staged(
     if any(primitive.kind == "hull" for primitive in hand.primitives):
         depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
         overlap = torch.maximum(overlap, depth.to(overlap))
-    scores = score(contact_set, pressed, clearance, overlap)
-    if problem.obstacles is not None:
-        ends = (opened.translation, opened.joints), (poses.translation, poses.joints)
-        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
-        knocks = approach_depth(problem, problem.obstacles, opened) > _DEEPEST
-        scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
-    return [_grasp(hand, i, poses, opened, pressed, contact_set, float(scores[i])) for i in range(len(scores))]
+    return Staged(poses, opened, clearance, contact_set, pressed, overlap)
 
 
-def score(
-    contact_set: ContactSet,
-    pressed: Squeeze,
-    clearance: Float[Tensor, "batch"],
-    overlap: Float[Tensor, "batch"],
-) -> Float[Tensor, "batch"]:
-    """The optimiser's own measure of a grasp, larger is better; no trial goes into it.
-
-    A grasp is good when its squeeze balances and is spread over many contacts, nothing sinks in, and the way from the
-    pregrasp is clear. The weights are those of a logistic regression of hold trials on these five figures over 16
-    objects, 32 grasps each (docs/method.md); self-overlap beyond a millimetre counts more than it said, because the
-    trial forgives what a real hand does not.
-    """
-    force = pressed.forces.norm(dim=-1)
-    largest_share = force.amax(-1) / force.sum(-1).clamp_min(1e-9)
-    depth = (-contact_set.distance.amin(-1)).clamp_min(0.0) / 0.001
-    return (
-        -1.7 * (largest_share + 0.01).log()
-        - 1.3 * (pressed.imbalance + 1e-3).log10()
-        - 0.7 * depth
-        - 5.5 * (0.8 - clearance).clamp_min(0.0)
-        - 10.0 * (overlap / 0.001 - 1.0).clamp_min(0.0)
-    )
-
-
-def _grasp(
-    hand: HandModel,
-    row: int,
-    poses: Poses,
-    opened: Poses,
-    pressed: Squeeze,
-    contact_set: ContactSet,
-    value: float,
-) -> Grasp:
+def _grasp(hand: HandModel, row: int, some: Staged, value: float) -> Grasp:
+    poses, opened, contact_set = some.poses, some.opened, some.contact_set
     quaternion = poses.quaternion[row] / poses.quaternion[row].norm()
 
     def posture(translation: Tensor, joints: Tensor) -> Posture:
@@ -162,7 +138,7 @@ def _grasp(
     return Grasp(
         pregrasp=posture(opened.translation[row], opened.joints[row]),
         grasp=posture(poses.translation[row], poses.joints[row]),
-        squeeze=posture(poses.translation[row], pressed.joints[row]),
+        squeeze=posture(poses.translation[row], some.pressed.joints[row]),
         contacts=contacts,
         score=value,
     )

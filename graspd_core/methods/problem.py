@@ -80,7 +80,7 @@ def build_problem(
 ) -> Problem:
     """Lay scene and hand out as tensors; `seed` spreads the disturbances beyond the signed axes."""
     return Problem(
-        hand=make_hand_tensors(hand, settings.candidates, device, dtype),
+        hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
         object=make_object_tensors(scene, settings, device, dtype),
         directions=disturbance_directions(settings.directions, seed).to(device=device, dtype=dtype),
         friction=min(settings.friction, scene.object.friction),

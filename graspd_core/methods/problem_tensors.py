@@ -13,7 +13,7 @@ from torch import Tensor
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.collision_tensors import CollisionTensors, make_collision_tensors
-from graspd_core.hands.kinematics import Kinematics, make_kinematics, placement
+from graspd_core.hands.kinematics import Kinematics, in_base, link_poses, make_kinematics, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.scene.scene import Scene, object_sharp_points
@@ -21,6 +21,8 @@ from graspd_core.scene.scene import Scene, object_sharp_points
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
 _REACH_OF_TIPS = 0.1
 _REACH_OF_OTHERS = 0.004
+# The same of patches of a hand that is to touch with all of itself [m].
+_REACH_OF_PATCHES = 0.03
 # A base frame this near to the middle of the palm lies in the palm [m].
 _PALM_RADIUS = 0.05
 # Share of thin surface from which an object counts as thin-walled.
@@ -34,7 +36,7 @@ class PointSet:
     Attributes:
         matrix: places them by their links' poses, see `hands.kinematics.placement`.
         links: link of each.
-        groups: candidates of each rigid group of links, padded by repetition.
+        groups: candidates of each rigid group of links, or of each patch of one, padded by repetition.
     """
 
     matrix: Float[Tensor, "points columns"]
@@ -66,9 +68,10 @@ class HandTensors:
         kinematics: forward kinematics.
         coarse: the first, evenly spread contact candidates; what most steps look at.
         fine: all contact candidates; what the last steps look at.
-        reach: attraction range of each rigid group of links [m].
+        reach: attraction range of each group of candidates [m].
         solids: collision primitives.
-        group_of_solid: index of each solid's rigid group, one past the last where it has no coarse candidate.
+        group_of_solid: index of the group of each solid's links, the first where they have several; one past the last
+            where they have no coarse candidate.
         spheres: for self-collision.
         lower: joint limits [rad] or [m].
         upper: joint limits [rad] or [m].
@@ -113,10 +116,13 @@ class ObjectTensors:
 
 
 @lru_cache(maxsize=8)
-def make_hand_tensors(hand: HandModel, candidates: int, device: str, dtype: torch.dtype) -> HandTensors:
+def make_hand_tensors(
+    hand: HandModel, candidates: int, patch_size: int, device: str, dtype: torch.dtype
+) -> HandTensors:
     """Lay a hand out; the coarse set is the first `candidates` of the contact candidates that it was loaded with.
 
-    Kept for the last few hands, which are hashed by identity.
+    They are grouped by rigid groups of links, or into patches of so many of them. Kept for the last few hands, which
+    are hashed by identity.
     """
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -125,23 +131,26 @@ def make_hand_tensors(hand: HandModel, candidates: int, device: str, dtype: torc
     def index(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, device=device, dtype=torch.long)
 
-    present = np.unique(hand.link_group[hand.candidate_link[:candidates]])
+    kinematics, of_link = make_kinematics(hand, device, dtype), hand.link_group[hand.candidate_link]
+    groups = _patches(hand, candidates, patch_size) if patch_size else of_link
+    present, first = np.unique(groups[:candidates], return_index=True)
+    reach = np.where(np.isin(of_link[first], fingertip_groups(hand)), _REACH_OF_TIPS, _REACH_OF_OTHERS)
 
     def point_set(count: int) -> PointSet:
         links = hand.candidate_link[:count]
         points = tensor(hand.candidate_points[:count])
-        groups = _members(hand.link_group[links], present)
-        return PointSet(placement(hand.num_links, points, index(links)), index(links), index(groups))
+        members = _members(groups[:count], present)
+        return PointSet(placement(hand.num_links, points, index(links)), index(links), index(members))
 
     solids = make_collision_tensors(hand, device, dtype)
-    group_of_solid = hand.link_group[solids.link.cpu().numpy()]
-    place = np.where(np.isin(group_of_solid, present), np.searchsorted(present, group_of_solid), len(present))
+    same = hand.link_group[solids.link.cpu().numpy()][:, None] == of_link[first]
+    place = np.where(same.any(1), same.argmax(1), len(present))
     return HandTensors(
         model=hand,
-        kinematics=make_kinematics(hand, device, dtype),
+        kinematics=kinematics,
         coarse=point_set(candidates),
         fine=point_set(len(hand.candidate_link)),
-        reach=tensor(np.where(np.isin(present, fingertip_groups(hand)), _REACH_OF_TIPS, _REACH_OF_OTHERS)),
+        reach=tensor(np.full(len(present), _REACH_OF_PATCHES) if patch_size else reach),
         solids=solids,
         group_of_solid=index(place),
         spheres=_sphere_tensors(hand, device, dtype),
@@ -191,6 +200,27 @@ def fingertip_groups(hand: HandModel) -> Int[np.ndarray, "tips"]:
     groups, parents = hand.link_group, hand.link_parent
     inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
     return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
+
+
+def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
+    """Which patch each contact candidate belongs to: the nearest of its links', each around a coarse candidate.
+
+    The coarse candidates of a rigid group of links have one patch for `size` of them, the centres far from each other.
+    """
+    posture = link_poses(hand, (hand.lower + hand.upper) / 2)
+    points = in_base(posture, hand.candidate_points, hand.candidate_link)
+    of_link, patch, count = hand.link_group[hand.candidate_link], np.zeros(len(points), dtype=int), 0
+    for group in np.unique(of_link[:candidates]):
+        members = np.flatnonzero(of_link == group)
+        coarse = members[members < candidates]
+        gaps = np.linalg.norm(points[members][:, None] - points[coarse], axis=-1)
+        centres = [0]
+        while len(centres) < round(len(coarse) / size):
+            centres.append(int(gaps[np.searchsorted(members, coarse)][:, centres].min(1).argmax()))
+        patch[members] = count + gaps[:, centres].argmin(1)
+        count += len(centres)
+    patch[~np.isin(of_link, of_link[:candidates])] = -1
+    return patch
 
 
 def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"]) -> Int[np.ndarray, "groups width"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from graspd_core.hands.model import HandModel
@@ -112,28 +113,42 @@ def run_rounds(
     `parts`, the object's convex parts, none is.
     """
     state = RoundsResult(time.perf_counter())
-    batches = [(config, count) for config in rounds]
-    if rounds and parts is not None and count >= _MANY:
-        batches.insert(0, (rounds[0], _FIRST_BATCH))
-    for attempt, (config, most) in enumerate(batches):
-        wanted, good, began = min(most, count - state.good), state.good, time.perf_counter()
+    early = [(config, _FIRST_BATCH) for config in rounds[:1] if parts is not None and count >= _MANY]
+    for attempt, (config, most) in enumerate([*early, *((config, count) for config in rounds)]):
+        enough, good, began = min(most + state.good, count), state.good, time.perf_counter()
         asked = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
-        asked |= {"seed": seed + _SEED_STEP * attempt, "count": wanted if good or not attempt else max(wanted, _MANY)}
-        with enough_memory(f"{asked['count']} grasps at once"):
-            candidates, refused = restrictions.admit(find_candidates(scene, hand, **asked).grasps)
-        state = replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
-        state = replace(state, refused=state.refused + refused)
-        tried = TriedGrasps()
-        if parts is None:
-            tried = TriedGrasps(measured(scene, hand, candidates[:wanted]) if measure else candidates[:wanted])
-        elif candidates:
-            if state.context is None:
-                context = make_trial_context(run, scene, hand, parts, verify, config.certainty, measure=measure)
-                state = replace(state, context=context)
-            if state.context is not None:
-                tried = run_trials(run, state.context, candidates, wanted, good)
-        grasps = surest_first((*state.grasps, *tried.grasps))
-        state = replace(state, grasps=grasps, first=state.first or tried.first, audits=state.audits + tried.audits)
+        seek = enough - good if good or not attempt else max(enough, _MANY)
+        with enough_memory(f"{seek} grasps at once"):
+            candidates = find_candidates(scene, hand, seed=seed + _SEED_STEP * attempt, count=seek, **asked).grasps
+        for some in _in_rank_order(candidates, enough - good, restrictions):
+            admitted, refused = restrictions.admit(some)
+            spent = time.perf_counter() - began
+            state = replace(state, optimise_time=state.optimise_time + spent, refused=state.refused + refused)
+            tried = TriedGrasps()
+            if parts is None:
+                first = admitted[: enough - state.good]
+                tried = TriedGrasps(measured(scene, hand, first) if measure else first)
+            elif admitted:
+                if state.context is None:
+                    context = make_trial_context(run, scene, hand, parts, verify, config.certainty, measure=measure)
+                    state = replace(state, context=context)
+                if state.context is not None:
+                    tried = run_trials(run, state.context, admitted, enough - state.good, state.good)
+            grasps = surest_first((*state.grasps, *tried.grasps))
+            state = replace(state, grasps=grasps, first=state.first or tried.first, audits=state.audits + tried.audits)
+            began = time.perf_counter()
+            if state.good >= enough or run.over():
+                break
         if state.good >= count or run.over():
             break
     return state
+
+
+def _in_rank_order(
+    candidates: tuple[Grasp, ...], wanted: int, restrictions: BoundRestrictions
+) -> Iterator[tuple[Grasp, ...]]:
+    """All candidates at once; where restrictions look at them, which takes time, few first, then twice as many."""
+    some = 2 * max(wanted, _FIRST_BATCH) if restrictions.each else len(candidates)
+    while candidates:
+        yield candidates[:some]
+        candidates, some = candidates[some:], 2 * some
