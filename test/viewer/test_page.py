@@ -75,7 +75,7 @@ def test_a_failed_trial_is_replayed_to_its_reason(page, viewer):
     page.choose("Show", "failed")
     page.text("1 of 1 shown")
     page.press("Run and play")
-    page.tab.get_by_text(re.compile(r"failed at \d+\.\d\d s: the object moved .* under a pull along")).wait_for()
+    page.text(re.compile(r"failed at \d+\.\d\d s: the object moved .* under a pull along"))
     page.until(lambda: np.linalg.norm(viewer._nodes._object.position) > 0.04)
     page.set("Way", 1)
     page.until(lambda: np.linalg.norm(viewer._nodes._object.position) == 0)
@@ -129,7 +129,7 @@ def test_plans_are_made_stopped_and_saved(viewer, visit, tmp_path):
     page.choose("Preset", "accurate")
     page.set("Grasps", 64)
     page.press("Plan")
-    page.tab.get_by_text(re.compile(r"searching \d+ of \d+")).first.wait_for()
+    page.text(re.compile(r"searching \d+ of \d+"))
     page.press("Stop")
     page.text("the caller cancelled the run")
 
@@ -162,7 +162,7 @@ def test_a_page_that_is_closed_leaves_no_thread_behind(visit):
     page = visit(viewer.url)
     page.tab.get_by_role("tab", name="Plan").click()
     page.press("Plan")
-    page.tab.get_by_text(re.compile(r"loading|searching|trying")).first.wait_for()
+    page.text(re.compile(r"loading|searching|trying"))
     viewer.close()
     page.errors.clear()  # of the connection that is gone
     page.until(lambda: not [t for t in set(threading.enumerate()) - before if not t.name.startswith("graspd-parts")])
