@@ -41,6 +41,8 @@ class Viewer:
         self._nodes = SceneNodes(self._server)
         gui = self._server.gui
         self._theme(False)
+        # Beside the scene, not over it: what it hid would be drawn all the same.
+        gui.main_panel.dock_right()
         tabs = gui.add_tab_group()
         with tabs.add_tab("Grasps"):
             self._status = gui.add_html("", visible=False)
