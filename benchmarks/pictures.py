@@ -39,7 +39,7 @@ from graspd_core.trials.trial_recording import record_trial
 from graspd_core.trials.trial_registry import build_worlds
 from graspd_core.trials.world import PROTOCOLS
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
-from graspd_core.viewer.bench_page import bench_page, read_runs
+from graspd_core.viewer.bench_page import bench_page
 from graspd_core.viewer.drawing import SEEN, Part, contact_parts, force_parts, hand_parts, scene_parts, weakest_parts
 from graspd_core.viewer.mechanics import Mechanics
 from graspd_core.viewer.motion import STAGES, placed_links, posture_at
@@ -125,7 +125,7 @@ def pages(figures: Path, benchmark: Path) -> None:
         page.tab.get_by_role("tab", name="Help").click()
         page.tab.get_by_role("checkbox").filter(visible=True).first.click()
         shoot("view_help")
-        (figures / "page.html").write_text(bench_page(benchmark, read_runs(benchmark), served=True))
+        (figures / "page.html").write_text(bench_page(benchmark, served=True)[0])
         page.tab.set_viewport_size({"width": 1200, "height": 900})
         page.tab.goto((figures / "page.html").resolve().as_uri())
         page.tab.locator("circle[data-name=fast]").first.click()

@@ -131,11 +131,10 @@ def wait_for_end(url: str) -> None:
 
 def _view_benchmark(options: argparse.Namespace) -> int:
     from graspd_core.formats.grasps_json import save_text
-    from graspd_core.viewer.bench_page import bench_page, plan_again, read_runs, serve_page
+    from graspd_core.viewer.bench_page import bench_page, plan_again, serve_page
     from graspd_core.viewer.viewer import Viewer
 
-    runs = read_runs(options.path)
-    page = bench_page(options.path, runs, served=options.html is None)
+    page, runs = bench_page(options.path, served=options.html is None)
     if options.html is not None:
         save_text(options.html, page)
         print(f"{options.html}: open it in a browser")

@@ -10,7 +10,7 @@ import html
 import json
 import shlex
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -52,33 +52,26 @@ _FIGURES = (
 )
 
 
-def read_runs(folder: Path) -> dict[str, Record]:
-    """The runs of raw grasps in a benchmark's folder, by key. Raises FormatError: they cannot be read."""
-    records = read_results(folder / "results.json")
-    try:
-        return {r["key"]: r for r in records if r.get("kind") == "raw" and not r["error"] and is_preset(r["name"])}
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
-
-
-def bench_page(folder: Path, runs: Mapping[str, Record], *, served: bool = False) -> str:
-    """The page of a folder's runs; who serves it shows their grasps.
+def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
+    """The page of a benchmark's folder, and its runs of raw grasps by key: who serves the page shows their grasps.
 
     Raises:
-        FormatError: a run lacks what the page says of it, or there is none.
+        FormatError: the folder has no results that can be read, or none of a preset.
     """
+    records = read_results(folder / "results.json")
     try:
-        data = {**page_data(runs.values()), "served": served}
+        raw = [r for r in records if r.get("kind") == "raw" and not r["error"] and is_preset(r["name"])]
+        data, runs = {**page_data(raw), "served": served}, {record["key"]: record for record in raw}
     except (KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
     if not data["panels"]:
         raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
     # Within a script only this sequence could end it.
     text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
-    return _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text)
+    return _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text), runs
 
 
-def page_data(runs: Collection[Record]) -> dict[str, Any]:
+def page_data(runs: Sequence[Record]) -> dict[str, Any]:
     """What the page's script draws: panels of points, and the runs of every name."""
     presets = by_name(rows(runs))
     panels = [

@@ -14,7 +14,7 @@ from graspd_core.bench.run_cases import Job, run_job
 from graspd_core.cli import main
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.methods.plan_config import load_preset
-from graspd_core.viewer.bench_page import bench_page, plan_again, read_runs, serve_page
+from graspd_core.viewer.bench_page import bench_page, plan_again, serve_page
 from graspd_core.viewer.session import Session
 
 
@@ -67,7 +67,7 @@ def test_the_grasps_of_a_run_are_those_that_were_measured(tmp_path: Path, viewer
     cell = Cell("raw", "fast", config, "shape:box", "parallel_gripper", 3, 4, ("standard",))
     record = run_job(Job("main", cell, run_cell, "0.1.0+abc"))
     write_results(tmp_path / "results.json", [record])
-    runs = read_runs(tmp_path)
+    html, runs = bench_page(tmp_path, served=True)
     shown: list[Session] = []
 
     def show(session: Session) -> None:
@@ -79,8 +79,7 @@ def test_the_grasps_of_a_run_are_those_that_were_measured(tmp_path: Path, viewer
             viewer.run(lambda stop: plan_again(runs[key], show, viewer.say, stop))
         return viewer.port if key in runs else None
 
-    page = bench_page(tmp_path, runs, served=True)
-    with serve_page(page, "127.0.0.1", 0, open_run) as url:
+    with serve_page(html, "127.0.0.1", 0, open_run) as url:
         page = visit(url)
         page.tab.locator("circle[data-name=fast]").first.click()
         page.tab.locator("summary").click()
@@ -98,7 +97,7 @@ def test_the_grasps_of_a_run_are_those_that_were_measured(tmp_path: Path, viewer
 
 def test_the_page_is_served_and_nothing_else(folder):
     asked: list[str] = []
-    page = bench_page(folder, read_runs(folder), served=True)
+    page, _ = bench_page(folder, served=True)
     with serve_page(page, "127.0.0.1", 0, lambda key: asked.append(key)) as url:
         assert urlopen(url).read() == urlopen(f"{url}/../results.json").read() == page.encode()
         for origin, status in ((url, 404), ("http://elsewhere.example", 403), ("null", 403)):
@@ -116,4 +115,4 @@ def test_the_page_is_served_and_nothing_else(folder):
 def test_results_that_hold_nothing_are_refused(tmp_path: Path, records: list):
     write_results(tmp_path / "results.json", records)
     with pytest.raises(FormatError, match=str(tmp_path)):
-        bench_page(tmp_path, read_runs(tmp_path))
+        bench_page(tmp_path)
