@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from graspd_core.hands.library import load_hand
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.planning.steering.steering import angle_of_approach
+from graspd_core.types import TriangleMesh
+from graspd_core.viewer.drawing import OBJECT, Part
 from graspd_core.viewer.session import open_grasps
 
 
@@ -50,6 +53,14 @@ def test_the_scrubber_moves_the_hand(page, viewer):
     page.set("Way", 2)
     page.until(lambda: places(viewer) == pytest.approx(at_grasp))
     page.until(lambda: unlike(page.picture(), seen) < 0.01)
+
+
+def test_closed_bodies_are_drawn_from_outside_and_open_ones_from_both_sides(page, viewer):
+    box, nodes = make_shape("box"), viewer._nodes
+    nodes.draw("object", [Part("closed", box, OBJECT), Part("open", TriangleMesh(box.vertices, box.faces[1:]), OBJECT)])
+    assert [node.side for node in nodes._groups["object"]] == ["front", "double"]
+    # The panel stands beside the scene.
+    page.until(lambda: page.tab.locator("canvas").first.bounding_box()["width"] < 600)
 
 
 def test_keys_go_to_the_next_grasp_and_back(page):
