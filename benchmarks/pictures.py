@@ -1,15 +1,21 @@
 """The pictures of the docs, drawn from what `graspd view` shows: plans and draws, the same every time. Not a test.
 
-    python benchmarks/pictures.py [--figures docs/figures]
+    python benchmarks/pictures.py [--figures docs/figures] [--pages results/bench]
 
 grasps.png of README.md, and view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and view_failed.png of
 docs/viewer.md: rays against the meshes of `graspd_core.viewer.drawing`, so that no browser and no screen is needed.
+With --pages instead the screenshots of docs/viewer.md, one of them of that benchmark: these need playwright and
+Chromium, and differ a little each time.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import os
+import re
+import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +26,7 @@ os.environ.update(OMP_NUM_THREADS="1")
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 
 from graspd_core import HandModel, PlanConfig, hand_names, load_hand, load_preset, load_scene, plan_grasps
 from graspd_core.rendering.depth_noise import DepthNoise
@@ -32,10 +39,12 @@ from graspd_core.trials.trial_recording import record_trial
 from graspd_core.trials.trial_registry import build_worlds
 from graspd_core.trials.world import PROTOCOLS
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
+from graspd_core.viewer.bench_page import bench_page
 from graspd_core.viewer.drawing import SEEN, Part, contact_parts, force_parts, hand_parts, scene_parts, weakest_parts
 from graspd_core.viewer.mechanics import Mechanics
 from graspd_core.viewer.motion import STAGES, placed_links, posture_at
-from graspd_core.viewer.session import Session
+from graspd_core.viewer.session import Session, make_session
+from graspd_core.viewer.viewer import Viewer
 
 # What is grasped on the README's picture, and by which hand.
 PAIRS = (("shape:mug", "allegro_right"), ("shape:torus", "barrett_like"), ("shape:hammer", "leap_right"))
@@ -48,9 +57,13 @@ SIDE, FINER = 360, 2
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
+    parser.add_argument("--pages", type=Path, default=None, metavar="BENCHMARK", help="screenshots instead")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.figures.mkdir(parents=True, exist_ok=True)
+    if options.pages:
+        pages(options.figures, options.pages)
+        return
     mug, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("balanced")
     grasps = plan_grasps(mug, hand, count=8, preset=config, measure=False).grasps
     pictures = {
@@ -65,6 +78,62 @@ def main() -> None:
         path = options.figures / f"{name}.png"
         save_png(picture, path)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+def pages(figures: Path, benchmark: Path) -> None:
+    """Screenshots of the page with grasps, a failed trial, a slice, the help, a run, and of a benchmark's chart."""
+    from playwright.sync_api import sync_playwright
+
+    sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
+    from conftest import FLAGS, Page  # pyright: ignore[reportMissingImports]
+
+    scene, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("fast")
+    grasps = plan_grasps(scene, hand, count=16, preset=config).grasps
+    viewer = Viewer(port=0)
+    viewer.show(make_session("mug", hand, grasps, scene, config, np.zeros((0, 3)), ()))
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        page = Page(browser.new_page(viewport={"width": 1000, "height": 760}))
+
+        def shoot(name: str, wait: float = 3000) -> None:
+            page.tab.wait_for_timeout(wait)
+            image = Image.open(io.BytesIO(page.tab.screenshot())).convert("RGB").quantize(192)
+            image.save(figures / f"{name}.png", optimize=True)
+
+        page.tab.goto(viewer.url)
+        page.text("#0 verified")
+        # viser's word on drawing in software.
+        page.tab.locator(".mantine-Notification-closeButton").first.click(timeout=10_000)
+        shoot("view_page")
+        page.choose("Show", "failed")
+        page.press("Run and play")
+        page.text(re.compile(r"failed at \d"))
+        shoot("view_trial", 8000)
+        page.choose("Show", "verified")
+        page.tab.get_by_text("What is shown").click()
+        page.choose("Distance slice", "x")
+        page.set("Opacity", 0.3)
+        shoot("view_slice")
+        page.choose("Distance slice", "none")
+        page.set("Opacity", 1.0)
+        page.tab.get_by_role("tab", name="Plan").click()
+        page.choose("Preset", "accurate")
+        page.press("Plan")
+        page.text(re.compile(r"trying \d+ of \d+, [3-9] verified"))
+        shoot("view_live", 300)
+        page.press("Stop")
+        page.tab.get_by_role("tab", name="Help").click()
+        page.tab.get_by_role("checkbox").filter(visible=True).first.click()
+        shoot("view_help")
+        (figures / "page.html").write_text(bench_page(benchmark, served=True)[0])
+        page.tab.set_viewport_size({"width": 1200, "height": 900})
+        page.tab.goto((figures / "page.html").resolve().as_uri())
+        page.tab.locator("circle[data-name=fast]").first.click()
+        page.tab.locator("summary").filter(has_text="plate").first.click()
+        shoot("view_bench")
+        (figures / "page.html").unlink()
+        browser.close()
+    viewer.close()
 
 
 def pairs() -> np.ndarray:
@@ -87,13 +156,13 @@ def hero(scene: Scene, hand: HandModel, config: PlanConfig, grasp: Grasp) -> np.
     marks = [*contact_parts(grasp.contacts), *force_parts(pressing.positions, pressing.forces)]
     marks += weakest_parts(push, scene.object) if push is not None else []
     drawn = scene_parts(scene)
-    return np.hstack([shot(scene, drawn + at(hand, grasp.squeeze), near=1.4), shot(scene, drawn + marks, near=1.4)])
+    return np.hstack([shot(scene, drawn + at(hand, grasp.squeeze), near=1.2), shot(scene, drawn + marks, near=1.2)])
 
 
 def sequence(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
     """From the retreat to the squeeze."""
     ways = (posture_at(hand, grasp, float(stage)) for stage in range(len(STAGES)))
-    return np.hstack([shot(scene, scene_parts(scene) + at(hand, way), width=0.9) for way in ways])
+    return np.hstack([shot(scene, scene_parts(scene) + at(hand, way), near=0.8) for way in ways])
 
 
 def cloud() -> np.ndarray:

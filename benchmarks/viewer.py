@@ -9,6 +9,7 @@ browser draws in software, on the same cores as the server: its frames are a low
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import random
 import shutil
@@ -35,9 +36,11 @@ from graspd_core import load_hand, load_preset, load_scene, plan_grasps, save_re
 from graspd_core.viewer.session import make_session, open_grasps
 from graspd_core.viewer.viewer import Viewer
 
-FRAMES = (
-    "() => { window.f = 0; const g = () => { window.f += 1; requestAnimationFrame(g); }; requestAnimationFrame(g); }"
-)
+# What three.js says of itself, by way of viser: frames that were really drawn.
+FRAMES = """() => {
+  const drawn = () => window.__viserTestpoints.rendererInfo.render.frame, first = drawn();
+  window.drawn = () => drawn() - first;
+}"""
 
 
 def main() -> None:
@@ -54,7 +57,9 @@ def main() -> None:
         browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         opened(viewer, page, path)
-        scrubbed(viewer, page)
+        for address in ("", "/?fixedDpr=0.5"):
+            page.goto(viewer.url + address)
+            scrubbed(viewer, page, address)
         watched(viewer, "a browser beside it")
         clicked(viewer, page, options.minutes)
         browser.close()
@@ -88,8 +93,9 @@ def opened(viewer: Viewer, page: Any, path: Path) -> None:
     print(f"{path}: on an open page after {shown:.2f} s; a page opened anew says so after {anew:.2f} s")
 
 
-def scrubbed(viewer: Viewer, page: Any) -> None:
+def scrubbed(viewer: Viewer, page: Any, address: str) -> None:
     """Frames of the browser and poses of the hand while the slider is dragged to and fro for ten seconds."""
+    page.get_by_text("#0 verified").first.wait_for()
     time.sleep(3.0)
     poses, nodes = [0], viewer._nodes
     put = nodes.pose_hand
@@ -104,18 +110,18 @@ def scrubbed(viewer: Viewer, page: Any) -> None:
     page.mouse.move(box["x"] + 4, box["y"] + 4)
     page.mouse.down()
     page.evaluate(FRAMES)
-    began, moves = time.perf_counter(), 0
+    began, moves, server, browser = time.perf_counter(), 0, time.process_time(), browser_cpu()
     while time.perf_counter() - began < 10.0:
         page.mouse.move(box["x"] - 90 + 120 * abs((moves % 120) / 60 - 1), box["y"] + 4)
         moves += 1
-    seconds = time.perf_counter() - began
-    frames = page.evaluate("window.f")
+    seconds, server, browser = time.perf_counter() - began, time.process_time() - server, browser_cpu() - browser
+    frames = page.evaluate("window.drawn()")
     page.mouse.up()
-    rates = [
-        f"{count / seconds:.0f} {name}" for name, count in (("frames", frames), ("poses", poses[0]), ("moves", moves))
-    ]
-    print(f"scrubbing, a second: {', '.join(rates)}")
     setattr(nodes, "pose_hand", put)  # noqa: B010 - a method is no attribute to pyright
+    print(
+        f"scrubbing {address}: {frames / seconds:.0f} frames and {poses[0] / seconds:.0f} poses a second; CPU: "
+        f"browser {browser:.1f} s, {1e3 * browser / frames:.0f} ms a frame, server and driver {server:.1f} s"
+    )
 
 
 def watched(viewer: Viewer, who: str, repeats: int = 6) -> None:
@@ -188,6 +194,16 @@ def children() -> list[int]:
         below = [process for process, above in parents.items() if above == parent]
         found, ahead = found + below, ahead + below
     return found
+
+
+def browser_cpu() -> float:
+    """CPU seconds of everything that this process has started and that still runs."""
+    ticks = 0
+    for process in children():
+        with contextlib.suppress(OSError):
+            fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+            ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def browser_memory() -> float:

@@ -193,8 +193,9 @@ def run(directory: Path, process: subprocess.Popen) -> None:
     cloud = cloud_of(mug)
     _, hand = robot.request(f"the mug as a cloud of {cloud.width} points", lambda: robot.points.publish(cloud))
     picture(mug, to_mug_frame(hand), directory / "grasp_from_cloud.png")
-    say(f"\nlook at it in a browser: graspd view {directory / 'grasps.json'}")
-    say(f"written: {', '.join(str(directory / n) for n in ('grasps.json', 'grasp.png', 'grasp_from_cloud.png'))}")
+    say(f"\nwritten to {os.path.relpath(directory)}: grasps.json, grasp.png, grasp_from_cloud.png")
+    graspd = os.path.relpath(Path(sys.executable).with_name("graspd"))
+    say(f"look at the grasps in a browser: {graspd} view {os.path.relpath(directory / 'grasps.json')}")
 
 
 def main() -> int:

@@ -16,6 +16,8 @@ from graspd_core.types import GraspResult, Outcome, Timing
 
 # Metrics in the summary of a run.
 _SHOWN = ("penetration", "contact_area", "epsilon", "robustness")
+# Grasps that it lists; the others it counts.
+_FIRST = 3
 
 
 def add_planning_options(parser: argparse.ArgumentParser) -> None:
@@ -80,11 +82,13 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
         f"verify {timing.verify:.2f} s, total {timing.total:.2f} s"
         + (f", first verified after {timing.first_verified:.2f} s" if timing.first_verified else "")
     )
-    for rank, grasp in enumerate(result.grasps[: min(good, 3)]):
+    for rank, grasp in enumerate(result.grasps[: min(good, _FIRST)]):
         figures = [
             METRICS[name].text(value) for name in _SHOWN if (value := (grasp.metrics or {}).get(name)) is not None
         ]
         lines.append(f"  #{rank}: {', '.join([f'{len(grasp.contacts)} contacts', *figures])}")
+    if good > _FIRST:
+        lines.append(f"  and {good - _FIRST} more")
     return "\n".join(lines)
 
 

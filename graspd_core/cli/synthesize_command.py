@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,6 +102,10 @@ def _report(
     if options.html:
         from graspd_core.formats.grasp_page import save_view
 
-        save_view(options.html, scene.object.mesh, hand, result.grasps)
+        save_view(options.html, scene.object.mesh, hand, result.grasps, name=Path(options.object).name)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
+    if options.out:
+        print(f"written: {options.out}; to look at it: graspd view {shlex.quote(str(options.out))}")
+    if options.html:
+        print(f"written: {options.html}: the best grasp, for any browser")

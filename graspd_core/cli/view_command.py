@@ -130,12 +130,26 @@ def wait_for_end(url: str) -> None:
 
 
 def _view_benchmark(options: argparse.Namespace) -> int:
-    from graspd_core.viewer.bench_page import save_bench_page, serve_page
+    from graspd_core.formats.grasps_json import save_text
+    from graspd_core.viewer.bench_page import bench_page, plan_again, serve_page
+    from graspd_core.viewer.viewer import Viewer
 
-    page = options.html or options.path / "page.html"
-    save_bench_page(options.path, page)
-    print(f"{page}: open it in a browser")
-    if options.html is None:
-        with serve_page(page, options.host, options.port) as url:
+    page, runs = bench_page(options.path, served=options.html is None)
+    if options.html is not None:
+        save_text(options.html, page)
+        print(f"{options.html}: open it in a browser")
+        return EXIT_OK
+    viewer = Viewer(host=options.host, port=options.port and options.port + 1)
+
+    def open_run(key: str) -> int | None:
+        if key not in runs:
+            return None
+        viewer.run(lambda stop: plan_again(runs[key], viewer.show, viewer.say, stop))
+        return viewer.port
+
+    try:
+        with serve_page(page, options.host, options.port, open_run) as url:
             wait_for_end(url)
+    finally:
+        viewer.close()
     return EXIT_OK

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +21,9 @@ from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
 OBJECT_COLOUR, HAND_COLOUR = (217, 140, 64), (89, 115, 153)
 
 
-def save_view(path: str | Path, object_mesh: TriangleMesh, hand: HandModel, grasps: Sequence[Grasp]) -> None:
+def save_view(
+    path: str | Path, object_mesh: TriangleMesh, hand: HandModel, grasps: Sequence[Grasp], *, name: str = "object"
+) -> None:
     """Write a page with the object and the hand at the first grasp that did not fail its trial.
 
     Args:
@@ -27,6 +31,7 @@ def save_view(path: str | Path, object_mesh: TriangleMesh, hand: HandModel, gras
         object_mesh: object frame [m].
         hand: that the grasps are for.
         grasps: in rank order; where all failed, the page shows the object alone.
+        name: of the object, for the page's title.
     """
     from trimesh.viewer.notebook import scene_to_html
 
@@ -34,7 +39,9 @@ def save_view(path: str | Path, object_mesh: TriangleMesh, hand: HandModel, gras
     # The page keeps places as float32.
     far = far_centre(object_mesh.vertices)
     scene = view_scene(moved_mesh(object_mesh, -far), hand, best and moved_grasp(best, -far))
-    save_text(Path(path), scene_to_html(scene))
+    said = f"{name}, {hand.name}: {f'{best.verdict} grasp' if best else 'no grasp'}"
+    page = re.sub("<title>.*?</title>", lambda _: f"<title>{html.escape(said)}</title>", scene_to_html(scene), count=1)
+    save_text(Path(path), page)
 
 
 def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasp: Grasp | None):

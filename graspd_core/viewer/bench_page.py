@@ -1,7 +1,7 @@
 """A benchmark as one page: speed against accuracy, and behind every point the runs and the grasps that made it.
 
-One file that needs no network and no library. Results keep figures of grasps, not their postures: beside every run
-stands the command that plans it again, to be looked at.
+One file that needs no network and no library. Results keep figures of grasps, not their postures: a run that a visitor
+asks for is planned again with its own settings and seed, which finds the same grasps.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ import html
 import json
 import shlex
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from graspd_core.bench.charts.speed_chart import PANELS, Point, points_of
 from graspd_core.bench.figures import Row, by_name, per_verified, rows
@@ -23,11 +26,23 @@ from graspd_core.bench.names import is_preset
 from graspd_core.bench.result_store import read_results
 from graspd_core.bench.study import Record
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.formats.grasps_json import save_text
+from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import SHAPES
+from graspd_core.methods.candidates import find_candidates
+from graspd_core.methods.loop import Hooks
 from graspd_core.methods.method_registry import METHODS
-from graspd_core.scene.load_scene import SHAPE_PREFIX
+from graspd_core.methods.plan_config import plan_config
+from graspd_core.metrics.measure import measure
+from graspd_core.metrics.metrics_context import make_metrics_context
+from graspd_core.scene.load_scene import SHAPE_PREFIX, load_scene
+from graspd_core.scene.scene import object_parts
+from graspd_core.trials.trial_registry import build_worlds, grasp_trials
+from graspd_core.trials.world import PROTOCOLS
+from graspd_core.types import StopHook, Verdict
+from graspd_core.viewer.server import may_connect
+from graspd_core.viewer.session import Session, make_session
 
+Tell = Callable[[str, float], None]
 _TIMES = {"cpu_per_grasp": "CPU seconds per raw grasp", "cpu_per_verified": "CPU seconds per verified grasp"}
 # Of one grasp's record: what is shown, from which part, times what.
 _FIGURES = (
@@ -37,27 +52,28 @@ _FIGURES = (
 )
 
 
-def save_bench_page(folder: Path, page: Path) -> None:
-    """Write the page of a benchmark's folder; it appears whole or not at all.
+def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
+    """The page of a benchmark's folder, and its runs of raw grasps by key: who serves the page shows their grasps.
 
     Raises:
         FormatError: the folder has no results that can be read, or none of a preset.
     """
     records = read_results(folder / "results.json")
     try:
-        data = page_data(records)
+        raw = [r for r in records if r.get("kind") == "raw" and not r["error"] and is_preset(r["name"])]
+        data, runs = {**page_data(raw), "served": served}, {record["key"]: record for record in raw}
     except (KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
     if not data["panels"]:
         raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
     # Within a script only this sequence could end it.
     text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
-    save_text(page, _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text))
+    return _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text), runs
 
 
-def page_data(records: Sequence[Record]) -> dict[str, Any]:
+def page_data(runs: Sequence[Record]) -> dict[str, Any]:
     """What the page's script draws: panels of points, and the runs of every name."""
-    presets = by_name(row for row in rows(records) if is_preset(row.name))
+    presets = by_name(rows(runs))
     panels = [
         {
             "time": label, "label": panel.label, "log": panel.log,
@@ -66,11 +82,7 @@ def page_data(records: Sequence[Record]) -> dict[str, Any]:
         for time, label in _TIMES.items()
         for panel in PANELS
     ]  # fmt: skip
-    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in presets}
-    for record in records:
-        if record.get("kind") == "raw" and not record["error"] and record["name"] in runs:
-            runs[record["name"]].append(_run(record))
-    return {"panels": [panel for panel in panels if panel["points"]], "runs": runs}
+    return {"panels": [panel for panel in panels if panel["points"]], "runs": [_run(record) for record in runs]}
 
 
 def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
@@ -82,14 +94,17 @@ def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
 
 
 def _run(record: Record) -> dict[str, Any]:
-    # Of a file only the name is kept.
-    source = f"{SHAPE_PREFIX}{record['object']}" if record["object"] in SHAPES else record["object"]
-    words = ["graspd", "synthesize", source, "--hand", record["hand"], "--preset", record["name"]]
+    words = ["graspd", "synthesize", _source(record), "--hand", record["hand"], "--preset", record["name"]]
     words += ["--seed", str(record["seed"]), "-n", str(record["count"]), "--view"]
     return {
-        "object": record["object"], "seed": record["seed"], "asked": record["count"], "held": record["held"],
+        **{name: record[name] for name in ("name", "key", "object", "seed", "count", "held")},
         "command": shlex.join(words), "grasps": [_grasp(grasp) for grasp in record["grasps"]],
     }  # fmt: skip
+
+
+def _source(record: Record) -> str:
+    # Of a file only the name is kept.
+    return f"{SHAPE_PREFIX}{record['object']}" if record["object"] in SHAPES else record["object"]
 
 
 def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
@@ -99,10 +114,47 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
     return {"held": bool(tried.get("passed")), "reason": str(tried.get("reason", "")), "figures": figures}
 
 
+def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop: StopHook) -> None:
+    """Find a run's grasps anew, try and measure them, and show them.
+
+    Raises:
+        GraspdError: an object or a hand that is not here.
+    """
+    config = plan_config(record["settings"], f"settings of {record['name']}")
+    hand = load_hand(record["hand"], candidates=config.problem.fine_candidates)
+    scene = load_scene(_source(record), resolution=config.resolution)
+    title = f"{record['name']}, {record['object']}, seed {record['seed']}"
+    session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
+    show(session)
+    count, hooks = record["count"], Hooks(lambda step, of, _: tell(f"searching {step} of {of}", step / of), stop)
+    found = find_candidates(scene, hand, count=count, seed=record["seed"], config=config, hooks=hooks).grasps[:count]
+    worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
+    context, grasps = make_metrics_context(scene.object, hand), []
+    for grasp in found:
+        if stop():
+            break
+        tell(f"trying {len(grasps)} of {len(found)}", len(grasps) / len(found))
+        trials = grasp_trials(worlds, grasp, stop)
+        grasps.append(replace(grasp, trials=trials, metrics=measure(context, grasp.grasp)))
+    held = sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps)
+    line = f"{held} of {count} held; {record['held']} did in the benchmark, by graspd {record.get('code')}"
+    show(make_session(title, hand, tuple(grasps), scene, config, session.seen, (line,)))
+    tell(line, 1.0)
+
+
 @contextmanager
-def serve_page(page: Path, host: str, port: int) -> Iterator[str]:
-    """Serve one file, whatever is asked for, until the end. Raises ConfigError: the address cannot be had."""
-    handler = partial(_OnePage, page.read_bytes())
+def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | None]) -> Iterator[str]:
+    """Serve one page, whatever is asked for, until the end.
+
+    Args:
+        page: HTML.
+        host, port: to listen on.
+        open_run: has the grasps of a run shown, by its key, and says on which port; None where there is no such run.
+
+    Raises:
+        ConfigError: the address cannot be had.
+    """
+    handler = partial(_OnePage, page.encode(), host, open_run)
     try:
         server = ThreadingHTTPServer((host, port), handler)
     except (OSError, OverflowError) as error:
@@ -120,8 +172,8 @@ def serve_page(page: Path, host: str, port: int) -> Iterator[str]:
 
 
 class _OnePage(BaseHTTPRequestHandler):
-    def __init__(self, content: bytes, *arguments: Any) -> None:
-        self._content = content
+    def __init__(self, content: bytes, host: str, open_run: Callable[[str], int | None], *arguments: Any) -> None:
+        self._content, self._host, self._open_run = content, host, open_run
         super().__init__(*arguments)
 
     def do_GET(self) -> None:
@@ -130,6 +182,18 @@ class _OnePage(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(self._content)))
         self.end_headers()
         self.wfile.write(self._content)
+
+    def do_POST(self) -> None:
+        """Show the grasps of a run and send the visitor there; a page of another site may not ask."""
+        named = self.headers.get("Host", "")
+        allowed = may_connect(self.headers.get("Origin"), named, self._host)
+        port = self._open_run(self.path.rpartition("/")[2]) if allowed else None
+        if port is None:
+            self.send_error(404 if allowed else 403)
+            return
+        self.send_response(303)
+        self.send_header("Location", f"http://{named.rpartition(':')[0] or named}:{port}")
+        self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
         del format, args

@@ -23,6 +23,9 @@ it comes from a retreat, closes on the object on its support, and lifts it.
 **While planning.** Every line figure is a hand: blue while it is searched for, grey while it waits for its trial, then
 green or red; one that is less sure stays grey.
 
+**Slow?** A browser that draws without a graphics card does so twice as fast with
+[a quarter of the pixels](/?fixedDpr=0.5).
+
 **Figures.**
 """
 

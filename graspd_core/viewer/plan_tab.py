@@ -16,8 +16,7 @@ from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.shapes import SHAPES
 from graspd_core.methods.plan_config import load_preset, preset_names
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.latest_jobs import LatestJobs
-from graspd_core.types import Verdict
+from graspd_core.types import StopHook, Verdict
 from graspd_core.viewer.grasp_list import BLOCK
 from graspd_core.viewer.live_view import LiveView
 from graspd_core.viewer.plan_request import (
@@ -40,13 +39,13 @@ class PlanTab:
 
     Args:
         server: of the page.
-        jobs: that draw.
         live: shows the run.
         show: shows a session, from any thread.
+        say: shows a line and how far the run is, from any thread.
     """
 
-    def __init__(self, server: Any, jobs: LatestJobs, live: LiveView, show: Callable[[Session], None]) -> None:
-        self._jobs, self._live, self._show = jobs, live, show
+    def __init__(self, server: Any, live: LiveView, show: Callable[[Session], None], say: Callable[..., None]) -> None:
+        self._live, self._show, self._say = live, show, say
         self._upload: Upload | None = None
         self._saved: bytes | None = None
         self._stop = threading.Event()
@@ -83,17 +82,17 @@ class PlanTab:
         """Show how far a run is. From the drawing thread."""
         self._status.content, self._bar.value = f"{BLOCK}{html.escape(line)}</div>", 100.0 * min(max(share, 0.0), 1.0)
 
-    def _say(self, line: str, share: float = 0.0) -> None:
-        """Show something in place of what a run has told before, from any thread."""
-        self._jobs.submit("progress", lambda: self.tell(line, share))
-
     def plan(self) -> None:
         """Begin what the widgets ask for, unless a run is under way."""
+        self.begin(lambda _: self._plan_and_show(self._request()))
+
+    def begin(self, work: Callable[[StopHook], None]) -> None:
+        """Do something else in the thread that plans, which says when to stop, unless a run is under way."""
         if not self._busy.acquire(blocking=False):
             return
         self._stop.clear()
         self._plan.disabled, self._halt.disabled, self._save.disabled = True, False, True
-        self._thread = threading.Thread(target=self._run, name="graspd-viewer-plan", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(work,), name="graspd-viewer-plan", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -133,9 +132,9 @@ class PlanTab:
         check(request)
         return request
 
-    def _run(self) -> None:
+    def _run(self, work: Callable[[StopHook], None]) -> None:
         try:
-            self._plan_and_show(self._request())
+            work(self._stop.is_set)
         except GraspdError as error:
             self._refuse(str(error))
         except Exception as error:

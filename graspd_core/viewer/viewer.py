@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import sys
 import time
 import traceback
@@ -9,6 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 from graspd_core.runtime.latest_jobs import LatestJobs
+from graspd_core.types import StopHook
+from graspd_core.viewer.grasp_list import BLOCK
 from graspd_core.viewer.grasp_tab import GraspTab
 from graspd_core.viewer.help_text import HELP
 from graspd_core.viewer.live_view import LiveView
@@ -38,15 +41,17 @@ class Viewer:
         self._nodes = SceneNodes(self._server)
         gui = self._server.gui
         self._theme(False)
+        # Beside the scene, not over it: what it hid would be drawn all the same.
+        gui.main_panel.dock_right()
         tabs = gui.add_tab_group()
         with tabs.add_tab("Grasps"):
-            self._status = gui.add_markdown("", visible=False)
+            self._status = gui.add_html("", visible=False)
             self._grasps = GraspTab(self._server, self._jobs, self._nodes)
         self._planner: PlanTab | None = None
         self.live = LiveView(self._jobs, self._nodes, self.tell)
         if plan:
             with tabs.add_tab("Plan"):
-                self._planner = PlanTab(self._server, self._jobs, self.live, self.show)
+                self._planner = PlanTab(self._server, self.live, self.show, self.say)
         with tabs.add_tab("Help"):
             dark = gui.add_checkbox("Dark", False)
             gui.add_markdown(HELP)
@@ -59,7 +64,12 @@ class Viewer:
     def url(self) -> str:
         """Where the page is."""
         host = f"[{self._host}]" if ":" in self._host else self._host
-        return f"http://{host}:{self._server.get_port()}"
+        return f"http://{host}:{self.port}"
+
+    @property
+    def port(self) -> int:
+        """That it listens on."""
+        return self._server.get_port()
 
     def show(self, session: Session) -> None:
         """Show a session in place of the one before, from any thread."""
@@ -75,9 +85,19 @@ class Viewer:
         """Have the drawing thread do something; of each kind the newest."""
         self._jobs.submit(kind, work)
 
+    def run(self, work: Callable[[StopHook], None]) -> None:
+        """Have the thread that plans do something, in place of what it is at; `plan` must be had."""
+        if self._planner is not None:
+            self._planner.close()
+            self._planner.begin(work)
+
+    def say(self, line: str, share: float = 0.0) -> None:
+        """Show how far a run is in place of what was said before, from any thread."""
+        self._jobs.submit("progress", lambda: self.tell(line, share))
+
     def tell(self, line: str, share: float) -> None:
         """Show how far a run is. From the drawing thread."""
-        self._status.content, self._status.visible = line, share < 1.0
+        self._status.content, self._status.visible = f"{BLOCK}{html.escape(line)}</div>", share < 1.0
         if self._planner is not None:
             self._planner.tell(line, share)
 

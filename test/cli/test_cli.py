@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from graspd_core.cli import main
+from graspd_core.cli.planning_options import summary
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.formats.read_grasps import load_document, load_grasps
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import preset_names
 from graspd_core.planning import plan_grasps as pipeline
-from graspd_core.types import GraspResult, Outcome, Timing, TriangleMesh
+from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, TriangleMesh
 
 GRASPD = [sys.executable, "-m", "graspd_core.cli"]
 NO_FACES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -193,6 +194,16 @@ def test_a_run_that_ends_with_too_few_says_so(capsys: pytest.CaptureFixture[str]
     assert "0 of 2 grasps (verified, 0 tried): the deadline passed" in capsys.readouterr().out
 
 
+def test_the_summary_lists_three_grasps_and_counts_the_others():
+    posture = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
+    grasp = Grasp(posture, posture, posture, (), 0.0, trials=(TrialResult("hold", True, 0.0, 0.0),))
+    lines = [
+        summary(GraspResult(Outcome.SUCCEEDED, (grasp,) * count, Timing(), 0, "closed_form"), count, count).splitlines()
+        for count in (3, 5)
+    ]
+    assert [line[-1] for line in lines] == ["  #2: 0 contacts", "  and 2 more"]
+
+
 @pytest.mark.parametrize(
     ("outcome", "status"),
     [
@@ -259,6 +270,7 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     ]
     done = subprocess.run([*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == EXIT_OK, done.stderr
+    assert "<title>box.stl, allegro_right: verified grasp</title>" in (tmp_path / "view.html").read_text()
     document = load_document(tmp_path / "grasps.json")
     assert [grasp["verdict"] for grasp in document["grasps"]].count("verified") == 1
     assert document["object"]["scale"] == 0.001

@@ -40,12 +40,13 @@ def shown(path: Path) -> dict[str, np.ndarray]:
 
 def test_the_page_shows_object_and_hand_and_needs_no_network(tmp_path: Path, hand):
     cup = make_shape("mug")
-    save_view(tmp_path / "deep" / "view.html", cup, hand, [grasp_at(hand, Verdict.VERIFIED)])
+    save_view(tmp_path / "deep" / "view.html", cup, hand, [grasp_at(hand, Verdict.VERIFIED)], name="<mug>")
     page = (tmp_path / "deep" / "view.html").read_text()
     assert not re.findall(
         r"""(?:src|href)\s*=\s*["']?https?:|@import|fetch\(\s*["']http|import[^;]{0,80}["']http""", page
     )
     assert not re.findall(r"<(?:link|iframe|img)\b", page)
+    assert f"<title>&lt;mug&gt;, {hand.name}: verified grasp</title>" in page
     meshes = shown(tmp_path / "deep" / "view.html")
     assert set(meshes) == {"object", "hand"}
     # float32 in the file
@@ -62,3 +63,4 @@ def test_the_hand_is_where_the_posture_puts_it(hand):
 def test_a_grasp_that_failed_is_not_shown(tmp_path: Path, hand):
     save_view(tmp_path / "view.html", make_shape("box"), hand, [grasp_at(hand, Verdict.FAILED)])
     assert set(shown(tmp_path / "view.html")) == {"object"}
+    assert f"<title>object, {hand.name}: no grasp</title>" in (tmp_path / "view.html").read_text()

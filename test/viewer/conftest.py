@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -80,9 +81,9 @@ class Page:
     tab: Any
     errors: list[str] = field(default_factory=list)
 
-    def text(self, text: str) -> None:
-        """Wait until the page says so."""
-        self.tab.get_by_text(text).first.wait_for(timeout=PATIENCE)
+    def text(self, text: str | re.Pattern[str]) -> None:
+        """Wait until the page says so, in the tab that is in front."""
+        self.tab.get_by_text(text).filter(visible=True).first.wait_for(timeout=PATIENCE)
 
     def choose(self, label: str, option: str) -> None:
         """Pick an option of the dropdown behind a label."""

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from urllib.request import urlopen
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import pytest
 
+from graspd_core.bench.measurements.measurement import Cell, run_cell
 from graspd_core.bench.result_store import write_results
+from graspd_core.bench.run_cases import Job, run_job
 from graspd_core.cli import main
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.viewer.bench_page import save_bench_page, serve_page
+from graspd_core.methods.plan_config import load_preset
+from graspd_core.viewer.bench_page import bench_page, plan_again, serve_page
+from graspd_core.viewer.session import Session
 
 
 def a_record(name: str, seconds: float, *, held: bool = True, thing: str = "box") -> dict:
@@ -20,7 +25,8 @@ def a_record(name: str, seconds: float, *, held: bool = True, thing: str = "box"
         "metrics": {"penetration": 1e-3, "contact_area": 2e-3},
     }
     return {
-        "kind": "raw", "name": name, "method": "closed_form", "object": thing, "hand": "allegro_right", "seed": 3,
+        "kind": "raw", "key": f"{name}-{thing}", "settings": {}, "name": name,
+        "method": "closed_form", "object": thing, "hand": "allegro_right", "seed": 3,
         "count": 1, "given": 1, "held": int(held), "error": "", "code": "0.1.0+abc", "machine": "2 cores",
         "cpu": {"scene": 1.0, "optimise": seconds, "standard": 0.1}, "peak_mb": 600.0, "grasps": [grasp],
     }  # fmt: skip
@@ -45,7 +51,8 @@ def test_a_point_leads_to_its_runs(folder, visit):
     page.tab.locator("circle[data-name=fast]").first.click()
     page.text("box, seed 3: 0 of 1 held")
     page.tab.get_by_text("box, seed 3: 0 of 1 held").click()
-    page.text("failed the object moved 5.1 cm")
+    page.text("failed: the object moved 5.1 cm")
+    page.text("As many that hold are planned and shown by")
     page.text("graspd synthesize shape:box --hand allegro_right --preset fast --seed 3 -n 1 --view")
     page.tab.locator("#time").select_option("CPU seconds per verified grasp")
     assert page.tab.locator("circle").count() == 6  # two panels of three; nothing of `fast` held in the first
@@ -55,14 +62,52 @@ def test_a_point_leads_to_its_runs(folder, visit):
     page.tab.locator("h2").filter(has_text="</script><b>x").wait_for()
 
 
+def test_the_grasps_of_a_run_are_those_that_were_measured(tmp_path: Path, viewer, visit):
+    config = load_preset("fast")
+    cell = Cell("raw", "fast", config, "shape:box", "parallel_gripper", 3, 4, ("standard",))
+    record = run_job(Job("main", cell, run_cell, "0.1.0+abc"))
+    write_results(tmp_path / "results.json", [record])
+    html, runs = bench_page(tmp_path, served=True)
+    shown: list[Session] = []
+
+    def show(session: Session) -> None:
+        shown.append(session)
+        viewer.show(session)
+
+    def open_run(key: str) -> int | None:
+        if key in runs:
+            viewer.run(lambda stop: plan_again(runs[key], show, viewer.say, stop))
+        return viewer.port if key in runs else None
+
+    with serve_page(html, "127.0.0.1", 0, open_run) as url:
+        page = visit(url)
+        page.tab.locator("circle[data-name=fast]").first.click()
+        page.tab.locator("summary").click()
+        with page.tab.expect_popup() as popup:
+            page.press("Show these grasps")
+        popup.value.get_by_text("fast, box, seed 3").first.wait_for()
+        popup.value.get_by_text(f"{record['held']} of 4 held; {record['held']} did in the benchmark").first.wait_for()
+        popup.value.get_by_text("#0 ").first.wait_for()
+        popup.value.close()
+    for grasp, measured in zip(shown[-1].grasps, record["grasps"], strict=True):
+        assert 100 * grasp.trials[0].displacement == pytest.approx(measured["standard"]["displacement_cm"])
+        assert grasp.metrics is not None
+        assert grasp.metrics["epsilon"] == pytest.approx(measured["metrics"]["epsilon"])
+
+
 def test_the_page_is_served_and_nothing_else(folder):
-    page_file = folder / "page.html"
-    save_bench_page(folder, page_file)
-    with serve_page(page_file, "127.0.0.1", 0) as url:
-        whole = page_file.read_bytes()
-        assert urlopen(url).read() == urlopen(f"{url}/../results.json").read() == whole
-    assert b"http://" not in whole.replace(b"http://www.w3.org/2000/svg", b"")
-    with pytest.raises(ConfigError, match=r"999\.0\.0\.1"), serve_page(page_file, "999.0.0.1", 0):
+    asked: list[str] = []
+    page, _ = bench_page(folder, served=True)
+    with serve_page(page, "127.0.0.1", 0, lambda key: asked.append(key)) as url:
+        assert urlopen(url).read() == urlopen(f"{url}/../results.json").read() == page.encode()
+        for origin, status in ((url, 404), ("http://elsewhere.example", 403), ("null", 403)):
+            with pytest.raises(HTTPError) as refused:
+                urlopen(Request(f"{url}/run/none", data=b"", headers={"Origin": origin}))
+            refused.value.close()
+            assert refused.value.code == status
+    assert asked == ["none"]
+    assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
+    with pytest.raises(ConfigError, match=r"999\.0\.0\.1"), serve_page(page, "999.0.0.1", 0, lambda _: None):
         pass
 
 
@@ -70,4 +115,4 @@ def test_the_page_is_served_and_nothing_else(folder):
 def test_results_that_hold_nothing_are_refused(tmp_path: Path, records: list):
     write_results(tmp_path / "results.json", records)
     with pytest.raises(FormatError, match=str(tmp_path)):
-        save_bench_page(tmp_path, tmp_path / "page.html")
+        bench_page(tmp_path)

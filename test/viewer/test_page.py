@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from graspd_core.hands.library import load_hand
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.planning.steering.steering import angle_of_approach
+from graspd_core.types import TriangleMesh
+from graspd_core.viewer.drawing import OBJECT, Part
 from graspd_core.viewer.session import open_grasps
 
 
@@ -52,6 +55,14 @@ def test_the_scrubber_moves_the_hand(page, viewer):
     page.until(lambda: unlike(page.picture(), seen) < 0.01)
 
 
+def test_closed_bodies_are_drawn_from_outside_and_open_ones_from_both_sides(page, viewer):
+    box, nodes = make_shape("box"), viewer._nodes
+    nodes.draw("object", [Part("closed", box, OBJECT), Part("open", TriangleMesh(box.vertices, box.faces[1:]), OBJECT)])
+    assert [node.side for node in nodes._groups["object"]] == ["front", "double"]
+    # The panel stands beside the scene.
+    page.until(lambda: page.tab.locator("canvas").first.bounding_box()["width"] < 600)
+
+
 def test_keys_go_to_the_next_grasp_and_back(page):
     page.key("n")
     page.text("#1 verified")
@@ -75,7 +86,7 @@ def test_a_failed_trial_is_replayed_to_its_reason(page, viewer):
     page.choose("Show", "failed")
     page.text("1 of 1 shown")
     page.press("Run and play")
-    page.tab.get_by_text(re.compile(r"failed at \d+\.\d\d s: the object moved .* under a pull along")).wait_for()
+    page.text(re.compile(r"failed at \d+\.\d\d s: the object moved .* under a pull along"))
     page.until(lambda: np.linalg.norm(viewer._nodes._object.position) > 0.04)
     page.set("Way", 1)
     page.until(lambda: np.linalg.norm(viewer._nodes._object.position) == 0)
@@ -129,7 +140,7 @@ def test_plans_are_made_stopped_and_saved(viewer, visit, tmp_path):
     page.choose("Preset", "accurate")
     page.set("Grasps", 64)
     page.press("Plan")
-    page.tab.get_by_text(re.compile(r"searching \d+ of \d+")).first.wait_for()
+    page.text(re.compile(r"searching \d+ of \d+"))
     page.press("Stop")
     page.text("the caller cancelled the run")
 
@@ -162,7 +173,7 @@ def test_a_page_that_is_closed_leaves_no_thread_behind(visit):
     page = visit(viewer.url)
     page.tab.get_by_role("tab", name="Plan").click()
     page.press("Plan")
-    page.tab.get_by_text(re.compile(r"loading|searching|trying")).first.wait_for()
+    page.text(re.compile(r"loading|searching|trying"))
     viewer.close()
     page.errors.clear()  # of the connection that is gone
     page.until(lambda: not [t for t in set(threading.enumerate()) - before if not t.name.startswith("graspd-parts")])
