@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from graspd_core.bench import suites, tables
 from graspd_core.bench.bullet.bullet_world import bullet_available
-from graspd_core.bench.failure_maps import map_registry, map_report
+from graspd_core.bench.charts.failure_map_chart import map_sections
+from graspd_core.bench.failure_maps import map_registry
 from graspd_core.bench.measurements.measurement import run_cell
 from graspd_core.bench.stress import stress_cases, stress_table
 from graspd_core.bench.studies import (
@@ -13,7 +14,6 @@ from graspd_core.bench.studies import (
     frames,
     human_hand,
     imported,
-    rgbd_table,
     robust_ranking,
     seen_objects,
     simulators,
@@ -68,7 +68,7 @@ STUDIES: dict[str, Study] = {
         "what cameras see of things on a table, planned on and tried on the truth",
         seen_objects.seen_cases,
         seen_objects.run_seen,
-        rgbd_table.rgbd_sections,
+        seen_objects.rgbd_sections,
         ("studies/seen_objects.py", "object_case.py"),
         _PLANS,
         seen_objects.seen_seconds,
@@ -87,8 +87,8 @@ STUDIES: dict[str, Study] = {
         "where methods stop working: friction and mass, size, view, wall",
         map_registry.map_cases,
         map_registry.run_map,
-        map_report.map_sections,
-        ("failure_maps/[!m]*.py", "failure_maps/map_case.py", "failure_maps/map_registry.py", "object_case.py"),
+        map_sections,
+        ("failure_maps/*.py", "object_case.py"),
         ("cases", "quick"),
         map_registry.map_seconds,
     ),
@@ -138,7 +138,7 @@ STUDIES: dict[str, Study] = {
         arm_reach.reach_cases,
         arm_reach.run_reach,
         arm_reach.reach_sections,
-        ("studies/arm_reach.py", "measurements/arm_poses.py", "object_case.py"),
+        ("studies/arm_reach.py", "object_case.py"),
         _PLANS,
         lambda case: 10.0,
         came=arm_reach.came,

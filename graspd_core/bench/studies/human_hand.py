@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
-from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
+from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
 from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
 from graspd_core.bench.report import markdown_table
 from graspd_core.bench.study import Record, Request, Sections, object_hash, thing_name
