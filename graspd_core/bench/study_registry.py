@@ -7,7 +7,7 @@ from graspd_core.bench.bullet.bullet_world import bullet_available
 from graspd_core.bench.charts.failure_map_chart import map_sections
 from graspd_core.bench.failure_maps import map_registry
 from graspd_core.bench.measurements.measurement import run_cell
-from graspd_core.bench.stress import stress_cases, stress_table
+from graspd_core.bench.stress import stress_cases
 from graspd_core.bench.studies import (
     arm_reach,
     early_ends,
@@ -96,7 +96,7 @@ STUDIES: dict[str, Study] = {
         "what breaks methods, each case in a process of its own",
         stress_cases.stress_runs,
         stress_cases.run_stress,
-        stress_table.stress_sections,
+        stress_cases.stress_sections,
         ("stress/*.py",),
         ("presets", "cases", "quick"),
         lambda case: 6.0,

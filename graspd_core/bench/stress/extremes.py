@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from graspd_core.bench.stress.stress_case import GRASP, Case
+from graspd_core.bench.stress.run_stress_case import GRASP, Case
 from graspd_core.methods.plan_config import PlanConfig
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene

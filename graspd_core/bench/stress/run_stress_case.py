@@ -1,4 +1,4 @@
-"""One case: what it ended in, how long that took, how much memory, what the user saw.
+"""What a stress case is; what one ended in, how long that took, how much memory, what the user saw.
 
 A grasp counts as verified only if it holds in a second trial too: from the file that a user would keep, with the
 object loaded anew and a world built anew.
@@ -8,21 +8,59 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from graspd_core.bench.stopwatch import peak_mb
-from graspd_core.bench.stress.stress_case import GRASP, Case
 from graspd_core.errors import GraspdError
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
 
+Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
+
+# An ending that is a verified grasp; the others are names of `Outcome` or of a `GraspdError`.
+GRASP = "grasp"
 # What a deadline may be overrun by [s].
 GRACE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One thing that breaks methods.
+
+    Attributes:
+        name: unique, words joined by dashes.
+        family: what of it is broken.
+        about: what is wrong, one line.
+        scene: makes the input in a folder of its own and loads it as a user would; may raise a GraspdError.
+        expect: the endings that are right: "grasp", names of `Outcome` ("TOO_FEW") or of an error ("MeshError").
+        whole: a meaningful solid, or an object that can be seen: counted in the share that ends in a verified grasp.
+        hand: by name or path.
+        deadline: seconds that planning is given.
+        loading: seconds that loading may take.
+        memory: most that the process may use at its peak, the libraries' own included [MB].
+        options: further arguments of `plan_grasps`.
+        told: words that the user must read.
+        truth: the true object, in the scene's frame, where the scene is only what cameras saw of it.
+    """
+
+    name: str
+    family: Family
+    about: str
+    scene: Callable[[Path], Scene]
+    expect: tuple[str, ...] = (GRASP,)
+    whole: bool = True
+    hand: str = "allegro_right"
+    deadline: float = 20.0
+    loading: float = 15.0
+    memory: float = 2000.0
+    options: dict[str, Any] = field(default_factory=dict)
+    told: str = ""
+    truth: Callable[[], TriangleMesh] | None = None
 
 
 @dataclass(frozen=True)
