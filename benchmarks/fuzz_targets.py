@@ -238,7 +238,7 @@ def _errors(*names: str) -> tuple[type[Exception], ...]:
     return tuple(getattr(errors, name) for name in names)
 
 
-_READERS = ("xml_io", "build_model", "mimic", "xml_values", "link_meshes", "joint_limits")
+_READERS = ("xml_io", "build_model", "link_meshes", "joint_limits")
 _HANDS = ("graspd_core.hands.library", *(f"graspd_core.hands.readers.{n}" for n in _READERS))
 _NUMBERS = ("nan", "inf", "-inf", "1e400", "1e308", "-1e308", "1e-320", "0", "-1", "99999999999999999999", "0x10")
 _YAML = ("&a", "*a", "<<:", "!!binary", "!!set", "2001-99-99", "? ", "[[", "{")
@@ -275,7 +275,7 @@ TARGETS: dict[str, Target] = {
         ),
         Target(
             "mano", _mano, "pkl", pickles, _errors("HandError"),
-            tuple(f"graspd_core.hands.mano.mano_{n}" for n in ("file", "numbers", "pickle")),
+            tuple(f"graspd_core.hands.mano.mano_{n}" for n in ("file", "numbers")),
             ("cnumpy\nndarray\n", "cnumpy\ndtype\n", "cchumpy.ch\nCh\n", "(", "tR", "}", "\x8a\xff", "\x8d", "2"),
             16384,
         ),
