@@ -6,14 +6,13 @@ object loaded anew and a world built anew.
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 from graspd_core.bench.stopwatch import peak_mb
 from graspd_core.errors import GraspdError
@@ -190,19 +189,10 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
 
 def _finite(result: GraspResult) -> bool:
     """Whether every number of every grasp that did not fail is finite; a trial that diverged may say so."""
-
-    def numbers(value: Any):
-        if isinstance(value, dict):
-            for inner in value.values():
-                yield from numbers(inner)
-        elif isinstance(value, list | tuple):
-            for inner in value:
-                yield from numbers(inner)
-        elif isinstance(value, np.ndarray):
-            yield from value.ravel().tolist()
-        elif isinstance(value, float | np.floating):
-            yield float(value)
-
     good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
-    postures = [(g.pregrasp, g.grasp, g.squeeze) for g in result.grasps]
-    return bool(np.isfinite([*numbers(good), *numbers([asdict(p) for trio in postures for p in trio])]).all())
+    postures = [asdict(posture) for g in result.grasps for posture in (g.pregrasp, g.grasp, g.squeeze)]
+    try:
+        json.dumps([good, postures], allow_nan=False, default=lambda numbers: numbers.tolist())
+    except ValueError:
+        return False
+    return True
