@@ -36,6 +36,7 @@ STUDIES: dict[str, Study] = {
         _CELLS,
         ("presets", *_RAW),
         suites.cell_seconds,
+        failures=True,
     ),
     "ladder": Study(
         "settings from poor to rich, one at a time",
@@ -104,6 +105,7 @@ STUDIES: dict[str, Study] = {
         stress_cases.stress_came,
         alone=True,
         patience=stress_cases.stress_patience,
+        failures=True,
     ),
     "early": Study(
         "trials that stop early against the full length",
@@ -170,5 +172,6 @@ STUDIES: dict[str, Study] = {
         ("studies/frames.py",),
         _PLANS,
         usual=False,
+        failures=True,
     ),
 }

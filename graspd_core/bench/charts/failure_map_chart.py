@@ -97,9 +97,7 @@ def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     body = []
     for name, drawn in MAPS.items():
         panels = {
-            f"{method} (preset {preset})": [
-                r for r in records if not r["error"] and (r["map"], r["preset"]) == (name, preset)
-            ]
+            f"{method} (preset {preset})": [r for r in records if (r["map"], r["preset"]) == (name, preset)]
             for method, preset in METHODS.items()
         }
         if not any(panels.values()):

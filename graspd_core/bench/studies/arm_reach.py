@@ -168,8 +168,7 @@ def came(record: Record) -> str:
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Both tables as Markdown."""
-    whole = [record for record in records if not record["error"]]
-    alone, asked = ([r for r in whole if key in r] for key in ("own", "filtered"))
+    alone, asked = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],
         "reach": [_asked_table(asked), _reasons(asked)] if asked else [],

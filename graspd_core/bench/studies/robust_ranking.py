@@ -66,7 +66,7 @@ def run_robust(case: ObjectCase) -> Record:
 
 def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Costs and gains by shape, the rank correlations, and the chart."""
-    rows = [record for record in records if not record["error"] and record["shares"]]
+    rows = [record for record in records if record["shares"]]
     if not rows:
         return {}
     headings = ["shape", "plan, CPU s", "with ranking", "first by score holds", "first by noise", "the best"]

@@ -187,16 +187,13 @@ def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
 
 def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Both tables."""
-    good = [record for record in records if not record["error"]]
-    rows = {row: own for row in NAMES if (own := [r for r in good if (r["views"], r["crowded"]) == row])}
-    if not rows:
-        return {}
+    rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["crowded"]) == row])}
     full = _share(rows[0, False], "first_held") if (0, False) in rows else 0.0
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
     shown = [views for views in NAMES if views in rows]
     objects = [
         [thing_name(thing), *(_marks([r for r in rows[views] if r["object"] == thing]) for views in shown)]
-        for thing in dict.fromkeys(r["object"] for r in good)
+        for thing in dict.fromkeys(r["object"] for r in records)
     ]
     told = "Verified grasps that hold on the truth, by object (* first grasp holds, one mark a case):"
     return {
@@ -204,7 +201,7 @@ def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
             markdown_table(_HEADINGS, body),
             told,
             markdown_table(["object", *(NAMES[views] for views in shown)], objects),
-            *_calibration([pair for r in good for pair in r.get("told", ())]),
+            *_calibration([pair for r in records for pair in r.get("told", ())]),
         ]
     }
 
