@@ -59,7 +59,7 @@ def _measured() -> Iterator[Case]:
             block,
         ),
         ("flying-pixels", "every edge smeared along its rays", _flying, cuboid),
-        ("table-bleed", "a ring of table about the foot of a mug taken for mug", _bled, mug),
+        ("table-bleed", "a ring of table about the foot of a mug taken for mug", bled, mug),
         ("dropouts", "nine of ten points lost", lambda: _dropped(_views("box", 3), 0.9), cuboid),
         ("half-nan", "every other point is NaN", lambda: _with_nan(_views("cylinder", 3), 0.5), cylinder),
         ("outliers", "two hundred points anywhere in the room", _outliers, cuboid),
@@ -167,7 +167,8 @@ def _flying() -> Views:
     return _views("box", 3, noise=replace(HIGH, flying=1.0, edge_loss=0.0))
 
 
-def _bled() -> Views:
+def bled() -> Views:
+    """What a cut by a plane a little too low leaves: a patch of table about a mug's foot."""
     stage = tabletop("mug", yaw=_YAW)
     ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT)
     (view,) = views_of(stage, CAMERA, _POSES[:1], DEFAULT)
