@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import importlib
 import os
 import re
 import resource
@@ -40,28 +39,27 @@ def fuzz_here(name: str, seconds: int, out: Path, seed: int) -> None:
     """Fuzz one target in this process until the time is over; does not return."""
     import atheris
 
+    corpus, findings = out / "corpus" / name, out / "findings"
+    for folder in (corpus, findings):
+        folder.mkdir(parents=True, exist_ok=True)
+    # What the seeds import is instrumented, and is there before memory is bounded.
     with atheris.instrument_imports(  # pyright: ignore[reportAttributeAccessIssue]
         include=["graspd_core"], enable_loader_override=False
     ):
         from fuzz_targets import TARGETS, scratch, try_input
 
-        target = TARGETS[name]
-        for module in target.modules:
-            importlib.import_module(module)
-    corpus, findings = out / "corpus" / name, out / "findings"
-    for folder in (corpus, findings):
-        folder.mkdir(parents=True, exist_ok=True)
-    with scratch() as folder:
+        target, inputs = TARGETS[name], scratch()
 
         def one(data: bytes) -> None:
             try:
-                try_input(target, data, Path(folder))
+                try_input(target, data, Path(inputs.name))
             except Exception as error:
                 _keep(findings, name, data, error)
 
         for number, data in enumerate(target.seeds()):
             (corpus / f"seed{number}").write_bytes(data)
-            one(data)  # imports what is imported late, before memory is bounded
+            one(data)
+    with inputs as folder:
         words = Path(folder) / "words"
         words.write_text("".join(f'"{_escaped(word)}"\n' for word in target.words))
         resource.setrlimit(resource.RLIMIT_AS, (_virtual_memory() + MEGABYTES * 2**20, resource.RLIM_INFINITY))

@@ -93,8 +93,10 @@ def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Pictur
     """Sections of all studies that have records, by marker; charts are drawn where a path is given."""
     sections: dict[str, Sequence[str | Picture]] = {}
     for name, records in records_of(plan).items():
-        if records:
-            sections |= sourced(f"graspd bench {name}", records, STUDIES[name].sections(records, chart))
+        study = STUDIES[name]
+        shown = [record for record in records if study.failures or not record["error"]]
+        if shown:
+            sections |= sourced(f"graspd bench {name}", records, study.sections(shown, chart))
     return sections
 
 

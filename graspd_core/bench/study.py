@@ -120,6 +120,7 @@ class Study:
         cases: of a request. Raises GraspdError: the request names what there is not.
         run: a case to its figures, in a process that does one case after another; a function of a module.
         sections: records, and the path that charts begin with (None: draw none), to what pages hold of them.
+        failures: the sections are of records of cases that failed, too.
         sources: files below `bench`, by glob, that figures depend on beside the package itself.
         takes: names of the fields of `Request` that it looks at.
         seconds: CPU seconds of a case, roughly.
@@ -142,6 +143,7 @@ class Study:
     alone: bool = False
     patience: Callable[[Any], float] = lambda case: 3600.0
     usual: bool = True
+    failures: bool = False
 
 
 def all_shapes() -> tuple[str, ...]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from graspd_core.bench import suites, tables
 from graspd_core.bench.bullet.bullet_world import bullet_available
-from graspd_core.bench.failure_maps import map_registry, map_report
+from graspd_core.bench.charts.failure_map_chart import map_sections
+from graspd_core.bench.failure_maps import map_registry
 from graspd_core.bench.measurements.measurement import run_cell
-from graspd_core.bench.stress import stress_cases, stress_table
+from graspd_core.bench.stress import stress_cases
 from graspd_core.bench.studies import (
     arm_reach,
     early_ends,
     frames,
     human_hand,
     imported,
-    rgbd_table,
     robust_ranking,
     seen_objects,
     simulators,
@@ -36,6 +36,7 @@ STUDIES: dict[str, Study] = {
         _CELLS,
         ("presets", *_RAW),
         suites.cell_seconds,
+        failures=True,
     ),
     "ladder": Study(
         "settings from poor to rich, one at a time",
@@ -68,7 +69,7 @@ STUDIES: dict[str, Study] = {
         "what cameras see of things on a table, planned on and tried on the truth",
         seen_objects.seen_cases,
         seen_objects.run_seen,
-        rgbd_table.rgbd_sections,
+        seen_objects.rgbd_sections,
         ("studies/seen_objects.py", "object_case.py"),
         _PLANS,
         seen_objects.seen_seconds,
@@ -87,8 +88,8 @@ STUDIES: dict[str, Study] = {
         "where methods stop working: friction and mass, size, view, wall",
         map_registry.map_cases,
         map_registry.run_map,
-        map_report.map_sections,
-        ("failure_maps/[!m]*.py", "failure_maps/map_case.py", "failure_maps/map_registry.py", "object_case.py"),
+        map_sections,
+        ("failure_maps/*.py", "object_case.py"),
         ("cases", "quick"),
         map_registry.map_seconds,
     ),
@@ -96,7 +97,7 @@ STUDIES: dict[str, Study] = {
         "what breaks methods, each case in a process of its own",
         stress_cases.stress_runs,
         stress_cases.run_stress,
-        stress_table.stress_sections,
+        stress_cases.stress_sections,
         ("stress/*.py",),
         ("presets", "cases", "quick"),
         lambda case: 6.0,
@@ -104,6 +105,7 @@ STUDIES: dict[str, Study] = {
         stress_cases.stress_came,
         alone=True,
         patience=stress_cases.stress_patience,
+        failures=True,
     ),
     "early": Study(
         "trials that stop early against the full length",
@@ -138,7 +140,7 @@ STUDIES: dict[str, Study] = {
         arm_reach.reach_cases,
         arm_reach.run_reach,
         arm_reach.reach_sections,
-        ("studies/arm_reach.py", "measurements/arm_poses.py", "object_case.py"),
+        ("studies/arm_reach.py", "object_case.py"),
         _PLANS,
         lambda case: 10.0,
         came=arm_reach.came,
@@ -170,5 +172,6 @@ STUDIES: dict[str, Study] = {
         ("studies/frames.py",),
         _PLANS,
         usual=False,
+        failures=True,
     ),
 }

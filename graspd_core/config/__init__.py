@@ -1,4 +1,4 @@
-"""Settings that several folders share: frozen dataclasses, a file each. A method's own lie in its folder."""
+"""Settings that several folders share: frozen dataclasses. A method's own lie in its folder."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import typing
 from typing import Literal
 
 from graspd_core.config.certainty_config import CertaintyConfig
-from graspd_core.config.grasp_stages_config import GraspStagesConfig
 from graspd_core.config.mapping import from_mapping
-from graspd_core.config.problem_config import ProblemConfig
-from graspd_core.config.reconstruction_config import ReconstructionConfig
-from graspd_core.config.robust_config import RobustConfig
-from graspd_core.config.rounds_config import RoundsConfig
-from graspd_core.config.scene_config import ObstacleConfig, SceneConfig, load_scene_config
-from graspd_core.config.segmentation_config import SegmentationConfig
+from graspd_core.config.planning_config import GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
+from graspd_core.config.scene_config import (
+    ObstacleConfig,
+    ReconstructionConfig,
+    SceneConfig,
+    SegmentationConfig,
+    load_scene_config,
+)
 
 __all__ = [
     "VERIFICATIONS",

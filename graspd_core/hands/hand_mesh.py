@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.mesh.shapes import joined
 from graspd_core.types import TriangleMesh
 
 
@@ -16,13 +19,8 @@ def hand_mesh(hand: HandModel, q: Float[np.ndarray, "joints"]) -> TriangleMesh:
     Curved faces are inscribed, with vertices on the true surface.
     """
     rotations, translations = link_poses(hand, q)
-    vertices, faces, start = [], [], 0
-    for primitive in hand.primitives:
-        mesh = primitive_mesh(primitive)
-        vertices.append(mesh.vertices @ rotations[primitive.link].T + translations[primitive.link])
-        faces.append(mesh.faces + start)
-        start += len(mesh.vertices)
-    return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
+    meshes = [(primitive.link, primitive_mesh(primitive)) for primitive in hand.primitives]
+    return joined(*(replace(m, vertices=m.vertices @ rotations[k].T + translations[k]) for k, m in meshes))
 
 
 def primitive_mesh(primitive: Primitive) -> TriangleMesh:

@@ -1,8 +1,10 @@
 """Signed distance of points to a link's collision primitives, negative inside.
 
-Distances to boxes, spheres, capsules and cylinders are exact. Two approximations: inside a union the depth to the
-nearest single primitive's surface is a lower bound of the depth below the union's surface, and a hull's distance is the
-greatest of its face planes' distances, exact inside and a lower bound outside near edges and corners.
+Distances to boxes, spheres, capsules and cylinders are exact [m]. Their gradients are exact where the distance is
+differentiable; on a centre or an axis, where it is not, they are zero (see `se3.safe_norm`), never NaN.
+Two approximations: inside a union the depth to the nearest single primitive's surface is a lower bound of the depth
+below the union's surface, and a hull's distance is the greatest of its face planes' distances, exact inside and a lower
+bound outside near edges and corners.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.primitive_sdf import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+from graspd_core.se3 import safe_norm
 
 # Primitives of which planes and bounds are remembered: those of the most crowded hand.
 _MOST = 2048
@@ -96,3 +98,38 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
     # Coplanar triangles of one facet make one plane (rounded to 1e-9, far below what a mesh file resolves).
     planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
     return planes[:, :3], planes[:, 3]
+
+
+def sphere_sdf(points: Float[Tensor, "*batch 3"], radius: float | Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+    """Distance [m] to a sphere about the origin."""
+    return safe_norm(points) - radius
+
+
+def capsule_sdf(
+    points: Float[Tensor, "*batch 3"],
+    radius: float | Float[Tensor, "*#batch"],
+    half_length: float | Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*batch"]:
+    """Distance [m] to a capsule along z: all points within `radius` of the segment |z| ≤ `half_length`."""
+    z = points[..., 2]
+    beyond = z.sign() * (z.abs() - half_length).clamp_min(0.0)
+    return safe_norm(torch.cat([points[..., :2], beyond[..., None]], -1)) - radius
+
+
+def box_sdf(points: Float[Tensor, "*batch 3"], half_extents: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch"]:
+    """Distance [m] to an axis-aligned box about the origin."""
+    return _corner_sdf(points.abs() - half_extents)
+
+
+def cylinder_sdf(
+    points: Float[Tensor, "*batch 3"],
+    radius: float | Float[Tensor, "*#batch"],
+    half_length: float | Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*batch"]:
+    """Distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
+    return _corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
+
+
+def _corner_sdf(past: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    """Distance to a corner of `n` orthogonal faces from the signed distances past each face."""
+    return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)

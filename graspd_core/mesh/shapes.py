@@ -81,7 +81,7 @@ def _mug() -> TriangleMesh:
     for radius in (HANDLE_OUTER, HANDLE_INNER):
         arc = radius * bend + [HANDLE_ARM, 0]
         curves.append(np.vstack([[HANDLE_ROOT, -radius], arc, [HANDLE_ROOT, radius]]))
-    return _join(cup, _ribbon(curves[0], curves[1], HANDLE_HALF_WIDTH))
+    return joined(cup, _ribbon(curves[0], curves[1], HANDLE_HALF_WIDTH))
 
 
 def _bowl() -> TriangleMesh:
@@ -107,7 +107,7 @@ def _hammer() -> TriangleMesh:
     inside_head = HEAD_LOW + HEAD_HALF[2]
     r = SHAFT_RADIUS
     shaft = _revolve([(0, SHAFT_LOW), (r, SHAFT_LOW), (r, inside_head), (0, inside_head)])
-    return _join(shaft, _box(HEAD_HALF, (0.0, 0.0, inside_head)))
+    return joined(shaft, _box(HEAD_HALF, (0.0, 0.0, inside_head)))
 
 
 def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriangleMesh:
@@ -160,7 +160,8 @@ def _subdivide(mesh: TriangleMesh, times: int) -> TriangleMesh:
     return TriangleMesh(np.asarray(vertices), np.asarray(faces))
 
 
-def _join(*bodies: TriangleMesh) -> TriangleMesh:
+def joined(*bodies: TriangleMesh) -> TriangleMesh:
+    """All of them as one mesh, their faces in order."""
     offsets = np.cumsum([0] + [len(body.vertices) for body in bodies[:-1]])
     faces = [body.faces + offset for body, offset in zip(bodies, offsets, strict=True)]
     return TriangleMesh(np.vstack([body.vertices for body in bodies]), np.vstack(faces))

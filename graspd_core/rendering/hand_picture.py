@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.shapes import joined
 from graspd_core.rendering.render import look_at, render_shaded
 from graspd_core.se3 import perpendicular
 from graspd_core.types import TriangleMesh
@@ -69,8 +70,6 @@ def _scene(
     ends = np.stack([hand.palm_center, hand.palm_center + _ARROW * size * hand.palm_normal])
     shaft = trimesh.creation.cylinder(radius=_SHAFT * size, segment=ends, sections=12)
     knob = trimesh.creation.icosphere(subdivisions=1, radius=2 * _SHAFT * size)
-    arrow = TriangleMesh(
-        np.concatenate([np.asarray(shaft.vertices), np.asarray(knob.vertices) + ends[1]]),
-        np.concatenate([np.asarray(shaft.faces), np.asarray(knob.faces) + len(shaft.vertices)]),
-    )
+    knob.apply_translation(ends[1])
+    arrow = joined(*(TriangleMesh(np.asarray(body.vertices), np.asarray(body.faces)) for body in (shaft, knob)))
     return [(hand_mesh(hand, posture), _HAND), (dots, _CANDIDATE), (arrow, _PALM)]

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from graspd_core.mesh.shapes import joined
 from graspd_core.mesh.surface_queries import first_hits
 from graspd_core.pointcloud.camera import PinholeCamera, camera_rays
 from graspd_core.se3 import perpendicular
@@ -59,7 +60,7 @@ def render_scene(
     meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
     """Distance along the optical axis [m], 0 where the ray meets nothing, and which mesh it meets, -1 for none."""
-    distance, face, _ = _cast(_joined(meshes), camera, T_world_camera)
+    distance, face, _ = _cast(joined(*meshes), camera, T_world_camera)
     hit = np.isfinite(distance)
     label = np.full(distance.shape, -1)
     label[hit] = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])[face[hit]]
@@ -74,7 +75,7 @@ def render_shaded(
     height: int = 480,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
-    together = _joined([mesh for mesh, _ in meshes])
+    together = joined(*(mesh for mesh, _ in meshes))
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
     distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
     hit = np.isfinite(distance)
@@ -98,12 +99,6 @@ def save_png(image: UInt8[np.ndarray, "height width 3"], path: str | Path) -> No
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
     Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-
-
-def _joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
-    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
-    return TriangleMesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
 
 
 def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):

@@ -11,8 +11,8 @@ import pytest
 
 from graspd_core.bench.charts import chart_style as charts_style
 from graspd_core.bench.charts import speed_chart as charts
-from graspd_core.bench.charts.robustness_chart import draw_robust
 from graspd_core.bench.figures import by_name, rows
+from graspd_core.bench.studies.robust_ranking import draw_robust
 
 ENDS = ("_short", "_planned", "_ladder")
 

@@ -11,14 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.bench.charts.failure_map_chart import Shares, draw_map
-from graspd_core.bench.failure_maps import camera_view as view
-from graspd_core.bench.failure_maps import friction_mass
-from graspd_core.bench.failure_maps import object_size as size
-from graspd_core.bench.failure_maps import wall_thickness as wall
+from graspd_core.bench.charts.failure_map_chart import Shares, draw_map, map_sections, reasons, shares
+from graspd_core.bench.failure_maps import map_runs
 from graspd_core.bench.failure_maps.map_case import MapCase, hand_for, kind_of, run_on
 from graspd_core.bench.failure_maps.map_registry import COUNT, MAPS, METHODS, MapAxis, cases_of, run_map
-from graspd_core.bench.failure_maps.map_report import map_sections, reasons, shares
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import BOX_HALF, make_shape
 from graspd_core.rendering.depth_noise import DEFAULT, NONE
@@ -58,7 +54,7 @@ def test_a_real_case_leaves_a_record():
 
 
 def test_a_refused_scene_loses_all_grasps_and_says_why():
-    done = run_on(size.run, replace(TINY, thing="teapot", up=("a", "b")))
+    done = run_on(map_runs.run_size, replace(TINY, thing="teapot", up=("a", "b")))
     assert [(cell.up, cell.held) for cell in done] == [("a", 0), ("b", 0)]
     for cell in done:
         ((reason, count),) = cell.reasons.items()
@@ -133,18 +129,18 @@ def test_a_map_with_nothing_in_it_is_drawn_empty(tmp_path: Path):
 def test_the_span_of_a_gripper_is_its_opening():
     # Jaws of 12 mm that open to 140 mm: from the middle of the one to that of the other.
     hand = load_hand("parallel_gripper")
-    assert size.hand_span(hand) == pytest.approx(0.152, abs=0.003)
-    assert 0.25 < size.hand_span(hand_for("allegro_right", 600)) < 0.45
+    assert map_runs.hand_span(hand) == pytest.approx(0.152, abs=0.003)
+    assert 0.25 < map_runs.hand_span(hand_for("allegro_right", 600)) < 0.45
 
 
 def test_the_least_width_of_the_box_is_its_shortest_side():
-    assert size.least_width(make_shape("box")) == pytest.approx(2 * min(BOX_HALF))
+    assert map_runs.least_width(make_shape("box")) == pytest.approx(2 * min(BOX_HALF))
 
 
 def test_noise_grows_from_none_over_a_camera_s_to_more():
-    assert view.noise_at(0.0) == NONE
-    assert view.noise_at(1.0) == DEFAULT
-    loud = view.noise_at(4.0)
+    assert map_runs.noise_at(0.0) == NONE
+    assert map_runs.noise_at(1.0) == DEFAULT
+    loud = map_runs.noise_at(4.0)
     assert loud.quadratic == 4 * DEFAULT.quadratic
     assert loud.flying == 1.0
     assert loud.grazing == DEFAULT.grazing
@@ -152,14 +148,14 @@ def test_noise_grows_from_none_over_a_camera_s_to_more():
 
 def test_another_mass_leaves_the_shape_alone():
     thing = load_scene("shape:box", resolution=8).object
-    heavy = friction_mass.at_mass(thing, 2.0)
+    heavy = map_runs.at_mass(thing, 2.0)
     assert heavy.mass == 2.0
     np.testing.assert_allclose(heavy.inertia, 20 * thing.inertia)
     assert heavy.sha256 == thing.sha256
 
 
 def test_the_grid_is_as_coarse_as_asked_and_the_cup_stays():
-    cup = wall.cup(0.3)
-    coarse, fine = (wall.on_grid(cup, nodes) for nodes in (8, 32))
+    cup = map_runs.cup(0.3)
+    coarse, fine = (map_runs.on_grid(cup, nodes) for nodes in (8, 32))
     assert float(coarse.sdf.spacing) > 3.9 * float(fine.sdf.spacing)
     assert coarse.object is cup.object

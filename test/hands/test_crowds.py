@@ -22,7 +22,7 @@ from graspd_core.hands.library import hand_names, load_hand, read_hand_file
 from graspd_core.hands.link_distance import bounds
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import surface_points
-from graspd_core.hands.readers.xml_values import rotation_from_rpy
+from graspd_core.hands.readers.xml_io import rotation_from_rpy
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3
 

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.hands.primitive_sdf import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+from graspd_core.hands.link_distance import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
 
 HALF = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.hands.primitive_sdf import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+from graspd_core.hands.link_distance import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
 from graspd_core.mesh import sdf as sdf_module
 from graspd_core.mesh.mesh_files import check_mesh
 from graspd_core.mesh.sdf import BAND, PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf

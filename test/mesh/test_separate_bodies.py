@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 
 from graspd_core.mesh.separate_bodies import bodies_apart
-from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.shapes import joined, make_shape
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import build_scene
 from graspd_core.types import TriangleMesh
-
-
-def joined(*meshes: TriangleMesh) -> TriangleMesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)])
-    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), faces)
 
 
 def block(size, centre=(0, 0, 0)) -> TriangleMesh:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.shapes import joined, make_shape
 from graspd_core.mesh.small_components import drop_small_components, face_components
 from graspd_core.scene.scene import build_scene
 from graspd_core.types import TriangleMesh
@@ -17,12 +17,6 @@ BOX = make_shape("box")
 
 def cube(half: float, centre) -> TriangleMesh:
     return TriangleMesh(BOX.vertices / np.abs(BOX.vertices).max(0) * half + np.asarray(centre, float), BOX.faces)
-
-
-def joined(*meshes: TriangleMesh) -> TriangleMesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)])
-    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), faces)
 
 
 def soup(mesh: TriangleMesh, jitter: float) -> TriangleMesh:

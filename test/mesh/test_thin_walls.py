@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from graspd_core.bench.stress.broken_meshes import thin_cup
-from graspd_core.bench.stress.run_stress_case import faults, run_case
-from graspd_core.bench.stress.stress_case import GRASP
+from graspd_core.bench.stress.run_stress_case import GRASP, faults, run_case
 from graspd_core.bench.stress.stress_cases import CASES
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf

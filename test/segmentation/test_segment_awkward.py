@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graspd_core.bench.stress.awkward_scenes import beside_a_step, half_out_of_view, zero_filled
+from graspd_core.bench.stress.broken_clouds import beside_a_step, half_out_of_view, zero_filled
 from graspd_core.config import ReconstructionConfig, SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.pointcloud.camera import PinholeCamera

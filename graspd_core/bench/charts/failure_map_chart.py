@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from graspd_core.bench.charts.chart_style import figure, save
 from graspd_core.bench.failure_maps.map_case import Place
-from graspd_core.bench.failure_maps.map_registry import Map
+from graspd_core.bench.failure_maps.map_registry import MAPS, METHODS, Map
+from graspd_core.bench.report import markdown_table
+from graspd_core.bench.study import Picture, Record, Sections
 
 Shares = Mapping[tuple[Place, Place], float]
 
@@ -50,8 +55,6 @@ def _known(drawn: Map, methods: Mapping[str, Shares]) -> Map:
 
 
 def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
-    import numpy as np
-
     across, up = drawn.across.places, drawn.up.places
     grid = np.array([[100 * shares.get((x, y), np.nan) for x in across] for y in up])
     image = axis.imshow(grid, cmap=_COLOURS, vmin=0, vmax=100, origin="lower", aspect="auto")
@@ -74,8 +77,6 @@ def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
 
 def _border(axis: Any, grid: Any) -> None:
     """A line between cells of which one holds at least half of its grasps and the other less."""
-    import numpy as np
-
     works, known = grid >= 50, np.isfinite(grid)
     beside = (works[:, 1:] != works[:, :-1]) & known[:, 1:] & known[:, :-1]
     above = (works[1:] != works[:-1]) & known[1:] & known[:-1]
@@ -88,3 +89,40 @@ def _border(axis: Any, grid: Any) -> None:
 
 def _written(place: Place) -> str:
     return place if isinstance(place, str) else f"{place:g}"
+
+
+def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """A picture a map, under the marker of its name, and all failures by reason."""
+    sections: dict[str, list[str | Picture | None]] = {}
+    body = []
+    for name, drawn in MAPS.items():
+        panels = {
+            f"{method} (preset {preset})": [r for r in records if (r["map"], r["preset"]) == (name, preset)]
+            for method, preset in METHODS.items()
+        }
+        if not any(panels.values()):
+            continue
+        if chart is not None:
+            png = draw_map(drawn, {title: shares(own) for title, own in panels.items()}, chart.with_name(f"map_{name}"))
+            sections[f"map-{name.replace('_', '-')}"] = [Picture(f"Success over {drawn.title}", png)]
+        body += [[drawn.title, title, _counts(reasons(own))] for title, own in panels.items()]
+    return {**sections, "map-failures": [markdown_table(["map", "method", "failures by reason"], body)] if body else []}
+
+
+def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
+    """Share of the grasps asked for that held, all objects together, by place across and up."""
+    held, asked = Counter[tuple[Place, Place]](), Counter[tuple[Place, Place]]()
+    for record in records:
+        for cell in record["cells"]:
+            held[record["across"], cell["up"]] += cell["held"]
+            asked[record["across"], cell["up"]] += record["count"]
+    return {place: held[place] / asked[place] for place in asked}
+
+
+def reasons(records: Sequence[Record]) -> Counter[str]:
+    """Why grasps failed, and how many each."""
+    return sum((Counter(cell["reasons"]) for record in records for cell in record["cells"]), Counter[str]())
+
+
+def _counts(why: Counter[str]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in why.most_common()) or "no failure"

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-from graspd_core.bench.failure_maps import camera_view as view
-from graspd_core.bench.failure_maps import friction_mass
-from graspd_core.bench.failure_maps import object_size as size
-from graspd_core.bench.failure_maps import wall_thickness as wall
+from graspd_core.bench.failure_maps import map_runs
 from graspd_core.bench.failure_maps.map_case import MapCase, Place, Run, run_on
 from graspd_core.bench.study import Record, Request
 from graspd_core.errors import ConfigError
@@ -18,6 +15,8 @@ from graspd_core.errors import ConfigError
 METHODS: Mapping[str, str] = {"closed_form": "balanced", "graspd2022": "graspd2022_short"}
 # Raw grasps of a cell, shared evenly among its objects.
 COUNT = 8
+# Objects that the map of sizes has a row each for.
+_SIZED = ("sphere", "box", "cylinder")
 
 
 @dataclass(frozen=True)
@@ -56,32 +55,32 @@ class Map:
 MAPS: Mapping[str, Map] = {
     "friction_mass": Map(
         "friction and mass",
-        MapAxis("friction coefficient", friction_mass.FRICTIONS),
-        MapAxis("mass [kg]", friction_mass.MASSES),
-        friction_mass.THINGS,
-        friction_mass.run,
+        MapAxis("friction coefficient", (0.1, 0.2, 0.3, 0.6, 1.5)),
+        MapAxis("mass [kg]", (0.005, 0.03, 0.1, 0.3, 1.0, 2.0)),
+        ("cylinder", "mug"),
+        map_runs.run_friction_mass,
         together=True,
     ),
     "size": Map(
         "size",
-        MapAxis("least width of the object / span of the hand", size.RATIOS),
-        MapAxis("object", size.THINGS),
-        size.THINGS,
-        size.run,
+        MapAxis("least width of the object / span of the hand", (0.025, 0.05, 0.1, 0.25, 0.4, 0.5)),
+        MapAxis("object", _SIZED),
+        _SIZED,
+        map_runs.run_size,
     ),
     "view": Map(
         "view",
-        MapAxis("elevation of the only camera [deg]", view.ELEVATIONS),
-        MapAxis("noise [times a D415's]", view.NOISES),
-        view.THINGS,
-        view.run,
+        MapAxis("elevation of the only camera [deg]", (15.0, 30.0, 50.0, 80.0)),
+        MapAxis("noise [times a D415's]", (0.0, 1.0, 2.0, 4.0)),
+        ("mug",),
+        map_runs.run_view,
     ),
     "wall": Map(
         "wall and grid",
-        MapAxis("resolution of the distance grid", wall.RESOLUTIONS),
-        MapAxis("wall of the cup [mm]", wall.WALLS),
-        wall.THINGS,
-        wall.run,
+        MapAxis("resolution of the distance grid", (8.0, 16.0, 48.0, 96.0)),
+        MapAxis("wall of the cup [mm]", (0.3, 1.0, 3.0, 6.0)),
+        ("cup",),
+        map_runs.run_wall,
     ),
 }
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
 from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
-from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
+from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
 from graspd_core.hands.model import HandModel
 from graspd_core.scene.scene import ObjectModel
 from graspd_core.trials.gravity_trial import gravity_trial

@@ -1,4 +1,4 @@
-"""One case: what it ended in, how long that took, how much memory, what the user saw.
+"""What a stress case is; what one ended in, how long that took, how much memory, what the user saw.
 
 A grasp counts as verified only if it holds in a second trial too: from the file that a user would keep, with the
 object loaded anew and a world built anew.
@@ -6,23 +6,60 @@ object loaded anew and a world built anew.
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, Literal
 
 from graspd_core.bench.stopwatch import peak_mb
-from graspd_core.bench.stress.stress_case import GRASP, Case
 from graspd_core.errors import GraspdError
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
 
+Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
+
+# An ending that is a verified grasp; the others are names of `Outcome` or of a `GraspdError`.
+GRASP = "grasp"
 # What a deadline may be overrun by [s].
 GRACE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One thing that breaks methods.
+
+    Attributes:
+        name: unique, words joined by dashes.
+        family: what of it is broken.
+        about: what is wrong, one line.
+        scene: makes the input in a folder of its own and loads it as a user would; may raise a GraspdError.
+        expect: the endings that are right: "grasp", names of `Outcome` ("TOO_FEW") or of an error ("MeshError").
+        whole: a meaningful solid, or an object that can be seen: counted in the share that ends in a verified grasp.
+        hand: by name or path.
+        deadline: seconds that planning is given.
+        loading: seconds that loading may take.
+        memory: most that the process may use at its peak, the libraries' own included [MB].
+        options: further arguments of `plan_grasps`.
+        told: words that the user must read.
+        truth: the true object, in the scene's frame, where the scene is only what cameras saw of it.
+    """
+
+    name: str
+    family: Family
+    about: str
+    scene: Callable[[Path], Scene]
+    expect: tuple[str, ...] = (GRASP,)
+    whole: bool = True
+    hand: str = "allegro_right"
+    deadline: float = 20.0
+    loading: float = 15.0
+    memory: float = 2000.0
+    options: dict[str, Any] = field(default_factory=dict)
+    told: str = ""
+    truth: Callable[[], TriangleMesh] | None = None
 
 
 @dataclass(frozen=True)
@@ -152,19 +189,10 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
 
 def _finite(result: GraspResult) -> bool:
     """Whether every number of every grasp that did not fail is finite; a trial that diverged may say so."""
-
-    def numbers(value: Any):
-        if isinstance(value, dict):
-            for inner in value.values():
-                yield from numbers(inner)
-        elif isinstance(value, list | tuple):
-            for inner in value:
-                yield from numbers(inner)
-        elif isinstance(value, np.ndarray):
-            yield from value.ravel().tolist()
-        elif isinstance(value, float | np.floating):
-            yield float(value)
-
     good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
-    postures = [(g.pregrasp, g.grasp, g.squeeze) for g in result.grasps]
-    return bool(np.isfinite([*numbers(good), *numbers([asdict(p) for trio in postures for p in trio])]).all())
+    postures = [asdict(posture) for g in result.grasps for posture in (g.pregrasp, g.grasp, g.squeeze)]
+    try:
+        json.dumps([good, postures], allow_nan=False, default=lambda numbers: numbers.tolist())
+    except ValueError:
+        return False
+    return True

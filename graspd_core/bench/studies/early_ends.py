@@ -116,7 +116,7 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Disagreements and CPU time by group as Markdown."""
     groups: dict[str, list[Record]] = {}
     told = []
-    for record in (record for record in records if not record["error"]):
+    for record in records:
         for row in record["rows"]:
             names = [row["group"]]
             if record["factors"] and row["group"] == "standard":

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
-from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
+from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
 from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
 from graspd_core.bench.report import markdown_table
 from graspd_core.bench.study import Record, Request, Sections, object_hash, thing_name
@@ -86,12 +85,11 @@ def run_mano(case: HumanGrasps) -> Record:
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """The objects, their mean, and the paper's rows, as Markdown."""
-    good = [record for record in records if not record["error"]]
-    measured = [record for record in good if record["contact_area_cm2"]]
+    measured = [record for record in records if record["contact_area_cm2"]]
     body = [_row(thing_name(r["object"]), f"{r['held']}/{r['count']}", [r]) for r in measured]
-    body += [[thing_name(r["object"]), "no grasp found", *[""] * 5] for r in good if r not in measured]
+    body += [[thing_name(r["object"]), "no grasp found", *[""] * 5] for r in records if r not in measured]
     if measured:
-        share = sum(r["held"] for r in good) / sum(r["count"] for r in good)
+        share = sum(r["held"] for r in records) / sum(r["count"] for r in records)
         body.append(_row("**mean**", f"{share:.0%}", measured))
     for name, (area, volume, ratio, moved) in PAPER.items():
         body.append([f"{name}, as published", "", f"{area}", f"{volume:.2f}", f"{ratio}", f"{moved}", ""])

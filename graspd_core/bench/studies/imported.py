@@ -142,19 +142,16 @@ def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequen
 
 def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """One table, a row for every object and source and for all objects together, as Markdown."""
-    good = [record for record in records if not record["error"]]
-    if not good:
-        return {}
-    trials = [name for name in TRIALS if any(name in record["trials"] for record in good)]
+    trials = [name for name in TRIALS if any(name in record["trials"] for record in records)]
     metrics = [row for row in METRICS.values() if row.measure is not None]
     headings = ["object", "grasps of", "tried", *(_PASSED[name] for name in trials if name in _PASSED)]
     headings += [_FIGURES[name][0] for name in trials if name in _FIGURES] + [row.title for row in metrics]
-    groups = [(_name(record["object"]), [record]) for record in good]
-    if len(good) > 1:
-        groups.append(("**all**", good))
+    groups = [(_name(record["object"]), [record]) for record in records]
+    if len(records) > 1:
+        groups.append(("**all**", list(records)))
     body = [_row(name, some, source, trials) for name, some in groups for source in SOURCES]
     whys: dict[str, int] = {}
-    for record in good:
+    for record in records:
         for why, count in record["refused"].items():
             whys[why] = whys.get(why, 0) + count
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())

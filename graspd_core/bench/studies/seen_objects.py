@@ -7,14 +7,17 @@ as a user's clouds do; every grasp that was verified on the reconstruction is tr
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from graspd_core.bench.object_case import ObjectCase, object_cases
-from graspd_core.bench.study import Record, Request
+from graspd_core.bench.report import markdown_table
+from graspd_core.bench.study import Record, Request, Sections, thing_name
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
@@ -45,6 +48,16 @@ YAW = 0.3
 CLEAR = 0.04
 # Where a sphere of 5 mm about a true point meets the reconstruction, that point counts as found.
 FOUND, SAMPLES = 0.005, 20_000
+# By number of views, and whether other things stand beside.
+NAMES = {
+    (1, False): "1 view", (1, True): "1 view, crowded", (3, False): "3 views", (15, False): "15 views",
+    (0, False): "full mesh",
+}  # fmt: skip
+_HEADINGS = [
+    "planned on", "first grasp holds on the truth", "of the full mesh's figure", "verified grasps that hold",
+    "that lift too", "cases without a grasp", "first verified grasp, median (worst)", "Chamfer", "within 5 mm",
+    "beyond 10 mm", "closed",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -170,3 +183,67 @@ def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
         "beyond_10mm": float((stray > 0.01).mean()),
         "watertight": bool(is_closed(scene.object.mesh)),
     }
+
+
+def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Both tables."""
+    rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["crowded"]) == row])}
+    full = _share(rows[0, False], "first_held") if (0, False) in rows else 0.0
+    body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
+    shown = [views for views in NAMES if views in rows]
+    objects = [
+        [thing_name(thing), *(_marks([r for r in rows[views] if r["object"] == thing]) for views in shown)]
+        for thing in dict.fromkeys(r["object"] for r in records)
+    ]
+    told = "Verified grasps that hold on the truth, by object (* first grasp holds, one mark a case):"
+    return {
+        "rgbd": [
+            markdown_table(_HEADINGS, body),
+            told,
+            markdown_table(["object", *(NAMES[views] for views in shown)], objects),
+            *_calibration([pair for r in records for pair in r.get("told", ())]),
+        ]
+    }
+
+
+def _row(own: Sequence[Record], full: float) -> list[str]:
+    seconds = [r["scene_s"] + r["first_s"] for r in own if r.get("first_s") is not None]
+    verified, held = sum(r["verified"] for r in own), sum(r["held"] for r in own)
+    first, scene = _share(own, "first_held"), np.median([r["scene_s"] for r in own])
+    times = f"{np.median(seconds):.1f} s ({max(seconds):.1f} s), of it scene {scene:.1f} s" if seconds else "–"
+    solids = [r for r in own if "chamfer_mm" in r]
+    errors = [
+        np.mean([r[name] for r in solids]) for name in ("chamfer_mm", "completeness", "beyond_10mm", "watertight")
+    ]
+    return [
+        f"{first:.0%} of {len(own)}",
+        f"{first / full:.0%}" if full else "–",
+        f"{held}/{verified} ({held / max(verified, 1):.0%})",
+        str(sum(r.get("lifted", 0) for r in own)),
+        str(sum(not r["verified"] for r in own)),
+        times,
+        *((f"{errors[0]:.1f} mm", *(f"{share:.0%}" for share in errors[1:])) if solids else "––––"),
+    ]
+
+
+def _share(own: Sequence[Record], name: str) -> float:
+    return float(np.mean([r.get(name, False) for r in own]))
+
+
+def _marks(own: Sequence[Record]) -> str:
+    marks = "".join("\\*" if r.get("first_held") else "." for r in own)
+    return f"{sum(r['held'] for r in own)}/{sum(r['verified'] for r in own)} {marks}"
+
+
+def _calibration(told: Sequence[tuple[float, bool]]) -> list[str]:
+    """How often grasps of each stated probability held on the truth, and the mean square of what that was off."""
+    if not told:
+        return []
+    levels = sorted({probability for probability, _ in told}, reverse=True)
+    held = {level: [hold for probability, hold in told if probability == level] for level in levels}
+    body = [[f"{level:.0%}", f"{np.mean(holds):.0%} of {len(holds)}"] for level, holds in held.items()]
+    brier = float(np.mean([(probability - hold) ** 2 for probability, hold in told]))
+    return [
+        f"Stated probability against what held on the truth, less sure grasps among them; Brier score {brier:.3f}:",
+        markdown_table(["stated", "held"], body),
+    ]

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd_core.bench.bullet.bullet_displacement import bullet_displacement
 from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
-from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available
+from graspd_core.bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
 from graspd_core.bench.object_case import ObjectCase, object_cases, raw_grasps
 from graspd_core.bench.report import markdown_table
 from graspd_core.bench.study import Record, Request, Sections, all_shapes, thing_name
@@ -62,7 +61,7 @@ def run_simulators(case: ObjectCase) -> Record:
 
 def simulator_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """The verdicts side by side, every disagreement with both reasons, and the displacements, as Markdown."""
-    rows = [(r["object"], trial) for r in records if not r["error"] for trial in r["trials"]]
+    rows = [(r["object"], trial) for r in records for trial in r["trials"]]
     if not rows:
         return {}
     verdicts = [(t["mujoco"]["passed"], t["bullet"]["passed"]) for _, t in rows]

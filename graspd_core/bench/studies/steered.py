@@ -144,9 +144,6 @@ def _in_boxes(hand: HandModel, grasp: Grasp, wish: Steering) -> bool:
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Success and cost by wish."""
-    rows = [record for record in records if not record["error"]]
-    if not rows:
-        return {}
     headings = ["wish", "requests", "with a verified grasp", "without the wish", "grasps of those asked for"]
     headings += [
         "without the wish",
@@ -156,7 +153,7 @@ def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
         "beyond region",
         "in boxes",
     ]
-    body = [_row(wish, [r for r in rows if wish in ("all", r["wish"])]) for wish in (*WISHES, "all")]
+    body = [_row(wish, [r for r in records if wish in ("all", r["wish"])]) for wish in (*WISHES, "all")]
     return {"steered": [markdown_table(headings, [row for row in body if row])]}
 
 

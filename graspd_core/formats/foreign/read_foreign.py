@@ -8,9 +8,8 @@ from pathlib import Path
 
 from graspd_core.errors import FormatError
 from graspd_core.formats.foreign.dexgraspbench_npy import read_dexgraspbench
-from graspd_core.formats.foreign.graspgen_json import read_graspgen
 from graspd_core.formats.foreign.imported_grasp import ImportedGrasp
-from graspd_core.formats.foreign.isaac_grasp import read_isaac
+from graspd_core.formats.foreign.posed_grasps import read_graspgen, read_isaac
 from graspd_core.hands.model import HandModel
 from graspd_core.runtime.inert_pickle import read_bounded
 

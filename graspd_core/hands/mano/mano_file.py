@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from graspd_core.errors import HandError
-from graspd_core.hands.mano.mano_numbers import numbers
-from graspd_core.hands.mano.mano_pickle import read_pickle
+from graspd_core.hands.mano.mano_numbers import numbers, read_pickle
 
 # The sixteen bodies, each named after the bone that it moves; 1 is the knuckle, 3 the last joint. Not the order of a
 # hand: the little finger comes before the ring finger.

@@ -127,16 +127,5 @@ def rotations_from_joints(
     return torch.cat([base, turned], 1)
 
 
-def joints_from_rotations(
-    frames: Float[Tensor, "16 3 3"], rotations: Float[Tensor, "batch 16 3 3"]
-) -> Float[Tensor, "batch 45"]:
-    """The hinges' values [rad] that give some rotations, abduction under 90°: inverse of `rotations_from_joints`."""
-    local = frames[1:].transpose(-1, -2) @ rotations[:, 1:] @ frames[1:]
-    flexion = torch.atan2(-local[..., 1, 2], local[..., 2, 2])
-    abduction = torch.asin(local[..., 0, 2].clamp(-1.0, 1.0))
-    twist = torch.atan2(-local[..., 0, 1], local[..., 0, 0])
-    return torch.stack([flexion, abduction, twist], -1).flatten(-2)
-
-
 def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from graspd_core.errors import HandError
 from graspd_core.hands.mano.mano_file import PARENTS, ManoData
-from graspd_core.se3 import quaternion_from_rotation, rotation_from_quaternion, safe_norm
+from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,16 +78,6 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
     """Rotations of axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
     half = 0.5 * safe_norm(vector)[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
-
-
-def vector_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Axis-angle vectors of length up to π [rad]; of two that are half a turn long, either."""
-    quaternion = quaternion_from_rotation(rotation)
-    sine = safe_norm(quaternion[..., 1:])
-    angle = 2.0 * torch.atan2(sine, quaternion[..., 0])
-    # For small angles the ratio of angle and sine of the half is two.
-    ratio = torch.where(sine < 1e-9, 2.0, angle / sine.clamp_min(1e-9))
-    return ratio[..., None] * quaternion[..., 1:]
 
 
 def pose_from_components(

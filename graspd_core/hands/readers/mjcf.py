@@ -19,9 +19,8 @@ from jaxtyping import Float
 from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import HandModel, JointKind, Primitive
 from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
-from graspd_core.hands.readers.joint_limits import Coupling, JointSpec
+from graspd_core.hands.readers.joint_limits import Coupling, JointSpec, resolved_couplings
 from graspd_core.hands.readers.link_meshes import corners_each
-from graspd_core.hands.readers.mimic import resolved_couplings
 from graspd_core.hands.readers.mjcf_geoms import (
     MeshAsset,
     asset_hull,
@@ -32,8 +31,7 @@ from graspd_core.hands.readers.mjcf_geoms import (
     read_geom,
     type_name,
 )
-from graspd_core.hands.readers.xml_io import Element, as_text, read_xml, wrong
-from graspd_core.hands.readers.xml_values import FARTHEST
+from graspd_core.hands.readers.xml_io import FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.se3 import axis_rotation
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}

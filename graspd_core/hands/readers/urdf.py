@@ -11,12 +11,10 @@ from jaxtyping import Float
 from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind
 from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
-from graspd_core.hands.readers.joint_limits import JointSpec
+from graspd_core.hands.readers.joint_limits import JointSpec, read_couplings
 from graspd_core.hands.readers.link_meshes import corners_each
-from graspd_core.hands.readers.mimic import read_couplings
 from graspd_core.hands.readers.urdf_geometry import colliding, read_primitives
-from graspd_core.hands.readers.xml_io import read_xml, wrong
-from graspd_core.hands.readers.xml_values import read_numbers, read_origin
+from graspd_core.hands.readers.xml_io import read_numbers, read_origin, read_xml, wrong
 
 _KINDS: dict[str, JointKind] = {
     "revolute": "revolute",

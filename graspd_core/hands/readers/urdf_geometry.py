@@ -10,8 +10,7 @@ from jaxtyping import Float
 
 from graspd_core.hands.model import Primitive, PrimitiveKind
 from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, mesh_hull
-from graspd_core.hands.readers.xml_io import wrong
-from graspd_core.hands.readers.xml_values import read_numbers, read_origin
+from graspd_core.hands.readers.xml_io import read_numbers, read_origin, wrong
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")

@@ -9,8 +9,13 @@ import pytest
 import torch
 
 from graspd_core.bench.bullet import bullet_world as bullet
-from graspd_core.bench.bullet.bullet_displacement import OBMAN, bullet_displacement, displacements
-from graspd_core.bench.bullet.bullet_world import BulletWorld, build_bullet_world
+from graspd_core.bench.bullet.bullet_world import (
+    OBMAN,
+    BulletWorld,
+    build_bullet_world,
+    bullet_displacement,
+    displacements,
+)
 from graspd_core.errors import SimulatorError
 from graspd_core.mesh.mesh_files import content_hash, mass_properties
 from graspd_core.scene.scene import ObjectModel

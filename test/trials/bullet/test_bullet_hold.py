@@ -17,7 +17,7 @@ from graspd_core.errors import SimulatorError
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mimic
-from graspd_core.hands.readers.xml_values import rotation_from_rpy
+from graspd_core.hands.readers.xml_io import rotation_from_rpy
 from graspd_core.se3 import random_rotations, rotation_from_quaternion
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import PROTOCOLS, build_world

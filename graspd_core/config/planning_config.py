@@ -1,0 +1,89 @@
+"""Settings of planning that every method shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ProblemConfig:
+    """How scene and hand are laid out as tensors; every method's poses become grasps and are ranked in these terms.
+
+    Attributes:
+        candidates: contact candidates looked at by most steps.
+        fine_candidates: contact candidates looked at while polishing.
+        patch_size: how many of them make a patch that is drawn to the surface by itself, so that all of the hand comes
+            to touch; zero: of each rigid group of links the nearest candidate is drawn.
+        features: sharp points of the object looked at while polishing.
+        directions: disturbance wrenches.
+        friction: coefficient planned with; below the object's own, so that contacts keep a margin.
+        confidence_floor: what a contact counts on surface that was only guessed; one where it was seen.
+    """
+
+    candidates: int = 256
+    fine_candidates: int = 600
+    patch_size: int = 0
+    features: int = 128
+    directions: int = 24
+    friction: float = 0.4
+    confidence_floor: float = 0.4
+
+
+@dataclass(frozen=True)
+class GraspStagesConfig:
+    """Pregrasp and squeeze.
+
+    Attributes:
+        touch_reach: links this near to the object count as touching [m].
+        grip_force: sum of the normal forces of the squeeze [N].
+        stiffness: position gain of the hand's joint controllers, of turning joints [N·m/rad].
+        slide_stiffness: the same of sliding joints [N/m].
+        effort_share: share of a joint's effort limit that the squeeze may use.
+        clearance: distance from the object that the pregrasp opens to [m].
+        open_steps: steps of the search for the pregrasp.
+        open_joint_rate: its step size of the joints [rad]; sliding ones take 0.05 m for a radian.
+        open_base_rate: its step size of the base [m].
+    """
+
+    touch_reach: float = 0.002
+    grip_force: float = 40.0
+    stiffness: float = 5.0
+    slide_stiffness: float = 2000.0
+    effort_share: float = 1.0
+    clearance: float = 0.012
+    open_steps: int = 40
+    open_joint_rate: float = 0.04
+    open_base_rate: float = 0.002
+
+
+@dataclass(frozen=True)
+class RoundsConfig:
+    """Rounds of optimiser and trial: where too few grasps held, what is missing is sought again from other starts.
+
+    An effort of one is the method's settings as they are; less is that share of its steps, more is as many times its
+    starts.
+
+    Attributes:
+        most: rounds at most.
+        first_budget: of the first round, on an object of known shape that stands alone; elsewhere it is one.
+        growth: times as much effort with every further round.
+    """
+
+    most: int = 3
+    first_budget: float = 0.5
+    growth: float = 2.0
+
+
+@dataclass(frozen=True)
+class RobustConfig:
+    """Verified grasps tried again with the hand out of place by up to 5 mm and 5°: those that still hold come first.
+
+    Attributes:
+        rank: whether that is done; it takes `trials` further hold trials for every verified grasp.
+        trials: hold trials of each.
+        hold_time: how long each of their six pulls lasts [s].
+    """
+
+    rank: bool = False
+    trials: int = 8
+    hold_time: float = 0.5
