@@ -152,6 +152,12 @@ class Settings:
         "empty: the defaults",
         check=_check_scene_config,
     )
+    collision_objects: str = _setting(
+        "",
+        "topic of moveit_msgs/CollisionObject, as /collision_object: what it tells of are obstacles of later requests; "
+        "empty: none is heard",
+        read_only=True,
+    )
     grasp_library: str = _setting(
         "",
         "path of a library of grasps, from `graspd library build`: what it knows is answered from it, and what is "

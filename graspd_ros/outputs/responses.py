@@ -92,6 +92,12 @@ class Responses:
             self._complained = time.monotonic()
             self.not_made(request_id, "cloud", error)
 
+    def thing_not_taken(self, error: Exception) -> None:
+        """A message about a thing of the planning scene that is no use; things stay as they were."""
+        code, message = code_of(error), sentence_of(error)
+        self.publishers.tell("refused", "", "collision_objects", code=code, message=message)
+        self._log().warning(f"refused: {message}")
+
     def _accepted(self, request: Request, ahead: int) -> None:
         self.counters.count("accepted")
         self.publishers.tell("accepted", request.id, request.source, ahead=ahead)
