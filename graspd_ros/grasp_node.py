@@ -37,6 +37,7 @@ from graspd_core.runtime.heap import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action_server import GoalServer, SynthesizeMessages
 from graspd_ros.diagnostics import health_message, resident_memory
+from graspd_ros.inputs.arm_place import heard_robot
 from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.frames import TransformListener, wait_for_transform
 from graspd_ros.inputs.request_builder import RequestBuilder
@@ -87,7 +88,7 @@ class GraspNode(Node):
             lambda target, source, stamp: self._transform_in_time(target, source, stamp, self._stopping),
         )
         self._responses = Responses(self, self._hand)
-        self._planner = Planner(self._hand, self._transform_in_time)
+        self._planner = Planner(self._hand, self._transform_in_time, heard_robot(self, settings.arm))
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )

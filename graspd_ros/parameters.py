@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from graspd_core import load_arm, load_preset
+from graspd_core.arms.arm_file import from_robot_description, read_arm_file
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, FormatError
 from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
@@ -67,7 +68,7 @@ def _check_scene_config(path: str) -> None:
 
 
 def _check_arm(name: str) -> None:
-    if name:
+    if name and not from_robot_description(read_arm_file(name)[1]):
         load_arm(name)
 
 

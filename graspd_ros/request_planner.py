@@ -47,8 +47,9 @@ class Planner:
     itself soon after, and the next request waits for that, so that cancelled work does not pile up.
     """
 
-    def __init__(self, hand: HandModel, lookup: Lookup) -> None:
+    def __init__(self, hand: HandModel, lookup: Lookup, robot_description: str = "") -> None:
         self._hand = hand
+        self._robot_description = robot_description
         self._lookup = lookup
         self._behind: Aside[Planned] | None = None
         self._runs = RecentRuns()
@@ -93,7 +94,7 @@ class Planner:
         stamp = Time() if request.timeless else request.stamp
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
         placed = lambda target, source: self._lookup(target, source, stamp, stop)  # noqa: E731
-        reach = reach_of(request, placed)
+        reach = reach_of(request, placed, self._robot_description)
         if request.things:
             from graspd_ros.inputs.collision_objects import among_things
 
