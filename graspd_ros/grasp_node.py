@@ -303,6 +303,8 @@ class GraspNode(Node):
         torch.set_num_threads(read_settings(self).torch_threads)
         try:
             warm_up(self._hand, stop=self._worker.stopping)
+            if read_settings(self).publish_markers:
+                self._responses.drawn(read_settings(self))
             if read_settings(self).grasp_library:
                 from graspd_ros.known_objects import warm_up_library
 

@@ -19,7 +19,7 @@ from graspd_core import load_arm, load_preset
 from graspd_core.arms.arm_file import from_robot_description, read_arm_file
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, FormatError
-from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
+from graspd_ros.outputs.markers import GEOMETRIES, PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
@@ -190,6 +190,11 @@ class Settings:
     marker_grasps: int = _setting(1, "how many of the best grasps ~/markers shows", low=0, high=MOST_GRASPS)
     marker_parts: list[str] = _setting(
         list(USUAL_PARTS), f"what ~/markers shows: any of {', '.join(PARTS)}", check=_check_parts
+    )
+    marker_geometry: str = _setting(
+        "visual",
+        "what ~/markers draws the hand with: visual, the visual shapes of its URDF; collision, what is planned with",
+        choices=GEOMETRIES,
     )
     output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
 
