@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from graspd_core.config import SceneConfig
+from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.winding_number import winding_inside
 from graspd_core.scene.obstacles import make_obstacles
@@ -23,6 +24,7 @@ _OVERLAP_SAMPLES = 4000
 # Of what is seen of a shape near the object [m²]; and the least and most points of one.
 _AREA_OF_A_SAMPLE = 1e-4
 _FEWEST, _MOST = 200, 4000
+_CORNERS = 200
 
 
 def with_neighbours(
@@ -61,7 +63,7 @@ def _meets(shape: TriangleMesh, low: Float[np.ndarray, "3"], high: Float[np.ndar
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
     """What the hulls of points share, of what they fill together; 0 where one is flat."""
     try:
-        hulls = [ConvexHull(a), ConvexHull(b)]
+        hulls = [ConvexHull(_hull_corners(a)), ConvexHull(_hull_corners(b))]
     except QhullError:
         return 0.0
     low, high = b.min(0), b.max(0)
@@ -69,6 +71,11 @@ def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
     inside = [(points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0).all(1) for hull in hulls]
     shared = float((inside[0] & inside[1]).mean() * np.prod(high - low))
     return shared / (hulls[0].volume + hulls[1].volume - shared)
+
+
+def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
+    """The points, or some that span nearly the same hull where they are many: a scan has hundreds of thousands."""
+    return points if len(points) <= _CORNERS else limited_hull(points, _CORNERS).vertices
 
 
 def _points_within(
@@ -81,14 +88,15 @@ def _points_within(
     for normal, corner in [*((axis, low) for axis in np.eye(3)), *((-axis, high) for axis in np.eye(3))]:
         vertices, faces, _ = slice_faces_plane(vertices, faces, normal, corner)
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
-    points = [corners[winding_inside(shape, corners)]]
+    corners = corners[((corners >= shape.vertices.min(0)) & (corners <= shape.vertices.max(0))).all(1)]
+    points = [corners[winding_inside(shape, corners)]] if len(corners) else []
     if len(faces):
         sides = np.diff(vertices[faces], axis=1)
         area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
         count = int(np.clip(area / _AREA_OF_A_SAMPLE, _FEWEST, _MOST))
         surface = TriangleMesh(vertices, faces.astype(np.int64))
-        points += [vertices[np.unique(faces)], surface_samples(surface, count, 0)[0]]
-    return np.concatenate(points)
+        points += [_hull_corners(vertices[np.unique(faces)]), surface_samples(surface, count, 0)[0]]
+    return np.concatenate(points) if points else np.zeros((0, 3))
 
 
 def _rises(points: Float[np.ndarray, "_ 3"], support: Plane | None, margin: float) -> bool:

@@ -105,3 +105,16 @@ def test_a_flat_or_open_shape_is_taken_as_far_as_it_goes(scene):
     mug = make_shape("mug")
     opened = TriangleMesh(mug.vertices + np.array([0.15, 0, 0]), mug.faces[: len(mug.faces) // 2])
     assert with_neighbours(scene, {"half a mug": [opened]}).obstacles
+
+
+def test_a_scan_of_many_triangles_is_taken_as_its_hull_is(scene):
+    """The hull of all of its corners would be 80,000 planes, held against thousands of points."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.1)
+    ball.apply_translation([0.2, 0.0, 0.0])
+    scan = TriangleMesh(np.array(ball.vertices), np.array(ball.faces, dtype=np.int64))
+    found = with_neighbours(scene, {"ball": [scan]})
+    (obstacle,) = found.obstacles
+    assert len(obstacle.mesh.faces) < 20_000
+    np.testing.assert_allclose(np.ptp(obstacle.mesh.vertices, axis=0), 0.21, atol=0.003)
