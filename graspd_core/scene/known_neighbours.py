@@ -10,7 +10,6 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from graspd_core.config import SceneConfig
-from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.winding_number import winding_inside
 from graspd_core.scene.obstacles import make_obstacles
@@ -75,7 +74,10 @@ def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
 
 def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
     """The points, or some that span nearly the same hull where they are many: a scan has hundreds of thousands."""
-    return points if len(points) <= _CORNERS else limited_hull(points, _CORNERS).vertices
+    if len(points) <= _CORNERS:
+        return points
+    rays = np.random.default_rng(0).normal(size=(_CORNERS, 3))
+    return points[np.unique([int((points @ ray).argmax()) for ray in rays])]
 
 
 def _points_within(
