@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from graspd_core.pointcloud.depth_image import cloud_from_depth as cloud_from_depth
     from graspd_core.pointcloud.depth_image import depth_in_metres as depth_in_metres
     from graspd_core.pointcloud.point_cloud import PointCloud as PointCloud
+    from graspd_core.scene.known_neighbours import with_neighbours as with_neighbours
     from graspd_core.scene.load_scene import load_scene as load_scene
     from graspd_core.scene.scene import Scene as Scene
     from graspd_core.scene.scene_from_views import scene_from_views as scene_from_views
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "scene.load_scene": "load_scene",
     "scene.scene_from_views": "scene_from_views",
+    "scene.known_neighbours": "with_neighbours",
     "scene.scene": "Scene",
     "config": "SceneConfig",
     "segmentation.target_selection": "Target",

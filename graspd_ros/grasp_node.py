@@ -10,7 +10,8 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from graspd_core import hand_names, load_hand, warm_up
-from graspd_core.errors import GraspdError
+from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.heap import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action_server import GoalServer, SynthesizeMessages
 from graspd_ros.diagnostics import health_message, resident_memory
+from graspd_ros.inputs.arm_place import heard_robot
 from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.frames import TransformListener, wait_for_transform
 from graspd_ros.inputs.request_builder import RequestBuilder
@@ -54,6 +56,7 @@ RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
 OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline passed while they waited
 # A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
 REQUEST_DEPTH = 500
+THINGS_DEPTH = 500  # a planning scene is told of in one burst
 
 
 class GraspNode(Node):
@@ -77,6 +80,7 @@ class GraspNode(Node):
         self._transforms = TransformBuffer()
         self._listener = TransformListener(self, self._transforms)
         self._pairs = ImagePairs()
+        self._things: Mapping[str, Any] = {}
         self._request_builder = RequestBuilder(
             self._hand.name,
             self._now,
@@ -84,11 +88,11 @@ class GraspNode(Node):
             lambda target, source, stamp: self._transform_in_time(target, source, stamp, self._stopping),
         )
         self._responses = Responses(self, self._hand)
-        self._planner = Planner(self._hand, self._transform_in_time)
+        self._planner = Planner(self._hand, self._transform_in_time, heard_robot(self, settings.arm))
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )
-        self._create_inlets()
+        self._create_inlets(settings.collision_objects)
         self._goals = self._create_actions()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # health does not stop where simulated time does
@@ -96,7 +100,7 @@ class GraspNode(Node):
         self.create_timer(OVERDUE_PERIOD, self._end_overdue, clock=steady)
         self._worker.start()
 
-    def _create_inlets(self) -> None:
+    def _create_inlets(self, collision_objects: str) -> None:
         def listen(kind: type, topic: str, callback: Callable, qos: QoSProfile | int) -> None:
             options = QoSOverridingOptions.with_default_policies()
             self.create_subscription(kind, topic, callback, qos, qos_overriding_options=options)
@@ -107,6 +111,8 @@ class GraspNode(Node):
         listen(PointCloud2, "points", self._on_points, qos_profile_sensor_data)
         listen(Image, "depth/image_rect", self._on_image, qos_profile_sensor_data)
         listen(CameraInfo, "depth/camera_info", self._on_camera_info, qos_profile_sensor_data)
+        if collision_objects:
+            listen(_collision_object(), collision_objects, self._on_collision_object, THINGS_DEPTH)
         self.create_service(ListHands, "~/list_hands", self._on_list_hands)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/add_view", self._on_add_view)
@@ -180,6 +186,14 @@ class GraspNode(Node):
     def _on_camera_info(self, message: CameraInfo) -> None:
         if pair := self._pairs.add_info(message):
             self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
+
+    def _on_collision_object(self, message: Any) -> None:
+        from graspd_ros.inputs.collision_objects import changed_things
+
+        try:
+            self._things = changed_things(self._things, message)
+        except Exception as error:  # whatever the message holds, the executor goes on
+            self._responses.thing_not_taken(error)
 
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
@@ -264,6 +278,8 @@ class GraspNode(Node):
             self._submit(request)
 
     def _submit(self, request: Request) -> None:
+        if self._things:
+            request = replace(request, things=self._things)
         with self._announcing:  # the worker starts only once the answer is out
             admission = self._worker.submit(request, BusyPolicy(request.settings.busy_policy))
             self._responses.admitted(request, admission)
@@ -287,6 +303,8 @@ class GraspNode(Node):
         torch.set_num_threads(read_settings(self).torch_threads)
         try:
             warm_up(self._hand, stop=self._worker.stopping)
+            if read_settings(self).publish_markers:
+                self._responses.drawn(read_settings(self))
             if read_settings(self).grasp_library:
                 from graspd_ros.known_objects import warm_up_library
 
@@ -312,3 +330,13 @@ class GraspNode(Node):
             return self._planner.plan(request, stop, self._responses.progress_hook(request))
         finally:
             trim_heap()
+
+
+def _collision_object() -> type:
+    """The message's type. Raises ConfigError: it is not installed."""
+    try:
+        from moveit_msgs.msg import CollisionObject
+    except ImportError:
+        told = "parameter collision_objects: moveit_msgs/CollisionObject is not installed; install it (docs/moveit.md)"
+        raise ConfigError(f"{told} or leave the parameter empty") from None
+    return CollisionObject

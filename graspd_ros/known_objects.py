@@ -70,7 +70,7 @@ def answer_known(
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))
     entry = find_entry(known, settings, hand)
-    if entry is not None and not restrictions and request.surface is None:
+    if entry is not None and not restrictions and request.surface is None and not request.things:
         grasps = unlike(library.grasps(entry, hand), excluded)[:count]
         if len(grasps) >= count:
             return library_result(library, grasps, count, time.perf_counter() - began), None

@@ -16,9 +16,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from graspd_core import load_arm, load_preset
+from graspd_core.arms.arm_file import from_robot_description, read_arm_file
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, FormatError
-from graspd_ros.outputs.markers import PARTS, USUAL_PARTS
+from graspd_ros.outputs.markers import GEOMETRIES, PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
@@ -67,7 +68,7 @@ def _check_scene_config(path: str) -> None:
 
 
 def _check_arm(name: str) -> None:
-    if name:
+    if name and not from_robot_description(read_arm_file(name)[1]):
         load_arm(name)
 
 
@@ -152,6 +153,12 @@ class Settings:
         "empty: the defaults",
         check=_check_scene_config,
     )
+    collision_objects: str = _setting(
+        "",
+        "topic of moveit_msgs/CollisionObject, as /collision_object: what it tells of are obstacles of later requests; "
+        "empty: none is heard",
+        read_only=True,
+    )
     grasp_library: str = _setting(
         "",
         "path of a library of grasps, from `graspd library build`: what it knows is answered from it, and what is "
@@ -183,6 +190,11 @@ class Settings:
     marker_grasps: int = _setting(1, "how many of the best grasps ~/markers shows", low=0, high=MOST_GRASPS)
     marker_parts: list[str] = _setting(
         list(USUAL_PARTS), f"what ~/markers shows: any of {', '.join(PARTS)}", check=_check_parts
+    )
+    marker_geometry: str = _setting(
+        "visual",
+        "what ~/markers draws the hand with: visual, the visual shapes of its URDF; collision, what is planned with",
+        choices=GEOMETRIES,
     )
     output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
 

@@ -47,8 +47,9 @@ class Planner:
     itself soon after, and the next request waits for that, so that cancelled work does not pile up.
     """
 
-    def __init__(self, hand: HandModel, lookup: Lookup) -> None:
+    def __init__(self, hand: HandModel, lookup: Lookup, robot_description: str = "") -> None:
         self._hand = hand
+        self._robot_description = robot_description
         self._lookup = lookup
         self._behind: Aside[Planned] | None = None
         self._runs = RecentRuns()
@@ -92,17 +93,23 @@ class Planner:
         run_isolated = request.frame_out != request.frame
         stamp = Time() if request.timeless else request.stamp
         T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
-        reach = reach_of(request, lambda target, source: self._lookup(target, source, stamp, stop))
+        placed = lambda target, source: self._lookup(target, source, stamp, stop)  # noqa: E731
+        reach = reach_of(request, placed, self._robot_description)
+        if request.things:
+            from graspd_ros.inputs.collision_objects import among_things
+
+            request = among_things(request, request.things, placed)
         newest = Time()
         excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
-        # What an earlier run found was not asked for these wishes, and an arm may have stood elsewhere. A library has
-        # what that run found, and more.
-        known = excluded and request.steering is None and not reach and request.known is None
+        # What an earlier run found was not asked for these wishes, and an arm or other things may have stood elsewhere.
+        # A library has what that run found, and more.
+        free = request.steering is None and not reach and not request.things
+        known = excluded and free and request.known is None
         result, file = self._runs.next_best(request, excluded) if known else None, ""
         if result is None:
             poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
-            placed = lambda progress: tell(_placed(progress, poses))  # noqa: E731
-            result, file = self._search(request, excluded, reach, stop, placed)
+            moved = lambda progress: tell(_placed(progress, poses))  # noqa: E731
+            result, file = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, result)
         for pose in (request.T_frame_object, T_out_frame):
             result = result if pose is None else moved_result(result, pose)

@@ -86,9 +86,11 @@ pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
 echo "setup: compiling the messages of graspd_msgs (20 seconds)"
 # Against the very libraries that it will be loaded with; what it needs is installed by now.
 "${pip[@]}" --no-build-isolation --no-deps ./msg_defs
-# What comes with ROS and is not on PyPI: the type of /tf, and the action GraspPlanning with the grasp that it gives.
-for package in tf2_msgs moveit_msgs grasping_msgs; do
-    if ! "$venv/bin/python" -c "import $package" 2>/dev/null; then
+# What comes with ROS and is not on PyPI: the type of /tf, MoveIt's grasp and collision object, the action GraspPlanning.
+for needed in tf2_msgs.msg:TFMessage object_recognition_msgs.msg:ObjectType moveit_msgs.msg:CollisionObject \
+    grasping_msgs.action:GraspPlanning; do
+    package=${needed%%.*}
+    if ! "$venv/bin/python" -c "from ${needed%%:*} import ${needed##*:}" 2>/dev/null; then
         rm -rf "$build" && mkdir "$build"
         cp -r "scripts/$package/." msg_defs/setup.py msg_defs/pyproject.toml "$build"
         "${pip[@]}" --no-build-isolation --no-deps "$build"

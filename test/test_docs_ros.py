@@ -111,10 +111,10 @@ def node(directory: Path, claim_domain: Callable[[], int]) -> Iterator[GraspNode
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         # A deadline beyond all that a busy machine may need.
-        arguments = ["--ros-args", "-p", f"mesh_roots:=['{directory}']", "-p", "deadline:=1000.0"]
+        given = f"mesh_roots:=['{directory}']", "deadline:=1000.0", "collision_objects:=/collision_object"
         domain = claim_domain()
         patch.setenv("ROS_DOMAIN_ID", str(domain))
-        rclpy.init(args=arguments, domain_id=domain)
+        rclpy.init(args=["--ros-args", *(word for value in given for word in ("-p", value))], domain_id=domain)
         node = GraspNode(on_failure=lambda: None)
         executor = SingleThreadedExecutor()
         executor.add_node(node)

@@ -17,8 +17,10 @@ from graspd_core.config.mapping import from_mapping, read_yaml
 from graspd_core.errors import ConfigError, shown
 from graspd_core.hands.model import HandModel, Mount
 from graspd_core.hands.readers.urdf import read_urdf
-from graspd_core.hands.readers.xml_io import read_xml
+from graspd_core.hands.readers.xml_io import parse_xml, read_xml
 from graspd_core.paths import config_dir
+
+ROBOT_DESCRIPTION = "robot_description"
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class ArmFile:
     """The keys of an arm description.
 
     Attributes:
-        urdf: path of the URDF, from the description's folder; it may hold more than the arm.
+        urdf: path of the URDF, from the description's folder, or `robot_description`: the robot that a caller brings
+            along. It may hold more than the arm.
         tip: the link that carries the hand.
         base: the link that the arm begins at; empty: the URDF's root.
         name: of the arm; empty: the file's.
@@ -57,13 +60,34 @@ def arm_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (config_dir() / "arms").glob("*.yaml")))
 
 
-def load_arm(name_or_path: str | Path) -> Arm:
+def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     """An arm by its name, or by the path of its description (.yaml).
+
+    Args:
+        name_or_path: of the arm.
+        robot_description: a robot's URDF, for descriptions whose `urdf` is `robot_description`.
 
     Raises:
         ConfigError: no such arm or file, or the description is wrong: names file, key and valid choices.
         HandError: the URDF cannot be used.
     """
+    path, entries = read_arm_file(name_or_path)
+    urdf = path.parent / entries.urdf
+    if not from_robot_description(entries):
+        return make_arm(entries, urdf, read_xml(urdf), str(path))
+    if not robot_description:
+        told = "is what the node hears at its start, where its parameter arm names this file; else name a file"
+        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} {told}")
+    return make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
+
+
+def from_robot_description(entries: ArmFile) -> bool:
+    """Whether the arm is part of a robot that the description does not name a file of."""
+    return entries.urdf == ROBOT_DESCRIPTION
+
+
+def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
+    """The path of an arm's description, and what it says. Raises ConfigError: see `load_arm`."""
     text = str(name_or_path)
     if not text.endswith((".yaml", ".yml")):
         if text not in arm_names():
@@ -74,8 +98,7 @@ def load_arm(name_or_path: str | Path) -> Arm:
     for key in ("urdf", "tip"):
         if not getattr(entries, key):
             raise ConfigError(f"{path}: {key} is missing; keys: {', '.join(ArmFile.__dataclass_fields__)}")
-    urdf = path.parent / entries.urdf
-    return make_arm(entries, urdf, read_xml(urdf), str(path))
+    return path, entries
 
 
 def make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:

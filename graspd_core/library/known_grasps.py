@@ -82,7 +82,8 @@ def known_grasps(
             break
     told = restrictions_in_words(bound, refused, len(good), len(admitted)) if refused else ""
     result = library_result(library, good, count, time.perf_counter() - began)
-    return replace(result, message="; ".join(filter(None, (result.message, told))), refused=refused)
+    message = "; ".join(filter(None, (result.message, told)))
+    return replace(result, message=message, refused=refused, warnings=scene.object.warnings)
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:

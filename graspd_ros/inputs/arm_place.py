@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
 from graspd_core import Arm, Reach, load_arm
+from graspd_core.arms.arm_file import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
+from graspd_core.errors import ConfigError
 from graspd_ros.inputs.frames import pose_of_matrix
 from graspd_ros.inputs.requests import Request
 
+ROBOT_PATIENCE = 10.0  # seconds that the start waits for the robot
 
-def reach_of(request: Request, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]) -> tuple[Reach, ...]:
+
+def reach_of(
+    request: Request, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]], robot_description: str = ""
+) -> tuple[Reach, ...]:
     """The restriction, in the frame of the request's object; none where the node has no arm.
 
     Args:
         request: its settings name the arm and the frame of its base.
         lookup: `T_target_source` of two frames when the object was seen; may raise a TransformError.
+        robot_description: the URDF of a robot, which the arm may be part of.
     """
     settings = request.settings
     if not settings.arm:
         return ()
-    arm = _arm(settings.arm)
+    arm = _arm(settings.arm, robot_description)
     base = settings.arm_base_frame or arm.chain.base_link
     T = np.eye(4) if base == request.frame else lookup(request.frame, base)
     if request.T_frame_object is not None:
@@ -35,5 +47,37 @@ def reach_of(request: Request, lookup: Callable[[str, str], Float[np.ndarray, "4
 
 # What is known of an arm takes a tenth of a second to make, and is kept with it.
 @lru_cache(maxsize=2)
-def _arm(name: str) -> Arm:
-    return load_arm(name)
+def _arm(name: str, robot_description: str) -> Arm:
+    return load_arm(name, robot_description)
+
+
+def heard_robot(node: Node, arm: str) -> str:
+    """The URDF on the topic robot_description, where an arm is part of that robot; else nothing is waited for.
+
+    To be called at the start, before the node is spun.
+
+    Raises:
+        GraspdError: nothing came within `ROBOT_PATIENCE` seconds, or the arm is not in it.
+    """
+    if not arm or not from_robot_description(read_arm_file(arm)[1]):
+        return ""
+    heard: list[String] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    topic = node.create_subscription(String, ROBOT_DESCRIPTION, heard.append, latched)
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end = time.monotonic() + ROBOT_PATIENCE
+    while not heard and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.1)  # in short turns, between which signals are handled
+    name = topic.topic_name
+    executor.remove_node(node)
+    executor.shutdown()
+    node.destroy_subscription(topic)
+    if not heard:
+        raise ConfigError(
+            f"parameter arm: {arm} is part of the robot on {name}, where nothing came within {ROBOT_PATIENCE:g} s; "
+            "start robot_state_publisher first, or name a file in urdf"
+        )
+    robot = str(heard[-1].data)
+    _arm(arm, robot)
+    return robot

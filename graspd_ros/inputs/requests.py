@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -19,6 +19,9 @@ from graspd_core.types import Plane
 from graspd_ros.inputs.frames import matrix_of_pose
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
+
+if TYPE_CHECKING:
+    from graspd_ros.inputs.collision_objects import Thing
 
 MOST_ID = 128
 MOST_EXCLUDED = 256
@@ -72,6 +75,7 @@ class Request:
         surface: what the object stands on, in its own frame; None: nothing.
         steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
             GraspdError. None where nothing is asked.
+        things: what stood in the planning scene by then, by id, wherever it is; empty where no such topic is heard.
         accepted: when the request came, by the monotonic clock [s].
     """
 
@@ -91,6 +95,7 @@ class Request:
     known: KnownObject | None = None
     surface: Plane | None = None
     steering: Callable[[], Steering] | None = None
+    things: Mapping[str, Thing] = field(default_factory=dict)
     accepted: float = field(default_factory=time.monotonic)
 
     @property

@@ -7,6 +7,7 @@ rank. Markers stay until the next result deletes them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -17,11 +18,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from graspd_core import HandModel
 from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.model import Primitive
 from graspd_core.types import Contact, Grasp, Posture, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
 from graspd_ros.outputs.status_json import pose_of
 
 IDS_OF_A_GRASP = 1000
+GEOMETRIES = ("visual", "collision")
 # What can be shown. Of the best grasps: the hand at the grasp, before it and where its squeeze aims at (faint), its
 # contacts, the axes of its base link, its figures. Of those that failed a trial: where they are, and why they failed.
 PARTS = ("hand", "pregrasp", "squeeze", "contacts", "axes", "text", "rejected")
@@ -49,12 +52,16 @@ def result_markers(
     *,
     shown: int = 1,
     parts: Sequence[str] = USUAL_PARTS,
+    solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Parts of the best `shown` grasps; the first marker deletes what was shown before: none leave an empty scene."""
+    """Parts of the best `shown` grasps; the first marker deletes what was shown before: none leave an empty scene.
+
+    `solids` are what the hand is drawn with; None: its collision solids.
+    """
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     for rank, grasp in enumerate(grasps):
-        made = _parts_of(grasp, rank, hand) if rank < shown else {}
+        made = _parts_of(grasp, rank, hand, hand.primitives if solids is None else solids) if rank < shown else {}
         if grasp.verdict is Verdict.FAILED:
             made["rejected"] = lambda grasp=grasp, rank=rank: _rejected(grasp, rank)
         for namespace in parts:
@@ -65,12 +72,14 @@ def result_markers(
     return MarkerArray(markers=markers)
 
 
-def _parts_of(grasp: Grasp, rank: int, hand: HandModel) -> dict[str, Callable[[], Iterable[Marker]]]:
+def _parts_of(
+    grasp: Grasp, rank: int, hand: HandModel, solids: Sequence[Primitive]
+) -> dict[str, Callable[[], Iterable[Marker]]]:
     T_frame_base, colour = matrix_of_pose(pose_of(grasp.grasp)), COLOURS[grasp.verdict]
     return {
-        "hand": lambda: _hand(hand, grasp.grasp, colour),
-        "pregrasp": lambda: _faint(_hand(hand, grasp.pregrasp, colour)),
-        "squeeze": lambda: _faint(_hand(hand, grasp.squeeze, colour)),
+        "hand": lambda: _hand(hand, solids, grasp.grasp, colour),
+        "pregrasp": lambda: _faint(_hand(hand, solids, grasp.pregrasp, colour)),
+        "squeeze": lambda: _faint(_hand(hand, solids, grasp.squeeze, colour)),
         "contacts": lambda: map(_contact, grasp.contacts),
         "axes": lambda: _axes(T_frame_base),
         "text": lambda: [_text(grasp, rank, T_frame_base)],
@@ -92,19 +101,20 @@ def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
     yield text
 
 
-def _hand(hand: HandModel, posture: Posture, colour: tuple[float, float, float]) -> Iterator[Marker]:
-    """The collision solids; a capsule is a cylinder and two balls."""
+def _hand(
+    hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
+) -> Iterator[Marker]:
+    """The solids; a capsule is a cylinder and two balls."""
     T_frame_base = matrix_of_pose(pose_of(posture))
     rotations, translations = link_poses(hand, posture.joint_positions)
-    for solid in hand.primitives:
+    for solid in solids:
         T_base_link = _matrix(rotations[solid.link], translations[solid.link])
         T = T_frame_base @ T_base_link @ _matrix(solid.rotation, solid.translation)
         pose, size = pose_of_matrix(T), solid.size
         if solid.kind == "hull":
-            corners = [_point(corner) for corner in solid.vertices[solid.faces.reshape(-1)]]
-            yield Marker(
-                type=Marker.TRIANGLE_LIST, pose=pose, scale=_vector(1, 1, 1), color=_colour(colour), points=corners
-            )
+            marker = Marker(type=Marker.TRIANGLE_LIST, pose=pose, scale=_vector(1, 1, 1), color=_colour(colour))
+            marker.points = _corners(solid)
+            yield marker
         elif solid.kind == "box":
             yield _solid(Marker.CUBE, pose, 2 * np.array(size), colour)
         elif solid.kind == "sphere":
@@ -115,6 +125,13 @@ def _hand(hand: HandModel, posture: Posture, colour: tuple[float, float, float])
                 for end in (-size[1], size[1]):
                     ball = pose_of_matrix(T @ _matrix(np.eye(3), np.array([0.0, 0.0, end])))
                     yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
+
+
+# Thousands of points take tens of milliseconds to make; nobody changes them.
+@lru_cache(maxsize=256)
+def _corners(mesh: Primitive) -> list[Point]:
+    """The corners of its triangles, in its own frame."""
+    return [_point(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
 
 
 def _contact(contact: Contact) -> Marker:

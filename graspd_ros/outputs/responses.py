@@ -9,6 +9,7 @@ import dataclasses
 import math
 import time
 import traceback
+from collections.abc import Sequence
 
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspArray, GraspProgress
@@ -17,6 +18,7 @@ from std_msgs.msg import Header
 
 from graspd_core import HandModel
 from graspd_core.errors import GraspdError
+from graspd_core.hands.model import Primitive
 from graspd_core.types import Progress, ProgressHook, Stage
 from graspd_ros.counters import Counters
 from graspd_ros.inputs.requests import MOST_ID, Listener, Request
@@ -26,6 +28,7 @@ from graspd_ros.outputs.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs.markers import result_markers
 from graspd_ros.outputs.publishers import Publishers
 from graspd_ros.outputs.trajectory import Pace
+from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, limited
 from graspd_ros.worker import Admission, Refusal, Report, WorkerEnding
 
@@ -51,6 +54,7 @@ class Responses:
         self.counters = Counters()
         self._node = node
         self._hand = hand
+        self._visuals: Sequence[Primitive] | None = None
         self._superseded = 0
         self._superseded_told = self._complained = -float("inf")
 
@@ -91,6 +95,12 @@ class Responses:
         if time.monotonic() - self._complained >= COUNT_PERIOD:
             self._complained = time.monotonic()
             self.not_made(request_id, "cloud", error)
+
+    def thing_not_taken(self, error: Exception) -> None:
+        """A message about a thing of the planning scene that is no use; things stay as they were."""
+        code, message = code_of(error), sentence_of(error)
+        self.publishers.tell("refused", "", "collision_objects", code=code, message=message)
+        self._log().warning(f"refused: {message}")
 
     def _accepted(self, request: Request, ahead: int) -> None:
         self.counters.count("accepted")
@@ -182,7 +192,7 @@ class Responses:
             shown.append(next(iter(answer.grasps)).trajectory)
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
-            look = {"shown": settings.marker_grasps, "parts": settings.marker_parts}
+            look = {"shown": settings.marker_grasps, "parts": settings.marker_parts, "solids": self.drawn(settings)}
             shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp, **look))
         for message in shown:
             self.publishers.publish(message)
@@ -190,6 +200,20 @@ class Responses:
         self._log().info(f"{request.id}: {event['verified']} of {event['grasps']} verified: {event['message']}")
         self.counters.planned(result, request.elapsed())
         self._publish(answer, request.listener)
+
+    def drawn(self, settings: Settings) -> Sequence[Primitive]:
+        """The solids that markers draw the hand with; read on first use, for seconds where its meshes are large."""
+        if settings.marker_geometry != "visual":
+            return self._hand.primitives
+        if self._visuals is None:
+            from graspd_core.hands.readers.visual_solids import visual_solids
+
+            try:
+                self._visuals = visual_solids(self._hand, settings.hand_prefix)
+            except GraspdError as error:
+                self._visuals = self._hand.primitives
+                self._log().warning(f"~/markers draws the hand's collision solids: {error}")
+        return self._visuals
 
     def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
         header = Header(frame_id=request.frame_out, stamp=request.stamp)

@@ -142,3 +142,16 @@ def test_a_hand_that_nobody_mounts_is_refused(tmp_path: Path):
     arm = load_arm(write(tmp_path, mounts={"other": {}}))
     with pytest.raises(ConfigError, match=r"arm cell: nobody says how hand barrett_like is mounted; .*: other; or"):
         tip_hand(arm, hand)
+
+
+def test_an_arm_is_taken_out_of_a_robot_that_the_caller_brings(tmp_path):
+    path = write(tmp_path, urdf="robot_description")
+    arm, plain = load_arm(path, ROBOT), load_arm(write(tmp_path))
+    assert (arm.joint_names, arm.chain.link_names) == (plain.joint_names, plain.chain.link_names)
+    path = write(tmp_path, urdf="robot_description")
+    with pytest.raises(ConfigError, match=r"cell.yaml.urdf: robot_description is what the node hears at its start"):
+        load_arm(path)
+    with pytest.raises(GraspdError, match=r"robot_description: not well-formed XML"):
+        load_arm(path, "<robot>")
+    with pytest.raises(ConfigError, match=r"cell.yaml.tip: no link 'flange' in the URDF; links: base"):
+        load_arm(path, '<robot name="r"><link name="base"/></robot>')

@@ -36,7 +36,7 @@ from graspd_ros.parameters import Settings
 
 PATIENCE = 200.0  # seconds until what is waited for is held to never come; a test's own limit is 300
 
-READ_ONLY = {"hand", "hand_prefix", "device", "torch_threads", "queue_size"}
+READ_ONLY = {"hand", "hand_prefix", "device", "torch_threads", "queue_size", "collision_objects"}
 DEFAULTS = {n: v for n, v in dataclasses.asdict(Settings()).items() if n not in READ_ONLY} | {"output_dir": "out"}
 TERMINAL = {"result", "error", "cancelled", "superseded"}
 

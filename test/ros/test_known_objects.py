@@ -6,6 +6,8 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +15,18 @@ import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Vector3
 from graspd_msgs.msg import GraspArray, GraspRequest
+from scipy.spatial.transform import Rotation
 from shape_msgs.msg import Plane
 from std_msgs.msg import Header
 
-from graspd_core import HandModel, Outcome, TriangleMesh, load_hand, load_scene, make_shape
+from graspd_core import GraspResult, HandModel, Outcome, TriangleMesh, hand_mesh, load_hand, load_scene, make_shape
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.library.known_grasps import known_or_planned
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_ros import known_objects
 from graspd_ros.inputs import source_registry
+from graspd_ros.inputs.collision_objects import Thing
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.outputs.error_codes import ErrorCode, code_of
 from graspd_ros.parameters import Settings
@@ -57,7 +61,8 @@ def folder(built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 class Node:
     """What the node does with a message, without ROS around it."""
 
-    def __init__(self, hand: HandModel, **settings: object) -> None:
+    def __init__(self, hand: HandModel, things: Mapping[str, Thing] | None = None, **settings: object) -> None:
+        self._things = things or {}
         usual = {"preset": "fast", "num_grasps": 2, "grasp_library": "known.grasps", "mesh_roots": ["."]}
         self.settings = Settings(**{**usual, **settings})
         self._builder = RequestBuilder(hand.name, lambda: Time(sec=1), lambda *_: np.eye(4))
@@ -70,7 +75,7 @@ class Node:
     def answer(self, **fields: object) -> Planned:
         fields.setdefault("id", "r")
         request = self._builder.from_message(str(fields["id"]), self.settings, GraspRequest(**fields))
-        return self._planner.plan(request, lambda: False, lambda _: None)
+        return self._planner.plan(replace(request, things=self._things), lambda: False, lambda _: None)
 
     def answer_path(self, path: str) -> Planned:
         request = self._builder.from_mesh("r", self.settings, path)
@@ -213,3 +218,25 @@ def test_a_node_answers_another_process_from_its_library(client, start_node, fol
     assert (refused.status, refused.error_code) == (GraspArray.FAILED, "BAD_REQUEST")
     assert "it has ball" in refused.message
     assert process.alive()
+
+
+def test_what_stands_about_a_known_object_is_kept_clear_of(folder: Path, hand: HandModel):
+    """A wall beside the ball, and the ball as a planning scene has it."""
+    box, ball = make_shape("box"), make_shape("sphere").vertices
+    cube, low, high = (box.vertices - box.vertices.min(0)) / np.ptp(box.vertices, axis=0), ball.min(0), ball.max(0)
+    wall = TriangleMesh(np.array([high[0] + 0.01, -0.5, -0.5]) + cube, box.faces)
+    same = TriangleMesh(low + cube * (high - low), box.faces)
+    things = {name: Thing("object", np.eye(4), (shape,)) for name, shape in (("wall", wall), ("ball", same))}
+    free, walled = Node(hand).answer(**known()).result, Node(hand, things=things).answer(**known()).result
+
+    def farthest(result: GraspResult) -> float:
+        postures = [grasp.grasp for grasp in result.grasps if grasp.usable]
+        turns = [Rotation.from_quat(np.roll(p.quaternion_wxyz, -1)) for p in postures]
+        hands = [hand_mesh(hand, p.joint_positions).vertices for p in postures]
+        return max(
+            float(t.apply(v)[:, 0].max() + p.position[0]) for t, v, p in zip(turns, hands, postures, strict=True)
+        )
+
+    assert farthest(free) > high[0] + 0.02
+    assert not any(grasp.usable for grasp in walled.grasps) or farthest(walled) < high[0] + 0.012
+    assert ["'ball' fills the object's own place" in warning for warning in walled.warnings] == [True]

@@ -91,6 +91,16 @@ def mesh_hull(
     return hull
 
 
+def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"]) -> TriangleMesh:
+    """A mesh file as it is, scaled along each axis [m]. Raises HandError: the file is not there or not a mesh."""
+    try:
+        mesh = load_mesh(resolve_mesh(urdf, shape, filename))
+    except (MeshError, OSError) as error:
+        raise wrong(urdf, shape, f"mesh {filename!r} cannot be read as a visual mesh: {error}") from error
+    # Mirrored, faces would be seen from inside.
+    return TriangleMesh(mesh.vertices * scale, mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces)
+
+
 @lru_cache(maxsize=2048)
 def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners: int) -> TriangleMesh:
     del modified

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from graspd_core.hands.model import Primitive, PrimitiveKind
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, mesh_hull
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, mesh_hull, whole_mesh
 from graspd_core.hands.readers.xml_io import read_numbers, read_origin, wrong
+from graspd_core.types import TriangleMesh
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
@@ -26,7 +29,13 @@ def read_primitives(path: Path, link: ET.Element, corners: int) -> tuple[list[Pr
     """
     elements = colliding(link)
     shown = bool(elements) and elements[0].tag == "visual"
-    return [_read_primitive(path, element, corners) for element in elements], shown
+    hull = partial(mesh_hull, corners=corners)
+    return [_read_primitive(path, element, hull) for element in elements], shown
+
+
+def read_visuals(path: Path, link: ET.Element) -> list[Primitive]:
+    """What one `<link>` shows, link number zero: as `read_primitives`, but meshes are whole and need not be convex."""
+    return [_read_primitive(path, element, whole_mesh) for element in link.findall("visual")]
 
 
 def colliding(link: ET.Element) -> list[ET.Element]:
@@ -34,7 +43,7 @@ def colliding(link: ET.Element) -> list[ET.Element]:
     return link.findall("collision") or link.findall("visual")
 
 
-def _read_primitive(path: Path, element: ET.Element, corners: int) -> Primitive:
+def _read_primitive(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:
     rotation, translation = read_origin(path, element)
     geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
@@ -50,8 +59,8 @@ def _read_primitive(path: Path, element: ET.Element, corners: int) -> Primitive:
         radius, length = (float(_positive(path, shape, key, 1)[0]) for key in ("radius", "length"))
         return Primitive(0, _ROUND[shape.tag], rotation, translation, (radius, 0.5 * length))
     if shape.tag == "mesh":
-        hull = mesh_hull(path, shape, shape.get("filename") or "", _scale(path, shape), corners)
-        return Primitive(0, "hull", rotation, translation, (), hull.vertices, hull.faces)
+        mesh = read_mesh(path, shape, shape.get("filename") or "", _scale(path, shape))
+        return Primitive(0, "hull", rotation, translation, (), mesh.vertices, mesh.faces)
     raise wrong(path, shape, f"unknown {element.tag} shape <{shape.tag}>; known: {', '.join(_SHAPES)}")
 
 

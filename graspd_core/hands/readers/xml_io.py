@@ -53,6 +53,11 @@ def read_xml(path: Path) -> Element:
         text = _decoded(data)
     except (OSError, ValueError) as error:
         raise HandError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    return parse_xml(path, text)
+
+
+def parse_xml(path: Path, text: str) -> Element:
+    """The root element of XML that stands for a file. Raises HandError: see `read_xml`."""
     text = _blanked(text, "<!--", "-->")
     for space in " \t\r\n":
         text = _blanked(text, f"<?xml{space}", "?>")

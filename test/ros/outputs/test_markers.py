@@ -16,6 +16,7 @@ from visualization_msgs.msg import Marker
 
 from graspd_core.hands.hand_mesh import hand_mesh
 from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.inputs.frames import matrix_of_pose
@@ -152,6 +153,15 @@ def test_every_marker_stays_has_a_frame_and_an_id_of_its_own():
     for marker in found[1:]:
         assert matrix_of_pose(marker.pose)[3, 3] == 1
         assert marker.type == Marker.TEXT_VIEW_FACING or min(marker.scale.x, marker.scale.y, marker.scale.z) > 0
+
+
+def test_the_hand_is_drawn_at_each_stage_with_the_solids_that_are_given():
+    whole = hand_mesh(HAND, HAND.open_posture)
+    drawn = [Primitive(0, "hull", np.eye(3), np.zeros(3), (), whole.vertices, whole.faces)]
+    found = list(result_markers((grasp(),), HAND, "camera", Time(), parts=PARTS, solids=drawn).markers)
+    for part in ("hand", "pregrasp", "squeeze"):
+        (marker,) = of(found, part)
+        assert (marker.type, len(marker.points)) == (Marker.TRIANGLE_LIST, 3 * len(whole.faces))
 
 
 def test_every_part_can_be_asked_for_and_left_out():

@@ -127,3 +127,11 @@ def test_a_request_that_was_never_worked_on_leaves_the_markers_as_they_are(node)
     messages, events = published(node, overdue())
     assert [(type(message), message.error_code) for message in messages] == [(GraspArray, "DEADLINE")]
     assert events == ["result"]
+
+
+def test_markers_draw_what_is_asked_for_and_a_hand_without_its_files_as_it_collides(node, tmp_path):
+    responses, visual = Responses(node, HAND), Settings()
+    assert responses.drawn(replace(visual, marker_geometry="collision")) is HAND.primitives
+    assert responses.drawn(visual) is not HAND.primitives
+    gone = Responses(node, replace(HAND, urdf=str(tmp_path / "gone.urdf")))
+    assert gone.drawn(visual) is gone._hand.primitives
