@@ -77,7 +77,8 @@ def read_dataset(where: Path, dataset: Path) -> None:
     keys = ["object_source", "scale", "friction", "hand_name", "preset"]
     postures = ["grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions"]
     frame = pd.read_parquet(dataset / "grasps", columns=[*keys, *postures, "joint_names", "verdict"])
-    for number, ((source, scale, friction, hand_name, preset), rows) in enumerate(frame.groupby(keys)):
+    for number, (_, rows) in enumerate(frame.groupby(keys)):
+        source, scale, friction, hand_name, preset = rows[keys].iloc[0]
         config = load_preset(preset)
         hand = load_hand(hand_name, candidates=config.problem.fine_candidates)
         scene = load_scene(source, scale=scale, friction=friction, resolution=config.resolution)
@@ -197,8 +198,9 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     if given.what == "try":
-        for variant, source, hand in product(range(given.variants), given.objects, given.hands):
-            try_block(given.out, source, hand, variant)
+        for variant in range(given.variants):
+            for source, hand in product(given.objects, given.hands):
+                try_block(given.out, source, hand, variant)
         return None
     if given.what == "read":
         return read_dataset(given.out, given.dataset)

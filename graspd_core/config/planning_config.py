@@ -22,7 +22,7 @@ class ProblemConfig:
 
     candidates: int = 256
     fine_candidates: int = 600
-    patch_size: int = 0
+    patch_size: int = 4
     features: int = 128
     directions: int = 24
     friction: float = 0.4

@@ -13,7 +13,7 @@ class LossWeights:
 
     Attributes:
         wrench_resistance: resistance against the worst disturbances.
-        distance: attraction of the fingers to the surface.
+        distance: attraction of the hand to the surface.
         penetration: depth below the padded surface.
         self_collision: overlap of the hand with itself.
         posture: joints away from the middle of their range.
@@ -68,7 +68,7 @@ class ClosedFormConfig:
     rotation_rate: float = 0.03
     joint_rate: float = 0.03
     obstacle_factor: float = 2.0
-    weights: LossWeights = field(default_factory=LossWeights)
+    weights: LossWeights = field(default_factory=lambda: LossWeights(distance=4.0))
     polish_weights: LossWeights = field(
         default_factory=lambda: LossWeights(
             wrench_resistance=6.0, distance=300.0, penetration=10.0, self_collision=100.0, obstacle=10.0
