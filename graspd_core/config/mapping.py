@@ -18,23 +18,29 @@ T = TypeVar("T")
 _LARGEST_INTEGER = 2**63 - 1
 
 
-def from_mapping(cls: type[T], values: Any, where: str = "config") -> T:
-    """Build a config dataclass from nested mappings.
+def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | None = None) -> T:
+    """Build a config dataclass from nested mappings; what they leave out is as in `start`, or as the class has it.
 
     Raises:
         ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
     """
-    return cls(**coerced(typing.get_type_hints(cls), values, where))
+    fields = dataclasses.fields(typing.cast(Any, cls))
+    factories = {f.name: f.default_factory for f in fields if f.default_factory is not dataclasses.MISSING}
+    starts = {name: getattr(start, name) if start else make() for name, make in factories.items()}
+    given = coerced(typing.get_type_hints(cls), values, where, starts)
+    return cls(**given) if start is None else dataclasses.replace(typing.cast(Any, start), **given)
 
 
-def coerced(hints: Mapping[str, Any], values: Any, where: str) -> dict[str, Any]:
+def coerced(
+    hints: Mapping[str, Any], values: Any, where: str, starts: Mapping[str, Any] = types.MappingProxyType({})
+) -> dict[str, Any]:
     """The values of a mapping, each as the type that `hints` names for its key. Raises ConfigError: see above."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
     unknown = sorted(map(shown, set(values) - set(hints)))
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]}; valid keys: {', '.join(sorted(hints))}")
-    return {key: _coerce(hints[key], value, f"{where}.{key}") for key, value in values.items()}
+    return {key: _coerce(hints[key], value, f"{where}.{key}", starts.get(key)) for key, value in values.items()}
 
 
 def read_yaml(path: Path) -> Any:
@@ -50,9 +56,9 @@ def read_yaml(path: Path) -> Any:
     return {} if values is None else values
 
 
-def _coerce(hint: Any, value: Any, where: str, *, signed: bool = False) -> Any:
+def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: bool = False) -> Any:
     if dataclasses.is_dataclass(hint):
-        return from_mapping(typing.cast(type, hint), value, where)
+        return from_mapping(typing.cast(type, hint), value, where, start)
     origin = typing.get_origin(hint)
     if origin is Literal:
         if value not in typing.get_args(hint):

@@ -40,6 +40,15 @@ def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
     assert config.grasp_stages == PlanConfig().grasp_stages
 
 
+def test_weights_that_a_preset_leaves_out_are_those_of_the_method(tmp_path: Path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("closed_form: {polish_weights: {penetration: 25}}\n")
+    before, after = load_preset("balanced").settings, load_preset(str(path)).settings
+    assert after == dataclasses.replace(
+        before, polish_weights=dataclasses.replace(before.polish_weights, penetration=25.0)
+    )
+
+
 def test_a_mapping_of_a_config_makes_that_config_again():
     config = dataclasses.replace(PlanConfig(), resolution=24)
     assert plan_config(to_mapping(config)) == config
