@@ -213,7 +213,8 @@ def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "po
     for group in np.unique(of_link[:candidates]):
         members = np.flatnonzero(of_link == group)
         coarse = members[members < candidates]
-        gaps = np.linalg.norm(points[members][:, None] - points[coarse], axis=-1)
+        # Rounded, so that which of two equal ones is nearer does not depend on where the base frame is.
+        gaps = np.linalg.norm(points[members][:, None] - points[coarse], axis=-1).round(6)
         centres = [0]
         while len(centres) < round(len(coarse) / size):
             centres.append(int(gaps[np.searchsorted(members, coarse)][:, centres].min(1).argmax()))
