@@ -86,7 +86,7 @@ HOLDING = tuple(
         "robust.hold_time": 0.1,
         "closed_form.explore_steps": 30,
         "closed_form.refine_steps": 30,
-        "closed_form.polish_steps": 20,
+        "closed_form.polish_steps": 60,
         "problem.candidates": 60,
         "problem.features": 24,
         "grasp_stages.touch_reach": 0.002,
