@@ -14,6 +14,8 @@ class ProblemConfig:
         fine_candidates: contact candidates looked at while polishing.
         patch_size: how many of them make a patch that is drawn to the surface by itself, so that all of the hand comes
             to touch; zero: of each rigid group of links the nearest candidate is drawn.
+        softness: how deep the hand gives, as flesh does [m]: the object is planned with as so much thinner, without its
+            sharp points. Trials know nothing of it.
         features: sharp points of the object looked at while polishing.
         directions: disturbance wrenches.
         friction: coefficient planned with; below the object's own, so that contacts keep a margin.
@@ -23,6 +25,7 @@ class ProblemConfig:
     candidates: int = 256
     fine_candidates: int = 600
     patch_size: int = 4
+    softness: float = 0.0
     features: int = 128
     directions: int = 24
     friction: float = 0.4

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -178,8 +178,12 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     floor, confidence = settings.confidence_floor, None
     if scene.confidence is not None:
         confidence = floor + (1 - floor) * scene.confidence.to(device, dtype)
+    sdf = scene.sdf.to(device, dtype)
+    if settings.softness:
+        sharp, thin = sharp[:0], False
+        sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
     return ObjectTensors(
-        sdf=scene.sdf.to(device, dtype),
+        sdf=sdf,
         # They were chosen one by one, each the farthest from all before: the first half is spread as well.
         features=torch.as_tensor(sharp if thin else sharp[: settings.features], device=device, dtype=dtype),
         coarse_features=settings.features if thin else 0,
