@@ -172,6 +172,13 @@ class HandModel:
         return tuple(tuple(p for p in self.primitives if p.link == i) for i in range(self.num_links))
 
     @cached_property
+    def fingertip_groups(self) -> Int[np.ndarray, "tips"]:
+        """Groups of rigidly joined links at the ends of the fingers: those that move no further group."""
+        groups, parents = self.link_group, self.link_parent
+        inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
+        return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
+
+    @cached_property
     def link_multiplier(self) -> Float[np.ndarray, "links"]:
         """Travel of each link's own joint for one radian or metre of `link_joint`: one where it is that joint."""
         multiplier = np.ones(self.num_links)

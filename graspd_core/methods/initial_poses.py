@@ -16,7 +16,6 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.aimed_starts import STANDOFF, StartPool, aimed, open_joints, uniform
 from graspd_core.methods.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.methods.poses import Poses
-from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.scene.scene import Scene
 from graspd_core.se3 import SE3, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
@@ -161,7 +160,7 @@ def half_widths(
 
 def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
     """Unit direction in the palm plane along which the fingertips travel most from open to closed, base frame."""
-    tips = [int(np.flatnonzero(hand.link_group == group)[-1]) for group in fingertip_groups(hand)]
+    tips = [int(np.flatnonzero(hand.link_group == group)[-1]) for group in hand.fingertip_groups]
     travel = (link_poses(hand, hand.closed_posture)[1] - link_poses(hand, hand.open_posture)[1])[tips]
     in_plane = travel - np.outer(travel @ hand.palm_normal, hand.palm_normal)
     return np.linalg.svd(in_plane)[2][0]

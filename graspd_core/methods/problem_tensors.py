@@ -134,7 +134,7 @@ def make_hand_tensors(
     kinematics, of_link = make_kinematics(hand, device, dtype), hand.link_group[hand.candidate_link]
     groups = _patches(hand, candidates, patch_size) if patch_size else of_link
     present, first = np.unique(groups[:candidates], return_index=True)
-    reach = np.where(np.isin(of_link[first], fingertip_groups(hand)), _REACH_OF_TIPS, _REACH_OF_OTHERS)
+    reach = np.where(np.isin(of_link[first], hand.fingertip_groups), _REACH_OF_TIPS, _REACH_OF_OTHERS)
 
     def point_set(count: int) -> PointSet:
         links = hand.candidate_link[:count]
@@ -197,13 +197,6 @@ def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
     """The middle of the palm, or the base frame's origin where that lies in the palm [m]."""
     far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
     return hand.palm_center if far else np.zeros(3)
-
-
-def fingertip_groups(hand: HandModel) -> Int[np.ndarray, "tips"]:
-    """Groups of rigidly joined links at the ends of the fingers: those that move no further group."""
-    groups, parents = hand.link_group, hand.link_parent
-    inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
-    return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:

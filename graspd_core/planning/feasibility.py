@@ -16,7 +16,6 @@ from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.unique_rows import packed_rows
-from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.scene.scene import Scene
 
 # The roughest surface that a trial believes in; see `trials.world.at_friction`.
@@ -52,7 +51,7 @@ def reach_of(hand: HandModel) -> tuple[float, float]:
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
     groups = hand.link_group[hand.candidate_link]
-    tips = [points[torch.as_tensor(groups == group)] for group in fingertip_groups(hand)]
+    tips = [points[torch.as_tensor(groups == group)] for group in hand.fingertip_groups]
     gaps = [float(torch.cdist(a, b).min()) for k, a in enumerate(tips) for b in tips[:k] if len(a) and len(b)]
     return float(torch.cdist(points, points).max()), max(gaps, default=0.0)
 

@@ -43,6 +43,8 @@ FIRM = StopRule(first=25, window=10, safety=16.0, speed=0.005, spin=math.radians
 SLIPPERY = StopRule(first=25, window=10, safety=16.0, speed=0.002, spin=math.radians(2.0))
 # Objects begin to slip as late as 1.9 s.
 CREEPING = StopRule(first=100, window=50, safety=16.0, speed=0.002, spin=math.radians(2.0))
+# Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
+_FEWEST_FINGERS = 3
 # The least impedance ratio and sliding friction of each, CREEPING below them all; measured at 0.6 and 0.3.
 _RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
@@ -64,10 +66,12 @@ class ObjectState:
     spin: float
 
 
-def stop_rule(protocol: Protocol) -> StopRule | None:
-    """The rule of a protocol, by its friction; None where trials run to their end."""
+def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
+    """The rule of a protocol, by its friction, and of a hand; None where trials run to their end."""
     if protocol.full_length:
         return None
+    if fingers < _FEWEST_FINGERS:
+        return CREEPING
     fits = (r for r, ratio, friction in _RULES if protocol.impratio >= ratio and protocol.friction[0] >= friction)
     return next(fits, CREEPING)
 

@@ -87,7 +87,7 @@ def step_until_known(
     `worst` travel [m] and turn [rad] are brought up to date. Returns why the trial is over, empty if it is not.
     """
 
-    rule, done = stop_rule(protocol), 0
+    rule, done = stop_rule(protocol, world.fingers), 0
     looks = 1 + rule.window // LOOK_EVERY if rule else 0
     recent = deque[ObjectState](maxlen=looks)
     while done < steps:

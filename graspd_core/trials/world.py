@@ -119,6 +119,7 @@ class World:
         up: unit direction against gravity; None where there is none.
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
+        fingers: how many ends of fingers the hand has.
         spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
         watch: called with the `mujoco.MjData` after every step of a trial; None, as in planning, costs nothing.
     """
@@ -135,6 +136,7 @@ class World:
     up: Float[np.ndarray, "3"] | None = None
     coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     mimics: tuple[Mimic, ...] = ()
+    fingers: int = 3
     spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
     watch: Callable[[Any], None] | None = field(default=None, repr=False, compare=False)
 
@@ -235,6 +237,7 @@ def _world_of(
         up=up,
         coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
         mimics=hand.mimics,
+        fingers=len(hand.fingertip_groups),
     )
 
 

@@ -64,11 +64,12 @@ def steps(monkeypatch) -> list[int]:
 
 
 def test_rules_follow_from_friction():
-    assert stop_rule(PROTOCOLS["standard"]) is FIRM
-    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.3)) is SLIPPERY
-    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.1)) is CREEPING
-    assert stop_rule(PROTOCOLS["hard"]) is CREEPING
-    assert stop_rule(PROTOCOLS["full"]) is stop_rule(PROTOCOLS["hard_full"]) is None
+    assert stop_rule(PROTOCOLS["standard"], 4) is FIRM
+    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.3), 4) is SLIPPERY
+    assert stop_rule(at_friction(PROTOCOLS["standard"], 0.1), 4) is CREEPING
+    assert stop_rule(PROTOCOLS["hard"], 4) is CREEPING
+    assert stop_rule(PROTOCOLS["standard"], 2) is CREEPING
+    assert stop_rule(PROTOCOLS["full"], 4) is stop_rule(PROTOCOLS["hard_full"], 4) is None
     for rule in (FIRM, SLIPPERY, CREEPING):
         assert not any(number % LOOK_EVERY for number in (rule.first, rule.window, CHECK_EVERY))
         assert rule.first > rule.window
@@ -136,6 +137,8 @@ def test_verdicts_are_those_of_the_full_length_from_held_to_lost(protocol, gripp
 
 def test_a_firm_grasp_takes_a_fraction_of_the_steps(gripper, cube, closing, steps):
     world, grasp = build_world(gripper, cube, (cube.mesh,), STANDARD), closing(0.015, 0.025, (0.04, 0.04))
+    assert world.fingers == 2
+    world = replace(world, fingers=3)
     assert hold_trial(world, grasp, full(STANDARD)).passed
     long = sum(steps)
     assert long == 200 + 6 * 500

@@ -17,7 +17,6 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.methods.aimed_starts import Aim, Roll
 from graspd_core.methods.initial_poses import closing_axis, depth_of_starts
 from graspd_core.methods.obstacle_distance import RETREAT
-from graspd_core.methods.problem_tensors import fingertip_groups
 from graspd_core.methods.restrictions import BoundRestriction, BoundRestrictions, Refusal
 from graspd_core.planning.steering.avoided_boxes import boxes_in_reach, entered
 from graspd_core.planning.steering.regions import Box, NearPoints, Numbers, Region, Sphere, numbers
@@ -228,7 +227,7 @@ def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
     rotations, translations = link_poses(hand, hand.open_posture)
     links = hand.candidate_link
     points = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
-    tips = [points[hand.link_group[links] == group].mean(0) for group in fingertip_groups(hand)]
+    tips = [points[hand.link_group[links] == group].mean(0) for group in hand.fingertip_groups]
     ahead = np.mean(tips, axis=0) - hand.palm_center
     side = ahead - (ahead @ hand.approach) * hand.approach
     if np.linalg.norm(side) < _ALONG * np.linalg.norm(ahead):
