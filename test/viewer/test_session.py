@@ -8,8 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from graspd_core.errors import FormatError, HandError, MeshError
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import HYPOTHESES, Snapshot, TrialResult, Verdict
 from graspd_core.viewer.drawing import sdf_slice, slice_axes
@@ -118,7 +120,12 @@ def test_squeeze_forces_press_inwards_and_balance(grasps_file):
     strength = np.linalg.norm(pressing.forces, axis=1).sum()
     assert strength > 1.0
     assert np.linalg.norm(pressing.forces.sum(0)) < 0.1 * strength
-    assert ((pressing.forces * pressing.positions).sum(1) < 0).all()  # the box is about the origin
+    assert session.scene is not None
+    _, outward = sample_sdf(session.scene.sdf, torch.as_tensor(pressing.positions, dtype=torch.float32))
+    # On an edge the finger's normal counts, not that of a face beside it: what presses there in passing may leave one.
+    strong = np.linalg.norm(pressing.forces, axis=1) > 0.05 * strength
+    assert strong.sum() >= 3
+    assert ((pressing.forces * outward.numpy()).sum(1)[strong] < 0).all()
     push = mechanics.weakest_push(grasp)
     assert push is not None
     assert np.linalg.norm(push) == pytest.approx(1.0)
