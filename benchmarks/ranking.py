@@ -32,7 +32,7 @@ from graspd_core.methods.plan_config import load_preset
 from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import build_problem
-from graspd_core.methods.stages.ranking import ranking_figures
+from graspd_core.methods.stages.ranking import FARTHEST, log_odds, ranking_figures
 from graspd_core.scene.scene import object_parts
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
@@ -61,7 +61,7 @@ def try_block(where: Path, source: str, hand_name: str, variant: int) -> None:
     scene = load_scene(source, scale=scale, friction=friction, resolution=config.resolution)
     found = METHODS[config.method].plan(PlannerInput(scene, hand, COUNT, variant, config, Hooks()))
     some = staged(found.problem, hand, found.poses, config)
-    grasps = finished(found.problem, hand, found.poses, config)
+    grasps = finished(found.problem, hand, some)
     held = {}
     for trial in ("standard", "hard"):
         protocol = at_friction(PROTOCOLS[trial], friction)
@@ -97,7 +97,7 @@ def fitted(figures: np.ndarray, held: np.ndarray, seed: int = 0) -> dict[str, np
     """Mean and deviation of the figures, and the layers of a network that is trained on how trials ended."""
     torch.manual_seed(seed)
     mean, deviation = figures.mean(0), figures.std(0) + 1e-6
-    x = torch.as_tensor(((figures - mean) / deviation).clip(-4, 4), dtype=torch.float32)
+    x = torch.as_tensor(((figures - mean) / deviation).clip(-FARTHEST, FARTHEST), dtype=torch.float32)
     y = torch.as_tensor(held, dtype=torch.float32)
     sizes = (x.shape[1], WIDTH, WIDTH, 1)
     layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
@@ -118,10 +118,8 @@ def fitted(figures: np.ndarray, held: np.ndarray, seed: int = 0) -> dict[str, np
 
 def odds(network: dict[str, np.ndarray], figures: np.ndarray) -> np.ndarray:
     """Log-odds by a network."""
-    x = torch.as_tensor(((figures - network["mean"]) / network["deviation"]).clip(-4, 4)).float()
-    for i in range(2):
-        x = nn.functional.silu(x @ torch.as_tensor(network[f"weight{i}"]) + torch.as_tensor(network[f"bias{i}"]))
-    return (x @ torch.as_tensor(network["weight2"]) + torch.as_tensor(network["bias2"]))[:, 0].numpy()
+    tensors = {name: torch.as_tensor(values).double() for name, values in network.items()}
+    return log_odds(tensors, torch.as_tensor(figures)).numpy()
 
 
 def linear(figures: np.ndarray) -> np.ndarray:

@@ -79,20 +79,17 @@ def assemble(
     grasps: list[Grasp] = []
     for first in range(0, len(poses.translation), _AT_ONCE):
         rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
-        some = finished(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
-        grasps += [grasp for grasp in some if grasp.score > _WORST]
+        some = staged(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+        grasps += [grasp for grasp in finished(problem, hand, some) if grasp.score > _WORST]
     return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
 
 
-def finished(
-    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
-) -> list[Grasp]:
-    """Three postures and a score for every pose, in their order, for so many as memory is there for."""
-    some = staged(problem, hand, poses, config, stop)
+def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
+    """The grasps of staged poses with their scores, in their order."""
     scores = score(problem, some)
     if problem.obstacles is not None:
-        ends = (some.opened.translation, some.opened.joints), (poses.translation, poses.joints)
-        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, poses.quaternion, *ends)
+        ends = (some.opened.translation, some.opened.joints), (some.poses.translation, some.poses.joints)
+        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, some.poses.quaternion, *ends)
         knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     return [_grasp(hand, i, some, float(scores[i])) for i in range(len(scores))]
@@ -101,7 +98,7 @@ def finished(
 def staged(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> Staged:
-    """Contacts, squeeze, pregrasp and what is known of them, for every pose."""
+    """Contacts, squeeze, pregrasp and what is known of them, for every pose, for so many as memory is there for."""
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)

@@ -11,7 +11,7 @@ import torch
 
 from graspd_core.formats.foreign.imported_grasp import ImportedGrasp
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.candidates import finished
+from graspd_core.methods.candidates import finished, staged
 from graspd_core.methods.finger_closing import make_closing
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.plan_config import PlanConfig
@@ -51,11 +51,11 @@ def complete_grasps(
     for first in range(0, len(kept), _AT_ONCE):
         some = kept[first : first + _AT_ONCE]
         poses = _poses(problem, [grasp.grasp for grasp in some])
-        own = finished(problem, hand, poses, config)
+        own = finished(problem, hand, staged(problem, hand, poses, config))
         if opened := [row for row, grasp in enumerate(some) if not grasp.closed]:
             closing = make_closing(problem, hand, RandomClosureConfig().close_steps)
             closed = minimise(closing, problem, poses[torch.tensor(opened)], Hooks()).poses
-            for row, grasp in zip(opened, finished(problem, hand, closed, config), strict=True):
+            for row, grasp in zip(opened, finished(problem, hand, staged(problem, hand, closed, config)), strict=True):
                 own[row] = grasp
         for theirs, ours in zip(some, own, strict=True):
             if theirs.squeeze is None and len(ours.contacts) < 2:

@@ -35,7 +35,8 @@ def test_the_file_fits_the_figures(some: tuple[Problem, Staged]):
     figures = ranking_figures(*some)
     assert torch.isfinite(figures).all()
     assert _fitted()["mean"].shape == _fitted()["deviation"].shape == figures.shape[1:]
-    assert (_fitted()["deviation"] > 0).all()
+    # A figure that never varied was not learned from, and would weigh by chance where it does.
+    assert (_fitted()["deviation"] > 1e-3).all()
 
 
 def test_hands_that_were_only_drawn_come_after_all_that_grasp(some: tuple[Problem, Staged]):

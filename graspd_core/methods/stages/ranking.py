@@ -6,6 +6,7 @@ says on what and how well.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib.resources import files
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from graspd_core.methods.stages.squeeze import Squeeze
 from graspd_core.se3 import rotation_from_quaternion
 
 # Figures farther from their mean than so many deviations say no more.
-_FARTHEST = 4.0
+FARTHEST = 4.0
 
 
 class Staged(NamedTuple):
@@ -50,12 +51,16 @@ def score(problem: Problem, staged: Staged) -> Float[Tensor, "batch"]:
 
     A finger deeper than 2 mm in the object and a hand deeper than 1 mm in itself cost; no trial goes into it.
     """
-    fitted = _fitted()
-    x = ((ranking_figures(problem, staged) - fitted["mean"]) / fitted["deviation"]).clamp(-_FARTHEST, _FARTHEST)
-    for layer in range(2):
-        x = torch.nn.functional.silu(x @ fitted[f"weight{layer}"] + fitted[f"bias{layer}"])
-    odds = (x @ fitted["weight2"] + fitted["bias2"])[:, 0].to(staged.clearance)
+    odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
     return odds - (_depth(staged) - 2.0).clamp_min(0.0) - 10.0 * (staged.overlap / 0.001 - 1.0).clamp_min(0.0)
+
+
+def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Float[Tensor, "batch"]:
+    """Log-odds of passing the hold trial, by a network as `benchmarks/ranking.py` fits it."""
+    x = ((figures - network["mean"]) / network["deviation"]).clamp(-FARTHEST, FARTHEST)
+    for layer in range(2):
+        x = torch.nn.functional.silu(x @ network[f"weight{layer}"] + network[f"bias{layer}"])
+    return (x @ network["weight2"] + network["bias2"])[:, 0]
 
 
 @torch.no_grad()
@@ -101,7 +106,6 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
         to_center.norm(dim=-1),
         (to_center * (rotation @ palm[1])).sum(-1),
         torch.full_like(shift, float(np.log(length))),
-        torch.full_like(shift, problem.friction),
     ]
     return torch.nan_to_num(torch.stack(columns, -1).double().cpu())
 
