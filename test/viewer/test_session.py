@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from graspd_core.errors import FormatError, HandError, MeshError
-from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.methods.poses import Poses
+from graspd_core.methods.stages.contact_set import find_contacts
 from graspd_core.runtime.latest_jobs import LatestJobs
 from graspd_core.types import HYPOTHESES, Snapshot, TrialResult, Verdict
 from graspd_core.viewer.drawing import sdf_slice, slice_axes
@@ -120,12 +121,15 @@ def test_squeeze_forces_press_inwards_and_balance(grasps_file):
     strength = np.linalg.norm(pressing.forces, axis=1).sum()
     assert strength > 1.0
     assert np.linalg.norm(pressing.forces.sum(0)) < 0.1 * strength
-    assert session.scene is not None
-    _, outward = sample_sdf(session.scene.sdf, torch.as_tensor(pressing.positions, dtype=torch.float32))
-    # On an edge the finger's normal counts, not that of a face beside it: what presses there in passing may leave one.
-    strong = np.linalg.norm(pressing.forces, axis=1) > 0.05 * strength
-    assert strong.sum() >= 3
-    assert ((pressing.forces * outward.numpy()).sum(1)[strong] < 0).all()
+    # On an edge the finger's own normal counts.
+    posture = vars(grasp.grasp).values()
+    poses = Poses(*(torch.as_tensor(value, dtype=torch.float32)[None] for value in posture))
+    touched = find_contacts(mechanics._problem, poses, session.config.grasp_stages.touch_reach)
+    gaps = torch.cdist(torch.as_tensor(pressing.positions, dtype=torch.float32), touched.position[0])
+    near = gaps.masked_fill(~touched.active[0], torch.inf) < 1e-6
+    assert near.any(1).all()
+    inward = [-(touched.normal[0][row].numpy() @ force) for row, force in zip(near, pressing.forces, strict=True)]
+    assert all(values.max() > 0 for values in inward)
     push = mechanics.weakest_push(grasp)
     assert push is not None
     assert np.linalg.norm(push) == pytest.approx(1.0)
