@@ -56,45 +56,28 @@ class Hypotheses:
     allowed: int
 
 
-def hypotheses_of(
-    run: Run, scene: Scene, hand: HandModel, trials: TrialContext, probability: float
-) -> Hypotheses | None:
-    """Those that a grasp must hold under to be as sure as asked for, cheapest first; None where none is needed.
+class OtherWorlds:
+    """The worlds of the hypotheses that change the object itself, made one after another by a thread.
 
-    The shapes are made by a thread of their own, one ahead of the trials, which wait for each that they need.
+    As many are begun at once as a grasp that holds in all of them must be tried in, one more for each that cannot be
+    made, and others when they are asked for.
     """
-    allowed = sum(held >= probability for held in HELD_AFTER) - 1
-    if scene.evidence is None or allowed + 1 == len(HELD_AFTER):
-        return None
-    from graspd_core.reconstruction.other_shapes import other_rules
 
-    slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
-    physics = {f"friction {slippery.friction[0]:.2g}": slippery}
-    builds: list[Callable[[], World | None]] = [partial(_own_world, scene, hand, slippery)]
-    for rule in other_rules(scene.evidence):
-        physics[f"hidden side by {rule}" if rule else "hidden side closed smoothly"] = trials.protocol
-        builds.append(partial(_other_world, scene, hand, trials.protocol, rule))
-    worlds = _Worlds(run, builds)
-    found = [Hypothesis(name, partial(_hold_in, worlds, k, physics[name])) for k, name in enumerate(physics)]
-    places = [
-        Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
-        for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
-    ]
-    return Hypotheses((*places, *found), allowed)
-
-
-class _Worlds:
-    """Worlds that a thread makes one after another, each when it or the one before it is first asked for."""
-
-    def __init__(self, run: Run, builds: Sequence[Callable[[], World | None]]) -> None:
-        self._run, self._builds, self._lock = run, builds, threading.Lock()
+    def __init__(self, run: Run, scene: Scene, hand: HandModel, protocol: Protocol, rules: Sequence[str], begun: int):
+        slippery = at_friction(protocol, _LESS_FRICTION * Protocol.friction[0])
+        self.physics = {f"friction {slippery.friction[0]:.2g}": slippery}
+        self._builds: list[Callable[[], World | None]] = [partial(_own_world, scene, hand, slippery)]
+        for rule in rules:
+            self.physics[f"hidden side by {rule}" if rule else "hidden side closed smoothly"] = protocol
+            self._builds.append(partial(_other_world, scene, hand, protocol, rule))
+        self._run, self._lock = run, threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
         self._made: list[Future[World | None]] = []
-        self._begin(2)
+        self._begin(begun)
 
     def world(self, index: int, stop: StopHook) -> World | None:
         """One of them; None where it cannot be made, or the hook says to stop."""
-        self._begin(index + 2)
+        self._begin(index + 1)
         while not wait([self._made[index]], timeout=_POLL).done:
             if stop():
                 return None
@@ -106,7 +89,40 @@ class _Worlds:
                 self._made.append(self._pool.submit(self._make, build))
 
     def _make(self, build: Callable[[], World | None]) -> World | None:
-        return None if self._run.known_over() else build()
+        if self._run.known_over():
+            return None
+        made = build()
+        if made is None:
+            self._begin(len(self._made) + 1)
+        return made
+
+
+def other_worlds(run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float) -> OtherWorlds | None:
+    """Those that grasps must be tried in to be as sure as asked for; None where none is needed."""
+    allowed = _allowed_failures(probability)
+    if scene.evidence is None or allowed + 1 == len(HELD_AFTER):
+        return None
+    from graspd_core.reconstruction.other_shapes import other_rules
+
+    rules = other_rules(scene.evidence)
+    return OtherWorlds(run, scene, hand, protocol, rules, 1 + len(rules) - allowed)
+
+
+def hypotheses_of(others: OtherWorlds, trials: TrialContext, probability: float) -> Hypotheses:
+    """All that a grasp is tried under, cheapest first."""
+    places = [
+        Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
+        for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
+    ]
+    found = [
+        Hypothesis(name, partial(_hold_in, others, k, protocol))
+        for k, (name, protocol) in enumerate(others.physics.items())
+    ]
+    return Hypotheses((*places, *found), _allowed_failures(probability))
+
+
+def _allowed_failures(probability: float) -> int:
+    return sum(held >= probability for held in HELD_AFTER) - 1
 
 
 def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tuple[TrialResult, float]:
@@ -136,7 +152,7 @@ def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tupl
     return TrialResult(HYPOTHESES, passed, worst[0], worst[1], reason), HELD_AFTER[worst_case]
 
 
-def _hold_in(worlds: _Worlds, index: int, protocol: Protocol, grasp: Grasp, stop: StopHook) -> TrialResult | None:
+def _hold_in(worlds: OtherWorlds, index: int, protocol: Protocol, grasp: Grasp, stop: StopHook) -> TrialResult | None:
     world = worlds.world(index, stop)
     return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
 

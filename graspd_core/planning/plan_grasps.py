@@ -24,7 +24,7 @@ from graspd_core.planning.planning_scene import planning_scene
 from graspd_core.planning.planning_worker import start_planning_worker
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.planning.run_clock import Run
-from graspd_core.planning.verification import parts_in_background, rank_by_robustness
+from graspd_core.planning.verification import rank_by_robustness, trials_ahead
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
@@ -70,13 +70,13 @@ def plan_grasps(
         ResourceError: the machine has too little memory for so many grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
-    request: dict[str, Any] = {"count": count, "seed": seed, "verify": verify, "device": device}
-    check_request(deadline=deadline, **request)
+    request: dict[str, Any] = {"count": count, "seed": seed, "device": device}
+    check_request(verify=verify, deadline=deadline, **request)
     run = Run(time.perf_counter(), deadline, progress, stop, watch)
     support, bound = scene.support, BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
     scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
-    parts = parts_in_background(run, scene) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, parts, bound.moved(run.origin), measure=measure, **request)
+    ahead = trials_ahead(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
+    found = run_rounds(run, scene, hand, rounds, ahead, bound.moved(run.origin), measure=measure, **request)
     result = _result(run, scene, replace(found, grasps=_ranked(run, found, config, seed)), config, seed, count)
     told = "" if run.over() else restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
     result = replace(result, message=message or told, support=support)

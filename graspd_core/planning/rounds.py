@@ -16,7 +16,7 @@ from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.planning.memory_errors import enough_memory
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import (
-    Parts,
+    TrialsAhead,
     TriedGrasps,
     VerificationContext,
     make_trial_context,
@@ -97,12 +97,11 @@ def run_rounds(
     scene: Scene,
     hand: HandModel,
     rounds: list[PlanConfig],
-    parts: Parts | None,
+    ahead: TrialsAhead | None,
     restrictions: BoundRestrictions = UNRESTRICTED,
     *,
     count: int,
     seed: int,
-    verify: str,
     device: str,
     measure: bool = True,
 ) -> RoundsResult:
@@ -110,10 +109,10 @@ def run_rounds(
 
     Most objects need one round, which begins with a small batch for a first answer. Where too few grasps held, what is
     missing is sought again from other initial poses. Candidates that a restriction refuses are not tried; without
-    `parts`, the object's convex parts, none is.
+    `ahead`, what trials need, none is.
     """
     state = RoundsResult(time.perf_counter())
-    early = [(config, _FIRST_BATCH) for config in rounds[:1] if parts is not None and count >= _MANY]
+    early = [(config, _FIRST_BATCH) for config in rounds[:1] if ahead is not None and count >= _MANY]
     for attempt, (config, most) in enumerate([*early, *((config, count) for config in rounds)]):
         enough, good, began = min(most + state.good, count), state.good, time.perf_counter()
         asked = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
@@ -125,12 +124,12 @@ def run_rounds(
             spent = time.perf_counter() - began
             state = replace(state, optimise_time=state.optimise_time + spent, refused=state.refused + refused)
             tried = TriedGrasps()
-            if parts is None:
+            if ahead is None:
                 first = admitted[: enough - state.good]
                 tried = TriedGrasps(measured(scene, hand, first) if measure else first)
             elif admitted:
                 if state.context is None:
-                    context = make_trial_context(run, scene, hand, parts, verify, config.certainty, measure=measure)
+                    context = make_trial_context(run, scene, hand, ahead, config.certainty, measure=measure)
                     state = replace(state, context=context)
                 if state.context is not None:
                     tried = run_trials(run, state.context, admitted, enough - state.good, state.good)

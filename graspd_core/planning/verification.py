@@ -18,7 +18,7 @@ from graspd_core.config import CertaintyConfig, RobustConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_context
-from graspd_core.planning.hypotheses import Hypotheses, hypotheses_of, try_hypotheses
+from graspd_core.planning.hypotheses import Hypotheses, OtherWorlds, hypotheses_of, other_worlds, try_hypotheses
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.trial_threads import results_in_order
 from graspd_core.scene.scene import Scene, object_parts
@@ -27,8 +27,6 @@ from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, Protocol, at_friction
 from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, TriangleMesh, Verdict
-
-Parts = Future[tuple[TriangleMesh, ...]]
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
@@ -52,10 +50,25 @@ class VerificationContext:
     hypotheses: Hypotheses | None = None
 
 
-def parts_in_background(run: Run, scene: Scene) -> Parts:
-    """The object's convex parts, from a thread that only who asks for its result, and the process's end, waits for.
+@dataclass(frozen=True)
+class TrialsAhead:
+    """What the trials of a run need and takes long, made by threads beside the search.
 
-    They take about as long as the optimiser does. One object is cut at a time, and none whose run is over before its
+    Attributes:
+        protocol: of the trials.
+        parts: the object's convex parts.
+        others: the worlds of what else may be true of it; None where nothing was guessed.
+    """
+
+    protocol: Protocol
+    parts: Future[tuple[TriangleMesh, ...]]
+    others: OtherWorlds | None
+
+
+def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
+    """Begin what the trials need, in threads that only who asks for a result, and the process's end, waits for.
+
+    It takes about as long as the optimiser does. One object is cut at a time, and none whose run is over before its
     turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
     """
 
@@ -64,24 +77,24 @@ def parts_in_background(run: Run, scene: Scene) -> Parts:
             return () if run.known_over() else object_parts(scene.object)
 
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
-    future = pool.submit(cut)
+    parts = pool.submit(cut)
     pool.shutdown(wait=False)
-    return future
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+    return TrialsAhead(protocol, parts, other_worlds(run, scene, hand, protocol, certainty.probability))
 
 
 def make_trial_context(
-    run: Run, scene: Scene, hand: HandModel, parts: Parts, verify: str, certainty: CertaintyConfig, *, measure: bool
+    run: Run, scene: Scene, hand: HandModel, ahead: TrialsAhead, certainty: CertaintyConfig, *, measure: bool
 ) -> VerificationContext | None:
     """The contexts, as soon as the parts are there; None where the run ended first."""
-    while not run.over() and not wait([parts], timeout=_POLL).done:
+    while not run.over() and not wait([ahead.parts], timeout=_POLL).done:
         pass
     if run.over():
         return None
-    parts.result()
-    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-    worlds = _worlds(scene, hand, protocol)
-    others = hypotheses_of(run, scene, hand, worlds, certainty.probability)
-    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, others)
+    ahead.parts.result()
+    worlds = _worlds(scene, hand, ahead.protocol)
+    hypotheses = None if ahead.others is None else hypotheses_of(ahead.others, worlds, certainty.probability)
+    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
 
 
 # Kept for the last few scenes and hands, which are hashed by identity.

@@ -134,11 +134,14 @@ def _occluders(
     """Depth of what stands before the object in each cell [m]: what is behind it nobody saw. Infinite: nothing does."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
-    local = (whole.points - whole.viewpoint) @ frame
-    local = local[np.isfinite(local).all(1) & (local[:, 2] > 1e-3)]
-    index = np.floor((local[:, :2] / local[:, 2:] - low) / cell)
-    inside = ((index >= 0) & (index < depth.shape)).all(1)
-    index, forward = tuple(index[inside].astype(int).T), local[inside, 2]
+    # Of all that a camera saw little is in the object's image; points that are not finite compare as false.
+    x, y, forward = ((whole.points - whole.viewpoint) @ frame).T
+    high = low + cell * np.array(depth.shape)
+    ahead = (forward > 1e-3) & (x >= low[0] * forward) & (x < high[0] * forward)
+    ahead &= (y >= low[1] * forward) & (y < high[1] * forward)
+    plane = np.stack([x[ahead], y[ahead]], -1) / forward[ahead, None]
+    forward = forward[ahead]
+    index = tuple(np.minimum(((plane - low) / cell).astype(int), np.array(depth.shape) - 1).T)
     near = forward < depth[index] - OCCLUDER_GAP_M
     before = np.full(depth.shape, np.inf)
     np.minimum.at(before, tuple(axis[near] for axis in index), forward[near])

@@ -38,12 +38,16 @@ def reaches_image_border(
         return False
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * np.ptp(plane, axis=0).max()
+    own, others = plane[mine], plane[~mine]
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
-        near = plane @ np.array(normal) + offset > -width
-        if (
-            min((near & mine).sum(), (near & ~mine).sum()) >= MIN_BORDER_POINTS
-            and _filled(plane[near], start, end) >= MIN_FILLED_SHARE
-        ):
+        # The object's few points first: most sides are none of theirs.
+        near = own[own @ np.array(normal) + offset > -width]
+        if len(near) < MIN_BORDER_POINTS:
+            continue
+        beside = others[others @ np.array(normal) + offset > -width]
+        if len(beside) < MIN_BORDER_POINTS:
+            continue
+        if _filled(np.concatenate([near, beside]), start, end) >= MIN_FILLED_SHARE:
             return True
     return False
 

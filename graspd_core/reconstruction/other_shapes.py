@@ -10,12 +10,13 @@ from graspd_core.errors import GraspdError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.reconstruction.evidence import Evidence
+from graspd_core.reconstruction.merge_views import thin
 from graspd_core.reconstruction.reconstruct import closed_mesh
 from graspd_core.reconstruction.shape_completion import RULES, guess_by
 from graspd_core.types import TriangleMesh
 
-# A trial feels no finer detail: cells along the longest side, Poisson's finest cell, and faces.
-_CELLS, _POISSON_CELL_M, _FACES = 40, 0.006, 4000
+# A trial feels no finer detail: spacing of points, cells along the longest side, Poisson's finest cell.
+_STEP_M, _CELLS, _POISSON_CELL_M = 0.003, 40, 0.006
 # Two shapes nearer to each other than this are one [m].
 _SAME_M = 5e-4
 _SAMPLES = 1500
@@ -31,16 +32,14 @@ def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMe
 
     None where the rule says nothing, no closed surface fits what it says, or the surface is that of `than`.
     """
-    guess = guess_by(rule, evidence.seen, evidence.free_space, evidence.step)
+    step = max(evidence.step, _STEP_M)
+    seen = thin(evidence.seen, step)
+    guess = guess_by(rule, seen, evidence.free_space, step)
     if guess is None:
         return None
-    settings = replace(
-        evidence.settings,
-        poisson_cell=max(evidence.settings.poisson_cell, _POISSON_CELL_M),
-        max_faces=min(evidence.settings.max_faces, _FACES),
-    )
+    settings = replace(evidence.settings, poisson_cell=max(evidence.settings.poisson_cell, _POISSON_CELL_M))
     try:
-        mesh = closed_mesh(evidence.seen, guess, evidence.free_space, evidence.step, settings, _CELLS)
+        mesh = closed_mesh(seen, guess, evidence.free_space, step, settings, _CELLS)
     except GraspdError:
         return None
     mesh = TriangleMesh(mesh.vertices @ evidence.rotation.T + evidence.origin, mesh.faces)

@@ -31,10 +31,10 @@ MAX_DISTANCES = 2_000_000
 def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
     """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size.
 
-    Its finest cells are wider than `finest` [m].
+    Its finest cells are about as wide as `finest` [m]: its grid halves from level to level.
     """
     size = float(np.ptp(surfels.points, axis=0).max())
-    depth = int(np.clip(np.ceil(np.log2(1.2 * size / finest)), 5, 7))
+    depth = int(np.clip(np.round(np.log2(1.2 * size / finest)), 5, 7))
     vertices, faces = _fit(surfels.points, surfels.normals, depth)
     if len(faces) == 0:
         raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
