@@ -86,7 +86,7 @@ class ReconstructionConfig:
         open_share: a surface with a smaller share missing is not completed.
         revolution_share: a body of revolution explains this share of what was seen, at least.
         symmetry_worth: a symmetry of a lower score is chance; the highest score is 2.6.
-        poisson_cell: the finest cells of the Poisson surface are wider than this: twice the camera's noise [m].
+        poisson_cell: the finest cells of the Poisson surface are about so wide: twice the camera's noise [m].
         min_cell: least cell of the grid that the surface is closed on [m].
         fit_distance: 85 % of the seen points lie this near to the mesh, or it is refused [m].
         max_faces: faces of the mesh, at most.
