@@ -25,7 +25,7 @@ from graspd_core.methods import losses
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
 from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
-from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
+from graspd_core.methods.graspd2022.multipliers import Adamax, adam_step, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, allowed_of, initial_poses_of, problem_of
@@ -46,6 +46,16 @@ class Evaluation(NamedTuple):
     limit: Float[Tensor, "batch"]
     range: Float[Tensor, "batch"]
     inter: Float[Tensor, "batch"]
+    normals: Float[Tensor, "batch points 3"]
+
+
+class Slope(NamedTuple):
+    """The Lagrangian's gradients at an iterate, `by_force` None without relaxation, and what they are made of."""
+
+    cost: Float[Tensor, "batch"]
+    broken: Float[Tensor, "batch constraints"]
+    by_pose: Float[Tensor, "batch variables"]
+    by_force: Float[Tensor, "batch points simulations components"]
     normals: Float[Tensor, "batch points 3"]
 
 
@@ -115,7 +125,7 @@ class Graspd2022:
         if config.level_set.schedule == "code":
             with torch.no_grad():
                 nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
-                radius = (nearest - 0.01).clamp_min(0.0)
+                radius = (nearest - config.level_set.clearance).clamp_min(0.0)
         worst = x.new_full((len(x),), torch.inf)
         return RelaxedState(
             adamax(x),
@@ -130,42 +140,84 @@ class Graspd2022:
     def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
         config = self.config
         remaining = max(0.0, 1.0 - index / config.level_set.coarse_steps) if config.level_set.coarse_steps else 0.0
+        first, *others = self.turns(problem)
+        slope = self.slope(problem, state, index, remaining * state.radius)
+        loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
+        finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
+        loss = torch.where(finite, loss, torch.inf)
+        # On a padded surface no iterate is judged.
+        better = (loss < state.best_loss) & (remaining == 0.0)
+        rate = self.rate(index) * config.relaxation.force_rate
+        pulled, count = state.forces, index + 1
+        if config.relaxation.enabled:
+            pulled = adamax_step(pulled, _clean(slope.by_force, finite), rate, count, config.beta2)
+            if config.relaxation.desired == "cone":
+                cone = into_cone(pulled.value, slope.normals, config.contact.friction)
+                pulled = replace(pulled, value=cone)
+        climb = -config.constraints.multiplier_rate
+        stepped = replace(
+            state,
+            pose=self.moved(state.pose, _clean(slope.by_pose, finite), index, 0, first),
+            forces=pulled,
+            multipliers=adamax_step(state.multipliers, _clean(slope.broken, finite), climb, count),
+            best=torch.where(better[:, None], state.pose.value, state.best),
+            best_loss=torch.where(better, loss, state.best_loss),
+            loss=loss,
+        )
+        for turn, shares in enumerate(others, 1):
+            by_pose = self.slope(problem, stepped, index, remaining * state.radius).by_pose
+            clean = _clean(by_pose, finite & torch.isfinite(by_pose).all(-1))
+            stepped = replace(stepped, pose=self.moved(stepped.pose, clean, index, turn, shares))
+        return stepped
+
+    def slope(self, problem: Problem, state: RelaxedState, index: int, radius: Float[Tensor, "batch"]) -> Slope:
+        """Cost, broken constraints and the Lagrangian's gradients at an iterate, against the level set φ = `radius`."""
+        bounds = self.config.constraints
         pose, forces = (x.value.detach().requires_grad_(True) for x in (state.pose, state.forces))
-        found = self.evaluate(problem, pose, forces, remaining * state.radius)
-        bounds = config.constraints
+        found = self.evaluate(problem, pose, forces, radius, leak_left=self.leak_left(index))
         task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
         broken = torch.stack([task, limit], -1)
         cost = self.cost(found)
         lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
         by_pose, by_force = torch.autograd.grad(lagrangian.sum(), (pose, forces), allow_unused=True)
-        broken, cost = broken.detach(), cost.detach()
-        loss = cost + damped(broken, torch.ones_like(broken), 1.0).sum(-1)
-        finite = torch.isfinite(by_pose).all(-1) & torch.isfinite(loss)
-        loss = torch.where(finite, loss, torch.inf)
-        # On a padded surface no iterate is judged.
-        better = (loss < state.best_loss) & (remaining == 0.0)
+        return Slope(cost.detach(), broken.detach(), by_pose, by_force, found.normals.detach())
+
+    def rate(self, index: int) -> float:
+        """Share of the step sizes at a step: grown while warming up, faded along half a cosine."""
+        config = self.config
         fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
-        count = index + 1
-        moved = adamax_step(state.pose, _clean(by_pose, finite), fade * config.pose_rate, count, config.beta2)
-        x = moved.value
+        return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
+
+    def leak_left(self, index: int) -> float:
+        """Share of the leak at a step."""
+        return 1.0 - index / max(1, self.steps - 1) if self.config.contact.leak_fades else 1.0
+
+    def turns(self, problem: Problem) -> tuple[Float[Tensor, "variables"] | None, ...]:
+        """For each move of the pose in a step, the share of the step size that each variable moves by; None is all."""
+        steps, joints = self.config.pose_steps, problem.hand.lower
+        moved, turned = steps.translation_share, steps.rotation_share
+        if not steps.in_turns and moved == turned == 1.0:
+            return (None,)
+        position = torch.cat([joints.new_tensor([moved] * 3 + [0.0] * 4), torch.zeros_like(joints)])
+        others = torch.cat([joints.new_tensor([0.0] * 3 + [turned] * 4), torch.ones_like(joints)])
+        return (position, others) if steps.in_turns else (position + others,)
+
+    def moved(
+        self,
+        pose: Adamax,
+        gradient: Float[Tensor, "batch variables"],
+        index: int,
+        turn: int,
+        shares: Float[Tensor, "variables"] | None,
+    ) -> Adamax:
+        """The pose after a move; all moments follow the gradient, also of variables whose turn it is not."""
+        config = self.config
+        step = adam_step if config.pose_steps.optimiser == "adam" else adamax_step
+        count = (2 if config.pose_steps.in_turns else 1) * index + turn + 1
+        after = step(pose, gradient, self.rate(index) * config.pose_rate, count, config.beta2)
+        x = after.value if shares is None else torch.lerp(pose.value, after.value, shares)
         quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
-        pulled = state.forces
-        if config.relaxation.enabled:
-            pulled = adamax_step(
-                pulled, _clean(by_force, finite), fade * config.relaxation.force_rate, count, config.beta2
-            )
-            if config.relaxation.desired == "cone":
-                pulled = replace(pulled, value=into_cone(pulled.value, found.normals.detach(), config.contact.friction))
-        climbed = adamax_step(state.multipliers, _clean(broken, finite), -bounds.multiplier_rate, count)
-        return replace(
-            state,
-            pose=replace(moved, value=torch.cat([x[:, :3], quaternion, x[:, 7:]], -1)),
-            forces=pulled,
-            multipliers=climbed,
-            best=torch.where(better[:, None], state.pose.value, state.best),
-            best_loss=torch.where(better, loss, state.best_loss),
-            loss=loss,
-        )
+        return replace(after, value=torch.cat([x[:, :3], quaternion, x[:, 7:]], -1))
 
     def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
         if self.config.keep == "last":
@@ -186,8 +238,10 @@ class Graspd2022:
         pose: Float[Tensor, "batch variables"],
         desired: Float[Tensor, "batch points simulations components"],
         radius: Float[Tensor, "batch"],
+        *,
+        leak_left: float = 1.0,
     ) -> Evaluation:
-        """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
+        """All terms at a pose, with desired forces, against the level set φ = `radius` [m] and a share of the leak."""
         config, body = self.config, self.body
         poses = unpack(pose)
         placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
@@ -201,7 +255,7 @@ class Graspd2022:
             stiffness=config.contact.stiffness,
             friction_stiffness=config.contact.friction_stiffness,
             friction=config.contact.friction,
-            leak=config.contact.leak,
+            leak=leak_left * config.contact.leak,
         )
         none = torch.zeros_like(radius)
         if config.relaxation.enabled:
