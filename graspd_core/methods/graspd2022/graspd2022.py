@@ -23,7 +23,7 @@ from graspd_core.hands.kinematics import place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods import losses
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
 from graspd_core.methods.graspd2022.multipliers import Adamax, adam_step, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import minimise
@@ -50,12 +50,12 @@ class Evaluation(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """The Lagrangian's gradients at an iterate, `by_force` None without relaxation, and what they are made of."""
+    """The Lagrangian's gradients at an iterate, that by the forces where there are any, and what they are made of."""
 
     cost: Float[Tensor, "batch"]
     broken: Float[Tensor, "batch constraints"]
     by_pose: Float[Tensor, "batch variables"]
-    by_force: Float[Tensor, "batch points simulations components"]
+    by_force: Float[Tensor, "batch points simulations components"] | None
     normals: Float[Tensor, "batch points 3"]
 
 
@@ -140,7 +140,6 @@ class Graspd2022:
     def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
         config = self.config
         remaining = max(0.0, 1.0 - index / config.level_set.coarse_steps) if config.level_set.coarse_steps else 0.0
-        first, *others = self.turns(problem)
         slope = self.slope(problem, state, index, remaining * state.radius)
         loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
         finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
@@ -149,7 +148,7 @@ class Graspd2022:
         better = (loss < state.best_loss) & (remaining == 0.0)
         rate = self.rate(index) * config.relaxation.force_rate
         pulled, count = state.forces, index + 1
-        if config.relaxation.enabled:
+        if slope.by_force is not None:
             pulled = adamax_step(pulled, _clean(slope.by_force, finite), rate, count, config.beta2)
             if config.relaxation.desired == "cone":
                 cone = into_cone(pulled.value, slope.normals, config.contact.friction)
@@ -157,30 +156,40 @@ class Graspd2022:
         climb = -config.constraints.multiplier_rate
         stepped = replace(
             state,
-            pose=self.moved(state.pose, _clean(slope.by_pose, finite), index, 0, first),
+            pose=self.moved(problem, state.pose, _clean(slope.by_pose, finite), (index, 0)),
             forces=pulled,
             multipliers=adamax_step(state.multipliers, _clean(slope.broken, finite), climb, count),
             best=torch.where(better[:, None], state.pose.value, state.best),
             best_loss=torch.where(better, loss, state.best_loss),
             loss=loss,
         )
-        for turn, shares in enumerate(others, 1):
-            by_pose = self.slope(problem, stepped, index, remaining * state.radius).by_pose
+        if config.pose_steps.in_turns:
+            by_pose = self.slope(problem, stepped, index, remaining * state.radius, pose_only=True).by_pose
             clean = _clean(by_pose, finite & torch.isfinite(by_pose).all(-1))
-            stepped = replace(stepped, pose=self.moved(stepped.pose, clean, index, turn, shares))
+            stepped = replace(stepped, pose=self.moved(problem, stepped.pose, clean, (index, 1)))
         return stepped
 
-    def slope(self, problem: Problem, state: RelaxedState, index: int, radius: Float[Tensor, "batch"]) -> Slope:
+    def slope(
+        self,
+        problem: Problem,
+        state: RelaxedState,
+        index: int,
+        radius: Float[Tensor, "batch"],
+        *,
+        pose_only: bool = False,
+    ) -> Slope:
         """Cost, broken constraints and the Lagrangian's gradients at an iterate, against the level set φ = `radius`."""
         bounds = self.config.constraints
-        pose, forces = (x.value.detach().requires_grad_(True) for x in (state.pose, state.forces))
+        pose = state.pose.value.detach().requires_grad_(True)
+        forces = state.forces.value.detach().requires_grad_(not pose_only)
         found = self.evaluate(problem, pose, forces, radius, leak_left=self.leak_left(index))
         task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
         broken = torch.stack([task, limit], -1)
         cost = self.cost(found)
         lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
-        by_pose, by_force = torch.autograd.grad(lagrangian.sum(), (pose, forces), allow_unused=True)
-        return Slope(cost.detach(), broken.detach(), by_pose, by_force, found.normals.detach())
+        wanted = (pose,) if pose_only else (pose, forces)
+        by_pose, *by_force = torch.autograd.grad(lagrangian.sum(), wanted, allow_unused=True)
+        return Slope(cost.detach(), broken.detach(), by_pose, by_force[0] if by_force else None, found.normals.detach())
 
     def rate(self, index: int) -> float:
         """Share of the step sizes at a step: grown while warming up, faded along half a cosine."""
@@ -192,32 +201,24 @@ class Graspd2022:
         """Share of the leak at a step."""
         return 1.0 - index / max(1, self.steps - 1) if self.config.contact.leak_fades else 1.0
 
-    def turns(self, problem: Problem) -> tuple[Float[Tensor, "variables"] | None, ...]:
-        """For each move of the pose in a step, the share of the step size that each variable moves by; None is all."""
-        steps, joints = self.config.pose_steps, problem.hand.lower
-        moved, turned = steps.translation_share, steps.rotation_share
-        if not steps.in_turns and moved == turned == 1.0:
-            return (None,)
-        position = torch.cat([joints.new_tensor([moved] * 3 + [0.0] * 4), torch.zeros_like(joints)])
-        others = torch.cat([joints.new_tensor([0.0] * 3 + [turned] * 4), torch.ones_like(joints)])
-        return (position, others) if steps.in_turns else (position + others,)
-
     def moved(
-        self,
-        pose: Adamax,
-        gradient: Float[Tensor, "batch variables"],
-        index: int,
-        turn: int,
-        shares: Float[Tensor, "variables"] | None,
+        self, problem: Problem, pose: Adamax, gradient: Float[Tensor, "batch variables"], when: tuple[int, int]
     ) -> Adamax:
-        """The pose after a move; all moments follow the gradient, also of variables whose turn it is not."""
-        config = self.config
-        step = adam_step if config.pose_steps.optimiser == "adam" else adamax_step
-        count = (2 if config.pose_steps.in_turns else 1) * index + turn + 1
+        """The pose after a move, `when` the index of the step and the turn in it.
+
+        All moments follow the gradient, also those of variables whose turn it is not: so it is in the code.
+        """
+        config, (index, turn) = self.config, when
+        steps = config.pose_steps
+        step = adam_step if steps.optimiser == "adam" else adamax_step
+        count = 2 * index + turn + 1 if steps.in_turns else index + 1
         after = step(pose, gradient, self.rate(index) * config.pose_rate, count, config.beta2)
-        x = after.value if shares is None else torch.lerp(pose.value, after.value, shares)
+        x, shares = after.value, move_shares(steps, turn, len(problem.hand.lower))
+        if any(share != 1.0 for share in shares):
+            x = torch.lerp(pose.value, x, x.new_tensor(shares))
         quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
-        return replace(after, value=torch.cat([x[:, :3], quaternion, x[:, 7:]], -1))
+        joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper) if steps.within_limits else x[:, 7:]
+        return replace(after, value=torch.cat([x[:, :3], quaternion, joints], -1))
 
     def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
         if self.config.keep == "last":
@@ -281,6 +282,12 @@ class Graspd2022:
             inter,
             normals,
         )
+
+
+def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
+    """Share of the step size that each variable moves by in a turn of a step: position, quaternion, joints."""
+    position, others = (1 - turn, turn) if steps.in_turns else (1, 1)
+    return [position * steps.translation_share] * 3 + [others * steps.rotation_share] * 4 + [float(others)] * joints
 
 
 def _clean(gradient: Tensor, finite: Tensor) -> Tensor:

@@ -101,12 +101,14 @@ class PoseStepsConfig:
         translation_share: step size of the base's position, by `pose_rate`.
         rotation_share: step size of the base's quaternion, by `pose_rate`.
         in_turns: a step moves the position of the base alone, then orientation and joints at what that led to.
+        within_limits: joints are put inside their limits after every move; else limits are a constraint alone.
     """
 
     optimiser: Literal["adamax", "adam"] = "adamax"
     translation_share: float = 1.0
     rotation_share: float = 1.0
     in_turns: bool = False
+    within_limits: bool = False
 
 
 @dataclass(frozen=True)
