@@ -13,15 +13,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.contact.free_body import make_body
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
-from graspd_core.methods.graspd2022.graspd2022 import Graspd2022, move_shares, plan
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig, PoseStepsConfig
+from graspd_core.methods.graspd2022.graspd2022 import plan
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
-from graspd_core.methods.graspd2022.multipliers import Adamax, adam_step, adamax, adamax_step, damped, excess
+from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.plan_config import PlanConfig, load_preset, override, preset_names
+from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.methods.planner import PlannerInput
 from graspd_core.methods.poses import Poses, pack
 from graspd_core.methods.problem import hand_forward
@@ -60,16 +59,6 @@ def draw(seed: int, *shape: int) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def solver_of(scenes):
-    def solver_of(config: Graspd2022Config, name: str = "box", dtype: torch.dtype = torch.float64) -> Graspd2022:
-        thing = scenes[name].object
-        body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, "cpu", dtype)
-        return Graspd2022(config, body)
-
-    return solver_of
-
-
-@pytest.fixture(scope="module")
 def problem(problem_of):
     return problem_of("box", torch.float64)
 
@@ -89,17 +78,6 @@ def test_adamax_by_hand():
     assert state.value[0].tolist() == pytest.approx([-0.1 - 0.056 / 0.19 / 3.996, 0.1 - 0.0055 / 0.19], rel=1e-6)
     forgetful = adamax_step(state, torch.zeros(1, 2, dtype=torch.float64), 0.1, 3, memory=0.5)
     assert forgetful.top[0].tolist() == pytest.approx([1.998, 0.5])
-
-
-def test_adam_is_that_of_torch():
-    gradients = draw(0, 5, 1, 3)
-    x = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    theirs, ours = torch.optim.Adam([x], lr=0.1), adamax(torch.zeros(1, 3, dtype=torch.float64))
-    for count, gradient in enumerate(gradients, 1):
-        x.grad = gradient
-        theirs.step()
-        ours = adam_step(ours, gradient, 0.1, count)
-    assert ours.value.numpy() == pytest.approx(x.detach().numpy(), rel=1e-6)
 
 
 @pytest.mark.parametrize("bound", [1.0, 10.0])
@@ -288,67 +266,6 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
     assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
 
 
-def test_the_level_set_of_the_code_starts_short_of_the_hand(problem, starts, solver_of):
-    radii = [
-        solver_of(changed(SHORT, level_set__schedule="code", level_set__clearance=gap)).init(problem, starts).radius
-        for gap in (0.01, 0.005)
-    ]
-    assert (radii[1] - radii[0]).tolist() == pytest.approx([0.005] * 3)
-
-
-def test_the_leak_fades_linearly_to_nothing(problem, starts, solver_of):
-    config = changed(SHORT, steps=11, contact__leak_fades=True)
-    assert [solver_of(config).leak_left(i) for i in (0, 5, 10)] == pytest.approx([1.0, 0.5, 0.0])
-    assert solver_of(SHORT).leak_left(10) == 1.0
-    solver = solver_of(changed(config, level_set__coarse_steps=0))
-    state = solver.init(problem, starts)
-    state = replace(state, forces=adamax(torch.ones_like(state.forces.value)))
-    # Nothing touches at the start: all that the physics gives the base is the leak's.
-    slopes = [solver.slope(problem, state, i, torch.zeros_like(state.radius)).by_pose[:, :3] for i in (0, 5, 10)]
-    assert slopes[0].abs().sum() > 0
-    assert slopes[1].numpy() == pytest.approx(0.5 * slopes[0].numpy())
-    assert slopes[2].abs().max() == 0
-
-
-def test_step_sizes_of_pose_and_forces_warm_up_but_not_of_the_multipliers(problem, starts, solver_of):
-    solver = solver_of(changed(SHORT, warm_up=4))
-    assert [solver.rate(i) for i in (0, 1, 4, 9)] == pytest.approx([0.0, 0.25, 1.0, 1.0])
-    assert solver_of(SHORT).rate(0) == 1.0
-    before = solver.init(problem, starts)
-    after = solver.step(problem, before, 0)
-    assert torch.equal(after.pose.value[:, :3], before.pose.value[:, :3])
-    assert torch.equal(after.forces.value, before.forces.value)
-    assert (after.multipliers.value[:, 0] > 0).all()
-
-
-def test_position_and_the_rest_of_the_pose_are_moved_in_turns():
-    steps = PoseStepsConfig(translation_share=0.25, rotation_share=0.5, in_turns=True)
-    assert move_shares(steps, 0, 2) == [0.25] * 3 + [0.0] * 6
-    assert move_shares(steps, 1, 2) == [0.0] * 3 + [0.5] * 4 + [1.0] * 2
-    assert move_shares(replace(steps, in_turns=False), 0, 2) == [0.25] * 3 + [0.5] * 4 + [1.0] * 2
-
-
-def test_in_turns_orientation_and_joints_answer_to_where_the_base_went(problem, starts, solver_of):
-    plain = changed(SHORT, level_set__coarse_steps=0, pose_steps__optimiser="adam", relaxation__force_rate=0.1)
-    # A second step has desired forces to follow.
-    together, in_turns = (solver_of(c) for c in (plain, changed(plain, pose_steps__in_turns=True)))
-    state = together.step(problem, together.init(problem, starts), 0)
-    one, two = together.step(problem, state, 0).pose, in_turns.step(problem, state, 0).pose
-    # The position is moved first, from the same pose and by the same gradient; Adam is told of both gradients.
-    assert torch.equal(one.value[:, :3], two.value[:, :3])
-    assert not torch.equal(one.value[:, 3:], two.value[:, 3:])
-    assert not torch.equal(one.mean, two.mean)
-
-
-def test_joints_stay_within_their_limits_where_that_is_asked(problem, starts, solver_of):
-    wild = changed(VARIANTS["code"], pose_rate=0.5, warm_up=0, pose_steps__within_limits=False, keep="last")
-    low, high = problem.hand.lower, problem.hand.upper
-    joints = run(wild, problem, starts, solver_of)[0][:, 7:]
-    assert ((joints < low) | (joints > high)).any()
-    joints = run(changed(wild, pose_steps__within_limits=True), problem, starts, solver_of)[0][:, 7:]
-    assert ((joints >= low) & (joints <= high)).all()
-
-
 def test_the_best_iterate_is_kept_or_the_last(problem, starts, solver_of):
     wild = changed(VARIANTS["cone"], steps=20, level_set__coarse_steps=0, pose_rate=0.2)
     _, best = run(wild, problem, starts, solver_of)
@@ -385,21 +302,6 @@ def test_presets_name_this_method_and_change_what_they_say():
     assert mine["graspd2022_no_coarse_to_fine"].settings.level_set.coarse_steps == 0
     assert not mine["graspd2022_no_relaxation"].settings.relaxation.enabled
     assert mine["graspd2022_no_leak"].settings.contact.leak == 0.0
-
-
-def test_the_released_code_s_preset_plans_a_small_problem(hand, scenes):
-    preset = load_preset("graspd2022_code")
-    settings = preset.settings
-    assert (settings.steps, settings.level_set.coarse_steps, settings.warm_up, settings.keep) == (
-        10000,
-        5000,
-        200,
-        "last",
-    )
-    config = override(preset, {"graspd2022.steps": 4, "graspd2022.level_set.coarse_steps": 2, "graspd2022.warm_up": 1})
-    found = plan(PlannerInput(scenes["sphere"], hand, 2, 1, config, Hooks()))
-    assert len(found.poses.translation) == 2
-    assert torch.isfinite(pack(found.poses)).all()
 
 
 def test_every_setting_is_explained():
