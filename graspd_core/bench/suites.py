@@ -146,7 +146,7 @@ def cell_seconds(cell: Cell) -> float:
         return {"verified": 2.5, "pace": 8.0, "start": 6.0}[cell.kind]
     each = _SECONDS.get(cell.settings.method, 1.0)
     if _steps(cell.settings) > _LONG:
-        each = 25.0 if _steps(cell.settings) > _LONGEST else 8.0
+        each = 28.0 if _steps(cell.settings) > _LONGEST else 8.0
     return 1.0 + cell.count * (each + 0.1 * len(cell.trials))
 
 
