@@ -26,6 +26,8 @@ STEADY = "balanced_steady"
 _RANKED = "robust"
 # Of settings with more steps than this a raw cell is asked for fewer grasps: they take seconds each.
 _LONG, _LONG_COUNT = 2000, 4
+# Settings with more steps than this are run on the objects of a quick run alone, unless they or objects are named.
+_LONGEST = 7000
 # Trials of the settings sweeps.
 _SWEEP_TRIALS = ("standard",)
 _SWEEP_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
@@ -71,11 +73,12 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     planned = {name: config for name, config in presets.items() if name in PLANNED}
     if "balanced" in planned:
         planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
-    trials = _trials(request, USUAL)
+    trials, named = _trials(request, USUAL), request.presets or request.objects
     cells: list[Cell] = []
     for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
-            cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
+            if named or _steps(config) <= _LONGEST or thing in _QUICK_OBJECTS:
+                cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
         # The closed form's own presets are what `plan_grasps` is used with; the others are only compared raw.
         for name, config in planned.items():
             cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
@@ -142,11 +145,13 @@ def cell_seconds(cell: Cell) -> float:
     if cell.kind != "raw":
         return {"verified": 2.5, "pace": 8.0, "start": 6.0}[cell.kind]
     each = _SECONDS.get(cell.settings.method, 1.0)
-    return 1.0 + cell.count * ((8.0 if _is_long(cell.settings) else each) + 0.1 * len(cell.trials))
+    if _steps(cell.settings) > _LONG:
+        each = 28.0 if _steps(cell.settings) > _LONGEST else 8.0
+    return 1.0 + cell.count * (each + 0.1 * len(cell.trials))
 
 
-def _is_long(config: PlanConfig) -> bool:
-    return getattr(config.settings, "steps", 0) > _LONG
+def _steps(config: PlanConfig) -> int:
+    return getattr(config.settings, "steps", 0)
 
 
 def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
@@ -157,7 +162,7 @@ def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _count(request: Request, config: PlanConfig) -> int:
-    usual = _LONG_COUNT if _is_long(config) else METHODS[config.method].benchmark_count
+    usual = _LONG_COUNT if _steps(config) > _LONG else METHODS[config.method].benchmark_count
     return request.count or (_QUICK_COUNT if request.quick else usual)
 
 

@@ -9,8 +9,11 @@ import torch
 from torch import Tensor
 
 from graspd_core.config import ProblemConfig
+from graspd_core.contact.free_body import make_body
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.methods.graspd2022.graspd2022 import Graspd2022
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.methods.problem import Problem, build_problem
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
@@ -43,6 +46,18 @@ def problem_of(hand: HandModel, scenes: dict[str, Scene]) -> Callable[[str, torc
         return built[name, dtype]
 
     return problem_of
+
+
+@pytest.fixture(scope="session")
+def solver_of(scenes: dict[str, Scene]) -> Callable[..., Graspd2022]:
+    """The solver of Grasp'D with given settings, for an object by name."""
+
+    def solver_of(config: Graspd2022Config, name: str = "box", dtype: torch.dtype = torch.float64) -> Graspd2022:
+        thing = scenes[name].object
+        body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, "cpu", dtype)
+        return Graspd2022(config, body)
+
+    return solver_of
 
 
 @pytest.fixture(scope="session")

@@ -23,9 +23,9 @@ from graspd_core.hands.kinematics import place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods import losses
 from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
 from graspd_core.methods.graspd2022.initial_poses_published import published_starts
-from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
+from graspd_core.methods.graspd2022.multipliers import Adamax, adam_step, adamax, adamax_step, damped, excess
 from graspd_core.methods.loop import minimise
 from graspd_core.methods.obstacle_distance import obstacle_gaps
 from graspd_core.methods.planner import PlannerInput, PlannerOutput, allowed_of, initial_poses_of, problem_of
@@ -46,6 +46,16 @@ class Evaluation(NamedTuple):
     limit: Float[Tensor, "batch"]
     range: Float[Tensor, "batch"]
     inter: Float[Tensor, "batch"]
+    normals: Float[Tensor, "batch points 3"]
+
+
+class Slope(NamedTuple):
+    """The Lagrangian's gradients at an iterate, that by the forces where there are any, and what they are made of."""
+
+    cost: Float[Tensor, "batch"]
+    broken: Float[Tensor, "batch constraints"]
+    by_pose: Float[Tensor, "batch variables"]
+    by_force: Float[Tensor, "batch points simulations components"] | None
     normals: Float[Tensor, "batch points 3"]
 
 
@@ -115,7 +125,7 @@ class Graspd2022:
         if config.level_set.schedule == "code":
             with torch.no_grad():
                 nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
-                radius = (nearest - 0.01).clamp_min(0.0)
+                radius = (nearest - config.level_set.clearance).clamp_min(0.0)
         worst = x.new_full((len(x),), torch.inf)
         return RelaxedState(
             adamax(x),
@@ -130,42 +140,85 @@ class Graspd2022:
     def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
         config = self.config
         remaining = max(0.0, 1.0 - index / config.level_set.coarse_steps) if config.level_set.coarse_steps else 0.0
-        pose, forces = (x.value.detach().requires_grad_(True) for x in (state.pose, state.forces))
-        found = self.evaluate(problem, pose, forces, remaining * state.radius)
-        bounds = config.constraints
-        task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
-        broken = torch.stack([task, limit], -1)
-        cost = self.cost(found)
-        lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
-        by_pose, by_force = torch.autograd.grad(lagrangian.sum(), (pose, forces), allow_unused=True)
-        broken, cost = broken.detach(), cost.detach()
-        loss = cost + damped(broken, torch.ones_like(broken), 1.0).sum(-1)
-        finite = torch.isfinite(by_pose).all(-1) & torch.isfinite(loss)
+        slope = self.slope(problem, state, index, remaining * state.radius)
+        loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
+        finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
         loss = torch.where(finite, loss, torch.inf)
         # On a padded surface no iterate is judged.
         better = (loss < state.best_loss) & (remaining == 0.0)
-        fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
-        count = index + 1
-        moved = adamax_step(state.pose, _clean(by_pose, finite), fade * config.pose_rate, count, config.beta2)
-        x = moved.value
-        quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
-        pulled = state.forces
-        if config.relaxation.enabled:
-            pulled = adamax_step(
-                pulled, _clean(by_force, finite), fade * config.relaxation.force_rate, count, config.beta2
-            )
+        rate = self.rate(index) * config.relaxation.force_rate
+        pulled, count = state.forces, index + 1
+        if slope.by_force is not None:
+            pulled = adamax_step(pulled, _clean(slope.by_force, finite), rate, count, config.beta2)
             if config.relaxation.desired == "cone":
-                pulled = replace(pulled, value=into_cone(pulled.value, found.normals.detach(), config.contact.friction))
-        climbed = adamax_step(state.multipliers, _clean(broken, finite), -bounds.multiplier_rate, count)
-        return replace(
+                cone = into_cone(pulled.value, slope.normals, config.contact.friction)
+                pulled = replace(pulled, value=cone)
+        climb = -config.constraints.multiplier_rate
+        stepped = replace(
             state,
-            pose=replace(moved, value=torch.cat([x[:, :3], quaternion, x[:, 7:]], -1)),
+            pose=self.moved(problem, state.pose, _clean(slope.by_pose, finite), (index, 0)),
             forces=pulled,
-            multipliers=climbed,
+            multipliers=adamax_step(state.multipliers, _clean(slope.broken, finite), climb, count),
             best=torch.where(better[:, None], state.pose.value, state.best),
             best_loss=torch.where(better, loss, state.best_loss),
             loss=loss,
         )
+        if config.pose_steps.in_turns:
+            by_pose = self.slope(problem, stepped, index, remaining * state.radius, pose_only=True).by_pose
+            clean = _clean(by_pose, finite & torch.isfinite(by_pose).all(-1))
+            stepped = replace(stepped, pose=self.moved(problem, stepped.pose, clean, (index, 1)))
+        return stepped
+
+    def slope(
+        self,
+        problem: Problem,
+        state: RelaxedState,
+        index: int,
+        radius: Float[Tensor, "batch"],
+        *,
+        pose_only: bool = False,
+    ) -> Slope:
+        """Cost, broken constraints and the Lagrangian's gradients at an iterate, against the level set φ = `radius`."""
+        bounds = self.config.constraints
+        pose = state.pose.value.detach().requires_grad_(True)
+        forces = state.forces.value.detach().requires_grad_(not pose_only)
+        found = self.evaluate(problem, pose, forces, radius, leak_left=self.leak_left(index))
+        task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
+        broken = torch.stack([task, limit], -1)
+        cost = self.cost(found)
+        lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
+        wanted = (pose,) if pose_only else (pose, forces)
+        by_pose, *by_force = torch.autograd.grad(lagrangian.sum(), wanted, allow_unused=True)
+        return Slope(cost.detach(), broken.detach(), by_pose, by_force[0] if by_force else None, found.normals.detach())
+
+    def rate(self, index: int) -> float:
+        """Share of the step sizes at a step: grown while warming up, faded along half a cosine."""
+        config = self.config
+        fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
+        return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
+
+    def leak_left(self, index: int) -> float:
+        """Share of the leak at a step."""
+        return 1.0 - index / max(1, self.steps - 1) if self.config.contact.leak_fades else 1.0
+
+    def moved(
+        self, problem: Problem, pose: Adamax, gradient: Float[Tensor, "batch variables"], when: tuple[int, int]
+    ) -> Adamax:
+        """The pose after a move, `when` the index of the step and the turn in it.
+
+        All moments follow the gradient, also those of variables whose turn it is not: so it is in the code.
+        """
+        config, (index, turn) = self.config, when
+        steps = config.pose_steps
+        step = adam_step if steps.optimiser == "adam" else adamax_step
+        count = 2 * index + turn + 1 if steps.in_turns else index + 1
+        after = step(pose, gradient, self.rate(index) * config.pose_rate, count, config.beta2)
+        x, shares = after.value, move_shares(steps, turn, len(problem.hand.lower))
+        if any(share != 1.0 for share in shares):
+            x = torch.lerp(pose.value, x, x.new_tensor(shares))
+        quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
+        joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper) if steps.within_limits else x[:, 7:]
+        return replace(after, value=torch.cat([x[:, :3], quaternion, joints], -1))
 
     def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
         if self.config.keep == "last":
@@ -186,8 +239,10 @@ class Graspd2022:
         pose: Float[Tensor, "batch variables"],
         desired: Float[Tensor, "batch points simulations components"],
         radius: Float[Tensor, "batch"],
+        *,
+        leak_left: float = 1.0,
     ) -> Evaluation:
-        """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
+        """All terms at a pose, with desired forces, against the level set φ = `radius` [m] and a share of the leak."""
         config, body = self.config, self.body
         poses = unpack(pose)
         placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
@@ -201,7 +256,7 @@ class Graspd2022:
             stiffness=config.contact.stiffness,
             friction_stiffness=config.contact.friction_stiffness,
             friction=config.contact.friction,
-            leak=config.contact.leak,
+            leak=leak_left * config.contact.leak,
         )
         none = torch.zeros_like(radius)
         if config.relaxation.enabled:
@@ -227,6 +282,12 @@ class Graspd2022:
             inter,
             normals,
         )
+
+
+def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
+    """Share of the step size that each variable moves by in a turn of a step: position, quaternion, joints."""
+    position, others = (1 - turn, turn) if steps.in_turns else (1, 1)
+    return [position * steps.translation_share] * 3 + [others * steps.rotation_share] * 4 + [float(others)] * joints
 
 
 def _clean(gradient: Tensor, finite: Tensor) -> Tensor:

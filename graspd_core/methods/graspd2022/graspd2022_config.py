@@ -26,13 +26,15 @@ class LevelSetConfig:
     """Coarse to fine: contact with the level set φ = r, r shrinking to zero.
 
     Attributes:
-        schedule: level set at the start: `paper`, `radius_start`; `code`, the start's least distance less a centimetre.
+        schedule: level set at the start: `paper`, `radius_start`; `code`, the start's least distance less `clearance`.
         radius_start: of the paper [m].
+        clearance: of the hand at the start from the level set of the code [m].
         coarse_steps: first steps, in which the level set shrinks to the surface; zero leaves coarse to fine out.
     """
 
     schedule: Literal["paper", "code"] = "paper"
     radius_start: float = 0.1
+    clearance: float = 0.01
     coarse_steps: int = 5000
 
 
@@ -42,6 +44,7 @@ class ContactConfig:
 
     Attributes:
         leak: slope of the depth out of contact; zero makes the gradient the plain one.
+        leak_fades: the leak falls linearly to zero over all steps, as grasping/src/cio.py of the code schedules it.
         stiffness: normal force of a contact by its depth [N/m].
         friction_stiffness: friction by tangential speed, below Coulomb's bound [N·s/m].
         friction: Coulomb coefficient.
@@ -49,6 +52,7 @@ class ContactConfig:
     """
 
     leak: float = 0.1
+    leak_fades: bool = False
     stiffness: float = 1e6
     friction_stiffness: float = 1e8
     friction: float = 0.8
@@ -86,6 +90,25 @@ class RelaxationConfig:
     enabled: bool = True
     desired: Literal["force", "wrench", "cone"] = "force"
     force_rate: float = 0.01
+
+
+@dataclass(frozen=True)
+class PoseStepsConfig:
+    """How the pose is stepped; the defaults are the paper's, other choices those of grasping/src/cio.py.
+
+    Attributes:
+        optimiser: `adamax`, or the code's `adam`.
+        translation_share: step size of the base's position, by `pose_rate`.
+        rotation_share: step size of the base's quaternion, by `pose_rate`.
+        in_turns: a step moves the position of the base alone, then orientation and joints at what that led to.
+        within_limits: joints are put inside their limits after every move; else limits are a constraint alone.
+    """
+
+    optimiser: Literal["adamax", "adam"] = "adamax"
+    translation_share: float = 1.0
+    rotation_share: float = 1.0
+    in_turns: bool = False
+    within_limits: bool = False
 
 
 @dataclass(frozen=True)
@@ -130,11 +153,13 @@ class Graspd2022Config:
         contact: the penalty contact.
         simulation: the one step of the object.
         relaxation: desired forces as variables (after contact-invariant optimisation).
+        pose_steps: how the pose is stepped.
         constraints: bounds on L_task and L_limit, and their multipliers.
         weights: weights of what is minimised.
         steps: of the optimiser.
         pose_rate: step size of the pose [m], [half rad] and [rad].
-        beta2: Adamax's decay rate of the gradient's infinity norm.
+        beta2: decay rate of the gradient's infinity norm (Adamax) or of its squares (Adam).
+        warm_up: first steps, in which the step sizes of pose and forces grow linearly from zero.
         final_rate: share of the step sizes that is left at the end, faded along half a cosine; one keeps them.
         keep: the `best` iterate on the true surface, or the `last`.
     """
@@ -144,10 +169,12 @@ class Graspd2022Config:
     contact: ContactConfig = field(default_factory=ContactConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     relaxation: RelaxationConfig = field(default_factory=RelaxationConfig)
+    pose_steps: PoseStepsConfig = field(default_factory=PoseStepsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     weights: ObjectiveWeights = field(default_factory=ObjectiveWeights)
     steps: int = 7000
     pose_rate: float = 0.003
     beta2: float = 0.999
+    warm_up: int = 0
     final_rate: float = 1.0
     keep: Literal["best", "last"] = "best"

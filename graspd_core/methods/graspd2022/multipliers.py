@@ -1,4 +1,4 @@
-"""Constrained minimisation by gradient steps: the modified differential multiplier method, and Adamax.
+"""Constrained minimisation by gradient steps: the modified differential multiplier method, Adamax and Adam.
 
 For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0); x descends it while λ
 climbs it. The damping d c² / 2 makes the two settle instead of circling (Platt & Barr, NIPS 1987).
@@ -22,7 +22,7 @@ class Adamax:
     Attributes:
         value: the iterate.
         mean: running mean of the gradient.
-        top: decaying maximum of the gradient's size.
+        top: decaying maximum of the gradient's size; with Adam the running mean of its squares.
     """
 
     value: Float[Tensor, "batch *shape"]
@@ -42,6 +42,16 @@ def adamax_step(
     mean = torch.lerp(gradient, state.mean, _BETA1)
     top = torch.maximum(memory * state.top, gradient.abs())
     return Adamax(torch.addcdiv(state.value, mean, top + _EPSILON, value=-rate / (1 - _BETA1**count)), mean, top)
+
+
+def adam_step(
+    state: Adamax, gradient: Float[Tensor, "batch *shape"], rate: float, count: int, memory: float = 0.999
+) -> Adamax:
+    """The state after Adam's step number `count`, from one (Kingma & Ba 2015, §2); `memory` is its β2."""
+    mean = torch.lerp(gradient, state.mean, _BETA1)
+    squares = torch.lerp(gradient * gradient, state.top, memory)
+    size = (squares / (1 - memory**count)).sqrt() + _EPSILON
+    return Adamax(torch.addcdiv(state.value, mean, size, value=-rate / (1 - _BETA1**count)), mean, squares)
 
 
 def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:
