@@ -35,9 +35,9 @@ from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
 
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
 PRESETS = ("balanced", "balanced", "fast", "accurate")
-VARIANTS, COUNT = 3, 24
-WIDTH, EPOCHS, BATCH, RATE, DECAY = 16, 30, 256, 3e-3, 0.1
-# Candidates that one order is told by, and those of them that a robot would look at.
+VARIANTS, COUNT = 2, 24
+WIDTH, EPOCHS, BATCH, RATE, DECAY = 16, 30, 256, 3e-3, 1.0
+# Candidates that one order is told by, or all where there are fewer, and those of them that a robot would look at.
 GROUP, FIRST, DRAWS = 32, 8, 40
 # The linear score of the first five figures, by which candidates were ordered before.
 LINEAR = (-1.7, -1.3, -0.7, -5.5)
@@ -71,26 +71,31 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
     print(f"{name}: {preset}, {held['standard'].sum()} of {len(grasps)} hold, {held['hard'].sum()} the hard trial")
 
 
-def fitted(figures: np.ndarray, held: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
-    """Mean and deviation of the figures, and the layers of a network that is trained on how trials ended."""
+def fitted(data: dict[str, np.ndarray], rows: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
+    """Mean and deviation of the figures, and the layers of a network that is trained on how the trials of rows ended.
+
+    It is trained on both trials, so that its layers serve both; the odds of the hard one are not kept.
+    """
     torch.manual_seed(seed)
+    figures, held = data["figures"][rows], np.stack([data["standard"][rows], data["hard"][rows]], 1)
     mean, deviation = figures.mean(0), figures.std(0) + 1e-6
     x = torch.as_tensor(((figures - mean) / deviation).clip(-FARTHEST, FARTHEST), dtype=torch.float32)
     y = torch.as_tensor(held, dtype=torch.float32)
-    sizes = (x.shape[1], WIDTH, WIDTH, 1)
+    sizes = (x.shape[1], WIDTH, WIDTH, 2)
     layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
     network = nn.Sequential(layers[0], nn.SiLU(), layers[1], nn.SiLU(), layers[2])
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, EPOCHS * -(-len(x) // BATCH))
     for _ in range(EPOCHS):
-        for rows in torch.randperm(len(x)).split(BATCH):
-            loss = nn.functional.binary_cross_entropy_with_logits(network(x[rows])[:, 0], y[rows])
+        for some in torch.randperm(len(x)).split(BATCH):
+            loss = nn.functional.binary_cross_entropy_with_logits(network(x[some]), y[some])
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             schedule.step()
     parameters = {f"weight{i}": layer.weight.detach().numpy().T for i, layer in enumerate(layers)}
     parameters |= {f"bias{i}": layer.bias.detach().numpy() for i, layer in enumerate(layers)}
+    parameters |= {"weight2": parameters["weight2"][:, :1], "bias2": parameters["bias2"][:1]}
     return {"mean": mean.astype(np.float32), "deviation": deviation.astype(np.float32), **parameters}
 
 
@@ -111,19 +116,17 @@ def worth(order: np.ndarray, held: np.ndarray, group: np.ndarray) -> tuple[float
     first, trials, area = [], [], []
     for name in np.unique(group):
         rows = np.flatnonzero(group == name)
-        if len(rows) < GROUP:
-            continue
         good, bad = order[rows][held[rows]], order[rows][~held[rows]]
         if len(good) and len(bad):
             area.append((good[:, None] > bad).mean() + 0.5 * (good[:, None] == bad).mean())
         for _ in range(DRAWS):
-            drawn = rng.choice(rows, GROUP, replace=False)
+            drawn = rng.choice(rows, min(GROUP, len(rows)), replace=False)
             ended = held[drawn][np.argsort(-order[drawn], kind="stable")]
             found = np.cumsum(ended)
             first.append(ended[:FIRST].mean())
-            took = np.argmax(found >= FIRST) + 1 if found[-1] >= FIRST else GROUP
+            took = np.argmax(found >= FIRST) + 1 if found[-1] >= FIRST else len(drawn)
             trials.append(took / max(min(FIRST, found[-1]), 1))
-    return float(np.mean(first or [np.nan])), float(np.mean(trials or [np.nan])), float(np.mean(area or [np.nan]))
+    return float(np.mean(first)), float(np.mean(trials)), float(np.mean(area or [np.nan]))
 
 
 def left_out(data: dict[str, np.ndarray], by: str) -> np.ndarray:
@@ -131,7 +134,7 @@ def left_out(data: dict[str, np.ndarray], by: str) -> np.ndarray:
     result = np.zeros(len(data["standard"]))
     for name in np.unique(data[by]):
         out = data[by] == name
-        result[out] = odds(fitted(data["figures"][~out], data["standard"][~out]), data["figures"][out])
+        result[out] = odds(fitted(data, ~out), data["figures"][out])
     return result
 
 
@@ -168,7 +171,7 @@ def fit(folder: Path, held_out: Path | None, to: Path) -> None:
     data = read(folder)
     kinds = [kind for kind in ("object", "hand") if len(np.unique(data[kind])) > 1]
     table("Tried", data, by_others(data) | {f"network, {kind} left out": left_out(data, kind) for kind in kinds})
-    network = fitted(data["figures"], data["standard"])
+    network = fitted(data, np.ones(len(data["figures"]), bool))
     if held_out is not None:
         others = read(held_out)
         table("Held out", others, by_others(others) | {"network": odds(network, others["figures"])})

@@ -52,8 +52,7 @@ def test_without_a_force_no_contact_shares_the_load(some: tuple[Problem, Staged]
     assert ranking_figures(problem, loose).abs().max() < 100.0
 
 
-def test_the_commands_make_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(benchmark, "GROUP", 8)
+def test_the_commands_make_a_network(tmp_path: Path):
     tried, network = tmp_path / "tried", tmp_path / "network.npz"
     few = ["--objects", "shape:sphere", "--hands", "parallel_gripper", "--variants", "1", "--count", "1"]
     benchmark.main(["try", *few, "--out", str(tried)])
