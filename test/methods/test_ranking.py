@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import ranking as benchmark
 import torch
 
 from graspd_core.methods.candidates import find_candidates, staged
@@ -14,7 +16,7 @@ from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import load_preset
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem
-from graspd_core.methods.stages.ranking import Staged, _fitted, ranking_figures, score
+from graspd_core.methods.stages.ranking import Staged, _fitted, log_odds, ranking_figures, score
 
 CONFIG = load_preset("fast")
 
@@ -42,6 +44,25 @@ def test_the_file_fits_the_figures(some: tuple[Problem, Staged]):
 def test_hands_that_were_only_drawn_come_after_all_that_grasp(some: tuple[Problem, Staged]):
     scores = score(*some)
     assert scores[:8].min() > scores[8:].max()
+
+
+def test_without_a_force_no_contact_shares_the_load(some: tuple[Problem, Staged]):
+    problem, before = some
+    loose = before._replace(pressed=replace(before.pressed, forces=torch.zeros_like(before.pressed.forces)))
+    assert ranking_figures(problem, loose).abs().max() < 100.0
+
+
+def test_the_commands_make_a_network(tmp_path: Path):
+    tried, network = tmp_path / "tried", tmp_path / "network.npz"
+    few = ["--objects", "shape:sphere", "--hands", "parallel_gripper", "--variants", "1", "--count", "1"]
+    benchmark.main(["try", *few, "--out", str(tried)])
+    (block,) = tried.glob("*.npz")
+    benchmark.main(["fit", "--out", str(tried), "--to", str(network)])
+    with np.load(network) as arrays, np.load(block) as rows:
+        fitted = {name: torch.as_tensor(arrays[name]).double() for name in arrays.files}
+        odds = log_odds(fitted, torch.as_tensor(rows["figures"]))
+        assert len(odds) == len(rows["standard"]) == len(rows["hard"]) == 8
+    assert torch.isfinite(odds).all()
 
 
 def test_one_at_a_time_is_as_all_at_once(some: tuple[Problem, Staged]):

@@ -24,6 +24,8 @@ from graspd_core.se3 import rotation_from_quaternion
 
 # Figures farther from their mean than so many deviations say no more.
 FARTHEST = 4.0
+# What a hand pays that presses on nothing: no candidate that the network was fitted to did so.
+_IDLE_COST = 20.0
 
 
 class Staged(NamedTuple):
@@ -49,9 +51,12 @@ class Staged(NamedTuple):
 def score(problem: Problem, staged: Staged) -> Float[Tensor, "batch"]:
     """Log-odds that a candidate passes the hold trial, less what the trial forgives and a real hand does not.
 
-    A finger deeper than 2 mm in the object and a hand deeper than 1 mm in itself cost; no trial goes into it.
+    A finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself and one that presses on nothing cost; no
+    trial goes into it.
     """
     odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
+    idle = (staged.pressed.forces == 0.0).all(-1).all(-1)
+    odds = odds - torch.where(idle, _IDLE_COST, 0.0)
     return odds - (_depth(staged) - 2.0).clamp_min(0.0) - 10.0 * (staged.overlap / 0.001 - 1.0).clamp_min(0.0)
 
 
@@ -90,7 +95,7 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
         (staged.overlap / 0.001).clamp_max(5.0),
         _links_touching(staged.contact_set),
         count,
-        1.0 / (shares**2).sum(-1).clamp_min(1e-9),
+        shares.sum(-1) ** 2 / (shares**2).sum(-1).clamp_min(1e-9),  # Contacts that share the load; 0: no force.
         (shares[..., None] * arms).sum(1).norm(dim=-1),
         normals.sum(1).norm(dim=-1) / count,
         *_spread(normals, count).unbind(0),
