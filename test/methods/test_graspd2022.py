@@ -45,7 +45,6 @@ VARIANTS = {
     "code": changed(
         SHORT,
         relaxation__desired="wrench",
-        contact__leak_fades=True,
         pose_steps__optimiser="adam",
         pose_steps__in_turns=True,
         pose_steps__within_limits=True,

@@ -56,19 +56,6 @@ def test_the_level_set_of_the_code_starts_short_of_the_hand(problem, starts, sol
     assert (radii[1] - radii[0]).tolist() == pytest.approx([0.005] * 3)
 
 
-def test_the_leak_fades_linearly_to_nothing(problem, starts, solver_of):
-    solver = solver_of(short({"steps": 11, "contact.leak_fades": True}))
-    assert [solver.leak_left(i) for i in (0, 5, 10)] == pytest.approx([1.0, 0.5, 0.0])
-    assert solver_of(short({})).leak_left(10) == 1.0
-    state = solver.init(problem, starts)
-    state = replace(state, forces=adamax(torch.ones_like(state.forces.value)))
-    # Nothing touches at the start: all that the physics gives the base is the leak's.
-    slopes = [solver.slope(problem, state, i, torch.zeros_like(state.radius)).by_pose[:, :3] for i in (0, 5, 10)]
-    assert slopes[0].abs().sum() > 0
-    assert slopes[1].numpy() == pytest.approx(0.5 * slopes[0].numpy())
-    assert slopes[2].abs().max() == 0
-
-
 def test_step_sizes_of_pose_and_forces_warm_up_but_not_of_the_multipliers(problem, starts, solver_of):
     solver = solver_of(short({"warm_up": 4}))
     assert [solver.rate(i) for i in (0, 1, 4, 9)] == pytest.approx([0.0, 0.25, 1.0, 1.0])

@@ -182,7 +182,7 @@ class Graspd2022:
         bounds = self.config.constraints
         pose = state.pose.value.detach().requires_grad_(True)
         forces = state.forces.value.detach().requires_grad_(not pose_only)
-        found = self.evaluate(problem, pose, forces, radius, leak_left=self.leak_left(index))
+        found = self.evaluate(problem, pose, forces, radius)
         task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
         broken = torch.stack([task, limit], -1)
         cost = self.cost(found)
@@ -196,10 +196,6 @@ class Graspd2022:
         config = self.config
         fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
         return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
-
-    def leak_left(self, index: int) -> float:
-        """Share of the leak at a step."""
-        return 1.0 - index / max(1, self.steps - 1) if self.config.contact.leak_fades else 1.0
 
     def moved(
         self, problem: Problem, pose: Adamax, gradient: Float[Tensor, "batch variables"], when: tuple[int, int]
@@ -239,10 +235,8 @@ class Graspd2022:
         pose: Float[Tensor, "batch variables"],
         desired: Float[Tensor, "batch points simulations components"],
         radius: Float[Tensor, "batch"],
-        *,
-        leak_left: float = 1.0,
     ) -> Evaluation:
-        """All terms at a pose, with desired forces, against the level set φ = `radius` [m] and a share of the leak."""
+        """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
         config, body = self.config, self.body
         poses = unpack(pose)
         placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
@@ -256,7 +250,7 @@ class Graspd2022:
             stiffness=config.contact.stiffness,
             friction_stiffness=config.contact.friction_stiffness,
             friction=config.contact.friction,
-            leak=leak_left * config.contact.leak,
+            leak=config.contact.leak,
         )
         none = torch.zeros_like(radius)
         if config.relaxation.enabled:

@@ -44,7 +44,6 @@ class ContactConfig:
 
     Attributes:
         leak: slope of the depth out of contact; zero makes the gradient the plain one.
-        leak_fades: the leak falls linearly to zero over all steps, as grasping/src/cio.py of the code schedules it.
         stiffness: normal force of a contact by its depth [N/m].
         friction_stiffness: friction by tangential speed, below Coulomb's bound [N·s/m].
         friction: Coulomb coefficient.
@@ -52,7 +51,6 @@ class ContactConfig:
     """
 
     leak: float = 0.1
-    leak_fades: bool = False
     stiffness: float = 1e6
     friction_stiffness: float = 1e8
     friction: float = 0.8
