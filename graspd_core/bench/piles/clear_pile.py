@@ -40,7 +40,7 @@ _MERGED = 0.15
 MOVED = 0.02
 # What the hand takes out rises with it: it may slip and turn in the hand as long as it comes up.
 _PROTOCOL = replace(PROTOCOLS["standard"], max_displacement=0.1, max_rotation=2 * np.pi)
-_LIFT = LiftSettings(lift_height=0.25, hold_time=1.0)
+_LIFT = LiftSettings(hold_time=1.0)
 # Endings of an attempt.
 CLEARED, DROPPED, BLOCKED, NO_GRASP, NO_SCENE = "cleared", "dropped", "blocked", "no verified grasp", "no scene"
 

@@ -133,7 +133,7 @@ def _drawn(frame: Record, meshes: Sequence[TriangleMesh], hand: HandModel) -> UI
         pose[:3, :3] = rotation_from_quaternion(torch.tensor(frame["hand"]["quaternion_wxyz"], dtype=torch.float64))
         pose[:3, 3] = frame["hand"]["position"]
         parts.append((moved(hand_mesh(hand, np.array(frame["hand"]["joint_positions"])), pose), _HAND))
-    camera = look_at((0.5, -0.43, 0.5), (0.0, 0.0, 0.1))
+    camera = look_at((0.6, -0.52, 0.5), (0.0, 0.0, 0.15))
     image = render_shaded(parts, T_world_camera=camera, width=_WIDTH, height=_HEIGHT)
     image[:_BORDER], image[-_BORDER:], image[:, :_BORDER], image[:, -_BORDER:] = 255, 255, 255, 255
     return image
