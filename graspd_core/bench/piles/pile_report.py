@@ -27,8 +27,8 @@ from graspd_core.types import TriangleMesh
 
 _HEADINGS = [
     "things", "taken out", "scenes emptied", "attempts", "no scene", "no verified grasp", "hand blocked", "dropped",
-    "two taken for one", "moved others", "verified grasps that held", "segmentation and reconstruction, a thing",
-    "planning, a thing",
+    "two taken for one", "came along", "moved others", "verified grasps that held",
+    "segmentation and reconstruction, a thing", "planning, a thing",
 ]  # fmt: skip
 # The scene of this many things is drawn, if there is one; frames of this size, so many in a row.
 _DRAWN, _WIDTH, _HEIGHT, _ROW = 8, 320, 240, 4
@@ -71,6 +71,7 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
         str(len(attempts)),
         *(str(ended[name]) for name in (NO_SCENE, NO_GRASP, BLOCKED, DROPPED)),
         str(sum(a["merged"] for a in attempts)),
+        str(sum(len(a["along"]) for a in lifts)),
         str(sum(a["moved"] > 0 for a in lifts)),
         f"{ended[CLEARED]}/{len(lifts)}",
         *(f"{seconds / cleared:.1f} s" if cleared else "–" for seconds in (seeing, planning)),
