@@ -106,13 +106,14 @@ def made_record(size: int, attempts: list[dict[str, Any]], left: list[str]) -> d
 def test_the_report_counts_what_came_of_attempts(attempts, tmp_path: Path):
     good = made_record(3, attempts(CLEARED, CLEARED, CLEARED), [])
     bad = made_record(5, [*attempts(DROPPED, CLEARED), *attempts(NO_GRASP, merged=True)], ["box"] * 4)
-    _, table, _, causes = pile_sections([good, bad], tmp_path / "bench")["piles"]
+    _, table, told, _, causes = pile_sections([good, bad], tmp_path / "bench")["piles"]
     assert (tmp_path / "piles.png").is_file()
     rows = str(table).splitlines()[2:]
     assert rows[0].startswith("| 3 | 3 of 3 | 1 of 1 | 3 | 0 | 0 | 0 | 0 | 0 |")
     assert rows[1].startswith("| 5 | 1 of 5 | 0 of 1 | 3 | 0 | 1 | 0 | 1 | 1 |")
     assert rows[2].startswith("| all | 4 of 8 | 1 of 2 | 6 | 0 | 1 | 0 | 1 | 1 |")
     assert rows[1].endswith("| 1/2 | 3.5 s | 6.0 s |")
+    assert "4 of 5 where the segment was of one thing, 0 of 0 where two" in str(told)
     assert "| dropped | the object moved … cm while lifting | 1 | 0 |" in str(causes)
     assert "| no verified grasp | fails under … of … | 1 | 1 |" in str(causes)
 

@@ -55,7 +55,7 @@ def pile_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     picture = None
     if chart is not None:
         picture = film_picture(max(records, key=lambda r: (r["size"] == _DRAWN, r["size"], -r["seed"])), chart)
-    return {"piles": [picture, markdown_table(_HEADINGS, body), *_causes(records)]}
+    return {"piles": [picture, markdown_table(_HEADINGS, body), _by_segment(records), *_causes(records)]}
 
 
 def _row(name: str, own: Sequence[Record]) -> list[str]:
@@ -76,6 +76,14 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
         f"{ended[CLEARED]}/{len(lifts)}",
         *(f"{seconds / cleared:.1f} s" if cleared else "–" for seconds in (seeing, planning)),
     ]
+
+
+def _by_segment(records: Sequence[Record]) -> str:
+    """How many verified grasps held where a segment was of one thing, and where it was of two."""
+    lifts = [a for r in records for a in r["attempts"] if "lift" in a]
+    held = {merged: [a["ended"] == CLEARED for a in lifts if a["merged"] == merged] for merged in (False, True)}
+    one, two = (f"{sum(own)} of {len(own)}" for own in held.values())
+    return f"Verified grasps that held: {one} where the segment was of one thing, {two} where two were taken for one."
 
 
 def _causes(records: Sequence[Record]) -> list[str]:
