@@ -7,6 +7,7 @@ from graspd_core.bench.bullet.bullet_world import bullet_available
 from graspd_core.bench.charts.failure_map_chart import map_sections
 from graspd_core.bench.failure_maps import map_registry
 from graspd_core.bench.measurements.measurement import run_cell
+from graspd_core.bench.piles import clear_pile, pile_case, pile_report
 from graspd_core.bench.stress import stress_cases
 from graspd_core.bench.studies import (
     arm_reach,
@@ -74,6 +75,16 @@ STUDIES: dict[str, Study] = {
         _PLANS,
         seen_objects.seen_seconds,
         came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
+    ),
+    "piles": Study(
+        "piles of things on a table, seen by a camera, grasped and lifted out one after another on the truth",
+        pile_case.pile_cases,
+        clear_pile.run_pile,
+        pile_report.pile_sections,
+        ("piles/*.py",),
+        ("presets", "objects", "cases", "seeds", "hand", "quick"),
+        pile_case.pile_seconds,
+        came=pile_report.pile_came,
     ),
     "robust": Study(
         "what ranking by noisy trials buys and costs",

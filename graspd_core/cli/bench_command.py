@@ -31,7 +31,11 @@ def add_command(commands: Any) -> None:
         help="shape:NAME, meshes in metres or folders; default: all shapes",
     )
     parser.add_argument(
-        "--cases", nargs="+", default=(), metavar="CASE", help="of stress: names, families; of maps: names"
+        "--cases",
+        nargs="+",
+        default=(),
+        metavar="CASE",
+        help="of stress: names, families; maps: names; piles: sizes",
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: 0")
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")

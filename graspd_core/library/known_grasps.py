@@ -209,7 +209,7 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
     turns = _rows([grasp.grasp.quaternion_wxyz for grasp in grasps])
     kinematics = make_kinematics(hand, dtype=torch.float64)
     ways = [("pregrasp", "grasp"), ("grasp", "squeeze")]
-    gaps = [gap_on_the_way(obstacles, kinematics, turns, ends(a), ends(b)) for a, b in ways]
+    gaps = [gap_on_the_way(obstacles, kinematics, turns, ends(a), ends(b), NEAR) for a, b in ways]
     return torch.stack(gaps).amin(0).numpy()
 
 

@@ -27,6 +27,8 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 RETREAT = 0.1
 RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
 _WAY_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+# What the optimiser makes of gaps ends below this [m].
+WIDE = 0.005
 # Points that stand for a cylinder's rim, and for a hull with more corners than this.
 _RIM, _HULL = 12, 32
 
@@ -133,8 +135,11 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
     return outermost(corners, _HULL) if len(corners) > _HULL else corners, 0.0
 
 
-def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Tensor, "batch gaps"]:
-    """Signed distances [m] of the hand's points to every obstacle, negative inside; link poses in the base frame."""
+def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Float[Tensor, "batch gaps"]:
+    """Signed distances [m] of the hand's points to every obstacle, negative inside; link poses in the base frame.
+
+    A gap to a thing that is at least `wide` may be given as `wide`.
+    """
     corners = base.apply(place_points(obstacles.corner_matrix, links))
     gaps = []
     if obstacles.normal is not None:
@@ -143,8 +148,20 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Te
         spheres = base.apply(place_points(obstacles.sphere_matrix, links))
         points = torch.cat([corners, spheres], 1)
         radii = torch.cat([obstacles.corner_radii, obstacles.sphere_radii])
-        gaps.extend(sample_sdf(sdf, points)[0] - radii for sdf in obstacles.sdfs)
+        gaps.extend(_gaps_to(sdf, points, radii, wide) for sdf in obstacles.sdfs)
     return torch.cat(gaps, -1)
+
+
+def _gaps_to(
+    sdf: GridSDF, points: Float[Tensor, "batch points 3"], radii: Float[Tensor, "points"], wide: float
+) -> Float[Tensor, "batch points"]:
+    """Gaps of balls to one thing. Of dozens of things about an object each has few balls near: these are sampled."""
+    off_grid = (points.detach() - (sdf.origin + sdf.half)).abs() - sdf.half
+    near = (off_grid < (radii + wide)[:, None]).all(-1)
+    gaps = points.new_full(near.shape, wide)
+    if bool(near.any()):
+        gaps[near] = sample_sdf(sdf, points[near])[0] - radii.expand(near.shape)[near]
+    return gaps
 
 
 @torch.no_grad()
@@ -154,14 +171,17 @@ def gap_on_the_way(
     quaternion: Float[Tensor, "batch 4"],
     pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
     grasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
+    wide: float = WIDE,
 ) -> Float[Tensor, "batch"]:
     """Least signed distance [m] of the hand to any obstacle, from the retreat over the pregrasp to the grasp.
 
-    It is negative inside. `pregrasp` and `grasp` are base translations and joints; the base is turned alike in both.
+    It is negative inside; one of at least `wide` may be given as `wide`. `pregrasp` and `grasp` are base translations
+    and joints; the base is turned alike in both.
     """
     rotation = rotation_from_quaternion(quaternion)
     back = rotation @ obstacles.retreat
     way = [(pregrasp[0] + RETREAT * share * back, pregrasp[1]) for share in RETREAT_SHARES]
     way += [(a * pregrasp[0] + (1 - a) * grasp[0], a * pregrasp[1] + (1 - a) * grasp[1]) for a in _WAY_SHARES]
-    gaps = [obstacle_gaps(obstacles, SE3(rotation, at), forward(kinematics, joints)).amin(-1) for at, joints in way]
+    placed = [(SE3(rotation, at), forward(kinematics, joints)) for at, joints in way]
+    gaps = [obstacle_gaps(obstacles, base, links, wide).amin(-1) for base, links in placed]
     return torch.stack(gaps).amin(0)

@@ -59,10 +59,7 @@ def segment(
     settings, target = settings or SegmentationConfig(), target or Target()
     scene = voxel_downsample(views, settings)
     check_target(target, views)
-    eyes = np.array([view.viewpoint for view in views], dtype=float)
-    parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
-    ground = find_ground(scene, parts, eyes, settings)
-    label = _things(scene, ground, eyes, settings)
+    eyes, ground, label = _parted(scene, views, settings)
     free = _candidates(scene, label, ground, settings)
     marked = target.box is not None or target.mask is not None
     if not free and not (marked and label.max(initial=-1) >= 0):
@@ -75,6 +72,33 @@ def segment(
     support = None if ground.support is None else ground.support.plane
     obstacles = _obstacles(scene, label, chosen, ground, settings)
     return Segmentation(found, support, obstacles, _doubts(scene, eyes, chosen, ground, bool(obstacles), settings))
+
+
+def find_things(
+    views: Sequence[PointCloud], settings: SegmentationConfig | None = None
+) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    """The points of each thing that `segment` would choose from without a target [m].
+
+    One of them as a target's point means the thing it is of. There may be none.
+
+    Raises:
+        CloudError: empty, all NaN, or too few points.
+    """
+    settings = settings or SegmentationConfig()
+    scene = voxel_downsample(views, settings)
+    _, ground, label = _parted(scene, views, settings)
+    of_points = label[scene.voxel]
+    return tuple(scene.points[of_points == k] for k in _candidates(scene, label, ground, settings))
+
+
+def _parted(
+    scene: VoxelScene, views: Sequence[PointCloud], settings: SegmentationConfig
+) -> tuple[Float[np.ndarray, "views 3"], Ground, Int[np.ndarray, "voxels"]]:
+    """Where the cameras stood, what things stand on, and the thing that each voxel is part of."""
+    eyes = np.array([view.viewpoint for view in views], dtype=float)
+    parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
+    ground = find_ground(scene, parts, eyes, settings)
+    return eyes, ground, _things(scene, ground, eyes, settings)
 
 
 def _things(

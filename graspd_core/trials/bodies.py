@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,21 @@ _GRAVITY = 9.81
 
 # Sliding, torsional and rolling coefficients.
 Friction = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class FreeBody:
+    """A thing that lies somewhere, free to move.
+
+    Attributes:
+        model: the thing, in its own frame.
+        parts: its convex parts, likewise [m].
+        pose: of its frame in the world [m].
+    """
+
+    model: ObjectModel
+    parts: tuple[TriangleMesh, ...]
+    pose: Float[np.ndarray, "4 4"]
 
 
 def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, friction: Friction) -> None:
@@ -51,21 +67,32 @@ def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, frictio
         geom.size = np.resize(np.append(primitive.size, [0.0, 0.0]), 3)
 
 
-def add_object(spec: Any, target: ObjectModel, parts: Sequence[TriangleMesh], friction: Friction) -> None:
+def add_object(
+    spec: Any,
+    target: ObjectModel,
+    parts: Sequence[TriangleMesh],
+    friction: Friction,
+    *,
+    name: str = OBJECT,
+    pose: Float[np.ndarray, "4 4"] | None = None,
+) -> None:
     import mujoco
 
-    body = spec.worldbody.add_body(name=OBJECT)
-    body.add_freejoint(name=OBJECT)
+    body = spec.worldbody.add_body(name=name)
+    if pose is not None:
+        body.pos = pose[:3, 3]
+        body.quat = quaternion_from_rotation(torch.as_tensor(pose[:3, :3], dtype=torch.float64)).numpy()
+    body.add_freejoint(name=name)
     body.explicitinertial = True
     body.mass = target.mass
     body.ipos = target.center_of_mass
     body.fullinertia = full_inertia(target.inertia, floor=1e-9)
     for index, part in enumerate(parts):
-        name = f"part:{index}"
-        add_mesh(spec, name, part.vertices, part.faces)
+        mesh = f"part:{index}" if name == OBJECT else f"{name} part:{index}"
+        add_mesh(spec, mesh, part.vertices, part.faces)
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=name,
+            meshname=mesh,
             condim=4,
             friction=friction,
             contype=1,
@@ -73,27 +100,46 @@ def add_object(spec: Any, target: ObjectModel, parts: Sequence[TriangleMesh], fr
         )
 
 
-def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    import mujoco
+def add_others(
+    spec: Any, others: Sequence[FreeBody], friction: Friction, origin: Float[np.ndarray, "3"]
+) -> tuple[str, ...]:
+    """Things that lie about, each free, in a world about `origin`; returns the names of their bodies."""
+    names = tuple(f"other {index + 1}" for index in range(len(others)))
+    for name, other in zip(names, others, strict=True):
+        add_object(spec, other.model, other.parts, friction, name=name, pose=other.pose)
+        spec.body(name).pos = other.pose[:3, 3] - origin
+    return names
 
+
+def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
+    """What the hand meets, and below `parts` what they rest on; without parts, all meets the one plane."""
     spec.option.gravity = -_GRAVITY * support.normal
-    lowest = min(float((part.vertices @ support.normal).min()) for part in parts)
-    for name, height in ((TABLE, support.offset), (_REST, lowest)):
-        body = spec.worldbody.add_body(name=name, mocap=True)
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=[0.0, 0.0, 1.0],
-            pos=height * support.normal,
-            quat=quaternion_between(np.eye(3)[2], support.normal, around=np.eye(3)[0]),
-            condim=4,
-            friction=friction,
-        )
-    spec.add_exclude(bodyname1=TABLE, bodyname2=OBJECT)
+    add_plane(spec, TABLE, support, friction)
     for link in hand.link_names:
         # Real hands carry their own weight.
         spec.body(f"link:{link}").gravcomp = 1.0
+    if not parts:
+        return
+    lowest = min(float((part.vertices @ support.normal).min()) for part in parts)
+    add_plane(spec, _REST, Plane(support.normal, lowest), friction)
+    spec.add_exclude(bodyname1=TABLE, bodyname2=OBJECT)
+    for link in hand.link_names:
         spec.add_exclude(bodyname1=_REST, bodyname2=f"link:{link}")
+
+
+def add_plane(spec: Any, name: str, plane: Plane, friction: Friction) -> None:
+    import mujoco
+
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0.0, 0.0, 1.0],
+        pos=plane.offset * plane.normal,
+        quat=quaternion_between(np.eye(3)[2], plane.normal, around=np.eye(3)[0]),
+        condim=4,
+        friction=friction,
+    )
 
 
 def add_obstacle(spec: Any, name: str, neighbour: Obstacle, target: ObjectModel, friction: Friction) -> None:

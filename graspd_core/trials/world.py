@@ -30,8 +30,10 @@ from graspd_core.se3 import quaternion_from_rotation
 from graspd_core.trials.bodies import (
     OBJECT,
     TABLE,
+    FreeBody,
     add_object,
     add_obstacle,
+    add_others,
     add_primitive,
     add_support,
     full_inertia,
@@ -120,6 +122,7 @@ class World:
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
         fingers: how many ends of fingers the hand has.
+        others: body ids of the free things about the object.
         spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
         watch: called with the `mujoco.MjData` after every step of a trial; None, as in planning, costs nothing.
     """
@@ -137,6 +140,7 @@ class World:
     coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     mimics: tuple[Mimic, ...] = ()
     fingers: int = 3
+    others: tuple[int, ...] = ()
     spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
     watch: Callable[[Any], None] | None = field(default=None, repr=False, compare=False)
 
@@ -178,6 +182,8 @@ def build_world(
     protocol: Protocol,
     support: Plane | None = None,
     obstacles: Sequence[Obstacle] = (),
+    *,
+    others: Sequence[FreeBody] | None = None,
 ) -> World:
     """Compile the world of one hand and one object.
 
@@ -189,6 +195,7 @@ def build_world(
         support: a table, with gravity onto it. The hand meets it where it is; the object rests on a plane of its own
             through its lowest point, because a reconstructed bottom hovers or sinks by millimetres.
         obstacles: fixed, as their convex hulls. Those that the object touches already let it pass.
+        others: free things; given, even none, all is as it truly lies and the object rests on the support itself.
     """
     import mujoco
 
@@ -198,21 +205,23 @@ def build_world(
     support = support and moved_plane(support, -far)
     obstacles = [moved_obstacle(obstacle, -far) for obstacle in obstacles]
     # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(lambda message: None)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    _set_physics(spec.option, protocol)
+    set_physics(spec.option, protocol)
     if len(hand.primitives) > _CROWD:
         spec.memory = _MEMORY
     _add_hand(spec, hand, protocol)
     add_object(spec, target, parts, protocol.friction)
     fixed = [TABLE] if support is not None else []
     if support is not None:
-        add_support(spec, hand, parts, protocol.friction, support)
+        add_support(spec, hand, parts if others is None else (), protocol.friction, support)
     for index, obstacle in enumerate(obstacles):
         fixed.append(f"neighbour {index + 1}")
         add_obstacle(spec, fixed[-1], obstacle, target, protocol.friction)
-    return _world_of(spec.compile(), hand, target, far, fixed, None if support is None else support.normal)
+    free = add_others(spec, others or (), protocol.friction, far)
+    world = _world_of(spec.compile(), hand, target, far, fixed, None if support is None else support.normal)
+    return replace(world, others=tuple(int(world.model.body(name).id) for name in free))
 
 
 def _world_of(
@@ -241,7 +250,7 @@ def _world_of(
     )
 
 
-def _set_physics(option: Any, protocol: Protocol) -> None:
+def set_physics(option: Any, protocol: Protocol) -> None:
     import mujoco
 
     option.timestep = protocol.timestep
@@ -257,10 +266,6 @@ def _set_physics(option: Any, protocol: Protocol) -> None:
 
 def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:
     return np.array([model.joint(f"joint:{name}").qposadr[0] for name in names], dtype=np.int64)
-
-
-def _ignore(message: str) -> None:
-    del message
 
 
 def _add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:

@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = {
     "main": ("bench", "README.md"),
     "rgbd": ("rgbd", "docs/clouds.md"),
+    "piles": ("piles", "docs/clouds.md"),
     "robust": ("robust", "docs/stress.md"),
     "steered": ("steered", "docs/usage.md"),
     "early": ("early-ends", "docs/bench.md"),

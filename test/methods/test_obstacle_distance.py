@@ -13,13 +13,15 @@ from hypothesis import strategies as st
 
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.hand_mesh import hand_mesh
-from graspd_core.hands.kinematics import forward
+from graspd_core.hands.kinematics import forward, place_points
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.methods.initial_poses import draw_starts
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.obstacle_distance import (
     RETREAT,
+    WIDE,
     gap_on_the_way,
     hand_reach,
     make_obstacle_tensors,
@@ -82,6 +84,25 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
     gaps = obstacle_gaps(obstacles, base, links)
     # Meshes of round solids are inscribed: facets cut off up to half a millimetre of a fingertip.
     assert float(gaps.min()) == pytest.approx(lowest(hand, posture, plane), abs=5e-4)
+
+
+def test_gaps_up_to_the_widest_are_exact_and_wider_ones_are_known_to_be(hand, scenes):
+    scene = beside(scenes["box"], 0.05)
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
+    assert obstacles is not None
+    starts = draw_starts(scenes["box"], hand, 6, 0, "cpu", DOUBLE)
+    links = forward(problem(scene, hand).hand.kinematics, starts.joints)
+    base = starts.base
+    balls = [(obstacles.corner_matrix, obstacles.corner_radii), (obstacles.sphere_matrix, obstacles.sphere_radii)]
+    whole = [sample_sdf(obstacles.sdfs[0], base.apply(place_points(at, links)))[0] - radii for at, radii in balls]
+    exact = torch.cat(whole, -1)
+    gaps = obstacle_gaps(replace(obstacles, normal=None, sdfs=obstacles.sdfs[:1]), base, links)
+    close = exact < WIDE
+    assert 0 < int(close.sum()) < close.numel()
+    assert torch.equal(gaps[close], exact[close])
+    assert bool((gaps[~close] >= WIDE).all())
+    # Some are not looked at.
+    assert bool((gaps == WIDE).any())
 
 
 def test_a_free_object_pays_nothing(hand, scenes):

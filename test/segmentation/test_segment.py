@@ -17,7 +17,7 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.rendering.depth_noise import LEVELS, NONE, DepthNoise, add_noise
 from graspd_core.rendering.render import look_at, render_scene
 from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
-from graspd_core.segmentation.segment import Segmentation, segment
+from graspd_core.segmentation.segment import Segmentation, find_things, segment
 from graspd_core.segmentation.target_selection import Target
 from graspd_core.types import TriangleMesh
 
@@ -323,3 +323,15 @@ def test_ten_million_points(kind):
     else:
         found = segment([PointCloud(points, view.viewpoint, view.forward)])
         assert share_near(found.views[0].points, THREE.truth, 4e-3) > 0.99
+
+
+def test_things_that_are_found_are_those_that_a_point_of_theirs_means():
+    views = views_of(THREE, CAMERA, [POSE])
+    things = find_things(views)
+    assert len(things) == 3
+    for points in things:
+        (cut,) = segment(views, target=Target(point=points[0])).views
+        # What is cut out leaves out the lowest millimetres, which may be the table's.
+        known = {tuple(point) for point in points}
+        assert all(tuple(point) in known for point in cut.points)
+        assert len(cut.points) > 0.9 * len(points)
