@@ -18,6 +18,7 @@ from graspd_core.segmentation.occlusion_merge import merge_occluded
 from graspd_core.segmentation.planes import find_planes
 from graspd_core.segmentation.support_plane import Ground, find_ground, stands_on, voxels_of
 from graspd_core.segmentation.target_selection import Target, check_target, seen, select_target
+from graspd_core.segmentation.touching import touching_things
 from graspd_core.types import Plane
 
 # Scenes nearer than this to their cameras are in another unit than metres [m].
@@ -71,7 +72,10 @@ def segment(
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     support = None if ground.support is None else ground.support.plane
     obstacles = _obstacles(scene, label, chosen, ground, settings)
-    return Segmentation(found, support, obstacles, _doubts(scene, eyes, chosen, ground, bool(obstacles), settings))
+    doubts = _doubts(scene, eyes, chosen, ground, bool(obstacles), settings)
+    return Segmentation(
+        found, support, obstacles, doubts if marked else (*doubts, *_touching(scene, eyes, chosen, ground))
+    )
 
 
 def find_things(
@@ -208,6 +212,22 @@ def _doubts(
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
     return tuple(doubts)
+
+
+def _touching(
+    scene: VoxelScene, eyes: Float[np.ndarray, "views 3"], chosen: Bool[np.ndarray, "voxels"], ground: Ground
+) -> tuple[str, ...]:
+    """That what was taken for one thing may be several, if a seam parts it."""
+    points = scene.mean[chosen]
+    height = np.zeros(len(points)) if ground.support is None else ground.support.height(points)
+    middles = touching_things(points, eyes, height, scene.size)
+    if not middles:
+        return ()
+    places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*middle) for middle in middles)
+    return (
+        f"cloud: the object may be {len(middles)} things that touch, about {places} m; "
+        "a box or a mask as target says which is meant",
+    )
 
 
 def _cut_off(scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], settings: SegmentationConfig) -> bool:

@@ -148,10 +148,11 @@ def result() -> GraspResult:
     scene, hand = load_scene("shape:box"), load_hand("parallel_gripper")
     found = plan_grasps(scene, hand, count=3, preset="fast", measure=True)
     best = found.grasps[0]
+    outward = best.grasp.position / np.linalg.norm(best.grasp.position)
 
     def away(grasp: Grasp) -> Grasp:
         move = {
-            name: replace(getattr(grasp, name), position=getattr(grasp, name).position + np.array([0.15, 0.0, 0.0]))
+            name: replace(getattr(grasp, name), position=getattr(grasp, name).position + 0.15 * outward)
             for name in ("pregrasp", "grasp", "squeeze")
         }
         return replace(grasp, **move, metrics=None)
