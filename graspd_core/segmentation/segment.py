@@ -217,10 +217,11 @@ def _doubts(
 def _touching(
     scene: VoxelScene, eyes: Float[np.ndarray, "views 3"], chosen: Bool[np.ndarray, "voxels"], ground: Ground
 ) -> tuple[str, ...]:
-    """That what was taken for one thing may be several, if a seam parts it."""
+    """That what was taken for one thing on a support may be several, if a seam parts it."""
+    if ground.support is None:
+        return ()
     points = scene.mean[chosen]
-    height = np.zeros(len(points)) if ground.support is None else ground.support.height(points)
-    middles = touching_things(points, eyes, height, scene.size)
+    middles = touching_things(points, eyes, ground.support.height(points), scene.size)
     if not middles:
         return ()
     places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*middle) for middle in middles)

@@ -11,11 +11,11 @@ from jaxtyping import Float, Int
 
 # Points so far apart tell how a surface bends [m], and how much bend inwards is a seam [1/m]: a bowl's inside, of a
 # radius over 8 cm, is none, nor is a camera's noise.
-_REACH_M, _SEAM_BEND = 0.013, 12.0
+_REACH_M, _SEAM_BEND = 0.013, 20.0
 # Points on one side of a seam are linked over this many spacings.
 _LINK_SPACINGS = 1.7
 # Each of two things has this share of the points at least, and some of its seen surface so near to the support [m].
-_MIN_SHARE, _FOOT_M = 0.12, 0.04
+_MIN_SHARE, _FOOT_M = 0.12, 0.03
 _NEIGHBOURS = 24
 
 
@@ -30,7 +30,7 @@ def touching_things(
     Args:
         points: thinned evenly [m].
         eyes: where the cameras stood [m].
-        height: of the points above the support [m]; zeros where there is none.
+        height: of the points above the support [m].
         spacing: of the points [m].
     """
     if len(points) < 2 * _NEIGHBOURS:

@@ -1,7 +1,5 @@
 """Segmentation: the right object out of scenes whose truth is known, and named failures out of the others."""
 
-import re
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +14,7 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.depth_image import cloud_from_depth
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.rendering.depth_noise import DEFAULT, LEVELS, NONE, DepthNoise, add_noise
+from graspd_core.rendering.depth_noise import LEVELS, NONE, DepthNoise, add_noise
 from graspd_core.rendering.render import look_at, render_scene
 from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core.segmentation.segment import Segmentation, find_things, segment
@@ -190,30 +188,6 @@ def test_a_mask_or_box_parts_two_that_touch(kind):
     assert share_near(found.views[0].points, scene.truth, 1e-3) > 0.97
     assert len(found.obstacles) == 1
     assert share_near(found.obstacles[0], scene.obstacles[0], 2e-3) > 0.95
-
-
-CYLINDER_BESIDE = tabletop("box", obstacles=[("cylinder", 0.064, 0.0)])
-
-
-@pytest.mark.parametrize("azimuth", [-2.2, -1.57, -0.9])
-def test_two_that_touch_are_told_where_the_seam_is_seen(azimuth):
-    view, _ = seen(CYLINDER_BESIDE.meshes, ring_poses(1, elevation=0.6, azimuth=azimuth)[0], DEFAULT)
-    (doubt,) = segment([view]).warnings
-    assert doubt.startswith("cloud: the object may be 2 things that touch, about (")
-    said = np.array(re.findall(r"-?\d+\.\d+", doubt), dtype=float).reshape(2, 3)
-    for mesh in (CYLINDER_BESIDE.truth, CYLINDER_BESIDE.obstacles[0]):
-        assert np.linalg.norm(said - centre(mesh), axis=1).min() < 0.04
-    # Who says what is meant is not asked.
-    bounds = (CYLINDER_BESIDE.truth.vertices.min(0), CYLINDER_BESIDE.truth.vertices.max(0))
-    assert segment([view], target=Target(box=bounds)).warnings == ()
-
-
-@pytest.mark.parametrize("distance", [0.5, 1.0])
-@pytest.mark.parametrize("shape", sorted(SHAPES))
-def test_one_thing_is_not_told_to_be_two(shape, distance):
-    pose = ring_poses(1, elevation=0.8, azimuth=1.2, distance=distance)[0]
-    view, _ = seen(tabletop(shape, yaw=0.3).meshes, pose, DEFAULT)
-    assert not [warning for warning in segment([view]).warnings if "touch" in warning]
 
 
 def test_flying_pixels_are_left_out():
