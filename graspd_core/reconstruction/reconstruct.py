@@ -30,6 +30,8 @@ from graspd_core.types import Plane, TriangleMesh
 
 # Share of the seen points that must lie on the result.
 MIN_FITTED_SHARE = 0.85
+# A face of the foot looks down by this cosine, at least.
+_DOWN = 0.7
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ def reconstruct(
         CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
     """
     settings = settings or ReconstructionConfig()
+    axis_known = views[0].forward is not None if views else False
     views = _clean(views, settings)
     rotation, origin = _frame(views, support)
     local = [_in_frame(view, rotation, origin) for view in views]
@@ -78,7 +81,7 @@ def reconstruct(
     step = point_step(local)
     standing = support is not None
     method, warnings, evidence = "poisson", (), None
-    if len(local) == 1 and is_unposed(local[0]):
+    if len(local) == 1 and is_unposed(local[0], axis_known):
         seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing, 0.0, settings.outline_slack)
         guess = Completion("", nothing(), 0.0)
     else:
@@ -89,11 +92,15 @@ def reconstruct(
         )
         guess = complete_shape(seen, free_space, step, settings)
         method += f", {guess.method}" if guess.method else ""
-        if guess.method or guess.openness > settings.open_share:
-            warnings = (_sentence(len(views), guess.method),)
-            evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings)
+        evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings)
     mesh = closed_mesh(seen, guess.surfels, free_space, step, settings)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
+    # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
+    missing = max(guess.openness, _guessed_share(mesh, confidence, standing))
+    if evidence is not None and (guess.method or missing > settings.open_share):
+        warnings = (_sentence(len(views), guess.method),)
+    else:
+        evidence = None
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
     return Reconstruction(mesh, confidence, method, warnings, evidence)
 
@@ -218,6 +225,17 @@ def _confidence(
     far = settings.guessed_distance
     distance, _ = KDTree(seen).query(mesh.vertices, distance_upper_bound=far)
     return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
+
+
+def _guessed_share(mesh: TriangleMesh, confidence: Float[np.ndarray, "vertices"], standing: bool) -> float:
+    """Share of a surface that was not seen; what stands on the support at z = 0 is known."""
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    across = np.cross(b - a, c - a)
+    area = np.linalg.norm(across, axis=1)
+    if standing:
+        foot = (across[:, 2] < -_DOWN * area) & (np.maximum(np.maximum(a, b), c)[:, 2] < MAX_FOOT_HEIGHT_M)
+        area = np.where(foot, 0.0, area)
+    return float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
 
 
 def _sentence(views: int, method: str) -> str:

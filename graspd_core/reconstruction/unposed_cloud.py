@@ -14,9 +14,10 @@ from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud
 from graspd_core.reconstruction.merge_views import Surfels
 
 # A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
-# this share of exceptions, the cloud is taken to show the object from all round.
+# this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
+# looked it takes more: from above, a third of the lines may run along the sides of a cup.
 MAX_RISE_CELLS = 4.0
-LAYERED_SHARE = 0.15
+LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
 
 # Neighbours for a normal, and for passing its sense on.
 NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
@@ -24,8 +25,13 @@ NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
 JITTER_STEPS = 0.02
 
 
-def is_unposed(view: PointCloud) -> bool:
-    """Whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it."""
+def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
+    """Whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it.
+
+    Args:
+        view: the object's points.
+        axis_known: it is said which way the camera looked.
+    """
     from scipy.spatial import KDTree
 
     points = clean_cloud(view.points, view.viewpoint).points
@@ -39,7 +45,8 @@ def is_unposed(view: PointCloud) -> bool:
     near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
     np.minimum.at(near, line, local[:, 2])
     np.maximum.at(far, line, local[:, 2])
-    return bool((far - near > MAX_RISE_CELLS * cell).mean() > LAYERED_SHARE)
+    most = LAYERED_SHARE_OF_CAMERA if axis_known else LAYERED_SHARE
+    return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:

@@ -120,6 +120,20 @@ def test_many_views_keep_a_mug_hollow():
     assert distances(whole.mesh, scene.truth).mean() < 0.0015
 
 
+@pytest.mark.parametrize("name", ["bottle", "cylinder", "mug"])
+@pytest.mark.parametrize("elevation", [70.0, 80.0])
+def test_sides_that_a_view_from_above_does_not_show_are_doubted(name, elevation):
+    stage = tabletop(name, yaw=0.3)
+    poses = ring_poses(1, elevation=np.deg2rad(elevation), azimuth=0.4)
+    ((depth, label),) = depth_views(stage, CAMERA, poses)
+    cloud = cloud_from_depth(np.where(label == 0, depth, 0.0), CAMERA, poses[0])
+    found = reconstruct(
+        [PointCloud(cloud.points[cloud.points[:, 2] > 0.004], cloud.viewpoint, cloud.forward)], support=stage.support
+    )
+    assert found.evidence is not None
+    assert "one side only; the rest is guessed" in found.warnings[0]
+
+
 def test_more_views_are_nearer_the_truth():
     off = [distances(make.mesh, seen("hammer")[0].truth).mean() for make in (made("hammer"), made("hammer", 3))]
     assert off[1] < off[0]
