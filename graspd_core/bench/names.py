@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-# Presets of the first page: those that people plan with, the published method, its code and repaired form, a baseline.
-FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_code", "graspd2022_repaired", "random_closure")
+# Presets of the first page: those that people plan with, the published method, its repaired form and a baseline.
+FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_repaired", "random_closure")
 # The first that fits a name tells its parent; a parent has none.
 _ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
 
