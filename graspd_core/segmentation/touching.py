@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 # Points so far apart tell how a surface bends [m], and how much bend inwards is a seam [1/m]: a bowl's inside, of a
-# radius over 8 cm, is none, nor is a camera's noise.
+# radius over 5 cm, is none, nor is a camera's noise.
 _REACH_M, _SEAM_BEND = 0.013, 20.0
 # Points on one side of a seam are linked over this many spacings.
 _LINK_SPACINGS = 1.7

@@ -14,6 +14,8 @@ from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.graspd2022.graspd2022 import Graspd2022
 from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.methods.graspd2022.initial_poses_published import published_starts
+from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import Problem, build_problem
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
@@ -91,3 +93,15 @@ def slope_errors() -> Callable[..., Tensor]:
         return torch.stack(errors)
 
     return slope_errors
+
+
+@pytest.fixture(scope="module")
+def problem(problem_of: Callable[..., Problem]) -> Problem:
+    """The box in float64, where a test has no other."""
+    return problem_of("box", torch.float64)
+
+
+@pytest.fixture(scope="module")
+def starts(problem: Problem, scenes: dict[str, Scene], hand: HandModel) -> Poses:
+    """Three starts as published, where a test has no other."""
+    return published_starts(problem, scenes["box"], hand, 3, 0, 0.1)

@@ -22,7 +22,7 @@ from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_st
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.methods.planner import PlannerInput
-from graspd_core.methods.poses import Poses, pack
+from graspd_core.methods.poses import pack
 from graspd_core.methods.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
@@ -55,16 +55,6 @@ VARIANTS = {
 
 def draw(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def problem(problem_of):
-    return problem_of("box", torch.float64)
-
-
-@pytest.fixture(scope="module")
-def starts(problem, scenes, hand) -> Poses:
-    return published_starts(problem, scenes["box"], hand, 3, 0, 0.1)
 
 
 def test_adamax_by_hand():

@@ -11,12 +11,11 @@ import torch
 
 from graspd_core.methods.graspd2022.graspd2022 import move_shares, plan
 from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
-from graspd_core.methods.graspd2022.initial_poses_published import published_starts
 from graspd_core.methods.graspd2022.multipliers import adam_step, adamax
 from graspd_core.methods.loop import Hooks, minimise
 from graspd_core.methods.plan_config import PlanConfig, load_preset, override
 from graspd_core.methods.planner import PlannerInput
-from graspd_core.methods.poses import Poses, pack
+from graspd_core.methods.poses import pack
 
 PAPER = PlanConfig(method="graspd2022")
 
@@ -25,16 +24,6 @@ def short(changes: Mapping[str, Any]) -> Graspd2022Config:
     """The paper's settings in twelve steps, with some changed, each by its dotted name."""
     changes = {"steps": 12, "level_set.coarse_steps": 6, **changes}
     return override(PAPER, {f"graspd2022.{name}": value for name, value in changes.items()}).settings
-
-
-@pytest.fixture(scope="module")
-def problem(problem_of):
-    return problem_of("box", torch.float64)
-
-
-@pytest.fixture(scope="module")
-def starts(problem, scenes, hand) -> Poses:
-    return published_starts(problem, scenes["box"], hand, 3, 0, 0.1)
 
 
 def test_adam_is_that_of_torch():
