@@ -1,6 +1,6 @@
 """What the viewer costs: opening 200 grasps, scrubbing, watching a run, and minutes of random clicking. Not a test.
 
-    python benchmarks/viewer.py [--minutes 10] [--grasps grasps.json]
+    python benchmarks/viewer.py [--minutes 10] [--grasps grasps.json] [--pace 0.5] [--clicks-only]
 
 Needs viser, playwright and a Chromium of the system's packages, as test/viewer does. Without a graphics card the
 browser draws in software, on the same cores as the server: its frames are a lower bound. Memory is resident memory.
@@ -47,21 +47,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0, help="of random clicking")
     parser.add_argument("--grasps", type=Path, default=None, help="a file of many grasps; without it 200 are planned")
+    parser.add_argument("--pace", type=float, default=0.05, help="seconds between clicks")
+    parser.add_argument("--clicks-only", action="store_true", help="leave out the scrubs and the watched runs")
     options = parser.parse_args()
     torch.set_num_threads(1)
     path = options.grasps or planned(200)
     before = set(threading.enumerate())
     viewer = Viewer(port=0)
-    watched(viewer, "nobody there")
+    if not options.clicks_only:
+        watched(viewer, "nobody there")
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         opened(viewer, page, path)
-        for address in ("", "/?fixedDpr=0.5"):
-            page.goto(viewer.url + address)
-            scrubbed(viewer, page, address)
-        watched(viewer, "a browser beside it")
-        clicked(viewer, page, options.minutes)
+        if not options.clicks_only:
+            for address in ("", "/?fixedDpr=0.5"):
+                page.goto(viewer.url + address)
+                scrubbed(viewer, page, address)
+            watched(viewer, "a browser beside it")
+        clicked(viewer, page, options.minutes, options.pace)
         browser.close()
     viewer.close()
     time.sleep(1.0)
@@ -142,8 +146,13 @@ def watched(viewer: Viewer, who: str, repeats: int = 6) -> None:
         print(f"watched run, {who}, {name}: {off:.2f} s without, {on:.2f} s with, {100 * (on / off - 1):+.1f} %")
 
 
-def clicked(viewer: Viewer, page: Any, minutes: float) -> None:
-    """Memory of the server and the browser while somebody clicks anywhere in the panel and types any key."""
+def clicked(viewer: Viewer, page: Any, minutes: float, pace: float) -> None:
+    """Memory of the server and the browser while somebody clicks anywhere in the panel and types any key.
+
+    Args:
+        minutes: so long.
+        pace: seconds between the end of a click and the next.
+    """
     random.seed(0)
     page.reload()
     page.get_by_text("#0 verified").first.wait_for()
@@ -151,10 +160,7 @@ def clicked(viewer: Viewer, page: Any, minutes: float) -> None:
     while time.monotonic() < end:
         if time.monotonic() - told > 60:
             told = time.monotonic()
-            print(
-                f"after {clicks} clicks: server {resident(os.getpid()):.0f} MB, browser {browser_memory():.0f} MB",
-                flush=True,
-            )
+            _tell_memory(clicks)
         try:
             if random.random() < 0.7:
                 page.mouse.click(random.uniform(960, 1260), random.uniform(110, 780))
@@ -163,13 +169,16 @@ def clicked(viewer: Viewer, page: Any, minutes: float) -> None:
         except Error as error:
             print(f"click {clicks}: {error}")
         clicks += 1
-        time.sleep(0.05)
+        time.sleep(pace)
     _tell_memory(clicks)
 
 
 def _tell_memory(clicks: int) -> None:
     server, browser = resident(os.getpid()), browser_memory()
-    print(f"after {clicks} clicks: server {server:.0f} MB, browser {browser:.0f} MB", flush=True)
+    print(
+        f"{time.strftime('%H:%M:%S')}, after {clicks} clicks: server {server:.0f} MB, browser {browser:.0f} MB",
+        flush=True,
+    )
 
 
 def resident(process: int) -> float:
