@@ -18,6 +18,9 @@ from graspd_core.viewer.motion import placed_links
 from graspd_core.viewer.session import Session
 
 _MOST_POINTS = 20_000
+# The browser's scene is in centimetres. viser's page holds an empty background one unit before the camera, which takes
+# a software browser a fifth of a frame's time. Nothing is drawn that is nearer than `_NEAR` units.
+PER_METRE, _NEAR = 100.0, 1.01
 
 
 class SceneNodes:
@@ -31,6 +34,7 @@ class SceneNodes:
         self._hidden: set[str] = set()
         self._opacity = 1.0
         # viser's own lights, shadows and reflections bring a browser that draws in software to 1 frame a second.
+        server.initial_camera.near = _NEAR
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
         server.scene.add_light_hemisphere(
@@ -68,7 +72,10 @@ class SceneNodes:
             node.remove()
         if len(lines):
             tints = np.repeat((255 * colours).astype(np.uint8)[:, None], 2, axis=1)
-            self._groups["lines"] = [self._server.scene.add_line_segments("/lines", lines, tints, thickness=0.0015)]
+            node = self._server.scene.add_line_segments(
+                "/lines", PER_METRE * lines, tints, thickness=PER_METRE * 0.0015
+            )
+            self._groups["lines"] = [node]
 
     def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
         """The signed distance on a plane square to an axis; None for none."""
@@ -77,13 +84,13 @@ class SceneNodes:
         if axis is None or session.scene is None:
             return
         image, middle = sdf_slice(session.scene, axis, share)
-        size = 2 * session.scene.sdf.half.double().cpu().numpy()
+        size = 2 * PER_METRE * session.scene.sdf.half.double().cpu().numpy()
         down, right = slice_axes(axis)
         turn = np.zeros((3, 3))
         turn[right, 0], turn[down, 1] = 1.0, 1.0
         turn[:, 2] = np.cross(turn[:, 0], turn[:, 1])
         node = self._server.scene.add_image(
-            "/slice", image, float(size[right]), float(size[down]), wxyz=_quaternion(turn), position=middle
+            "/slice", image, float(size[right]), float(size[down]), wxyz=_quaternion(turn), position=PER_METRE * middle
         )
         self._groups["slice"] = [node]
 
@@ -101,12 +108,12 @@ class SceneNodes:
         """Put every link where it is; rows beyond the links are left out."""
         with self._server.atomic():
             for link, node in self._links.items():
-                node.position, node.wxyz = positions[link], quaternions[link]
+                node.position, node.wxyz = PER_METRE * positions[link], quaternions[link]
 
     def pose_object(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> None:
         """Put the object somewhere else than where it was planned on."""
         if self._object is not None:
-            self._object.position, self._object.wxyz = position, quaternion
+            self._object.position, self._object.wxyz = PER_METRE * position, quaternion
 
     def show_hand(self, visible: bool) -> None:
         for node in self._links.values():
@@ -128,15 +135,15 @@ class SceneNodes:
         nodes = []
         if len(points):
             every = -(-len(points) // _MOST_POINTS)
-            shown = points[::every].astype(np.float32)
-            nodes = [self._server.scene.add_point_cloud("/cloud", shown, SEEN, point_size=0.0012)]
+            shown = (PER_METRE * points[::every]).astype(np.float32)
+            nodes = [self._server.scene.add_point_cloud("/cloud", shown, SEEN, point_size=PER_METRE * 0.0012)]
         self._groups["cloud"] = nodes
 
     def _mesh(self, name: str, part: Part) -> Any:
         # Of a closed body nobody sees the inside: to draw it takes a software browser a fifth of a frame's time.
         closed = name.startswith("/hand") or is_closed(part.mesh)
         return self._server.scene.add_mesh_simple(
-            name, part.mesh.vertices, part.mesh.faces, color=_bytes(part.colour), flat_shading=True,
+            name, PER_METRE * part.mesh.vertices, part.mesh.faces, color=_bytes(part.colour), flat_shading=True,
             side="front" if closed else "double",
             opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
@@ -154,7 +161,7 @@ class SceneNodes:
         eye = middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up)
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
-            camera.position, camera.look_at = eye, middle
+            camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle
 
 
 def _bytes(colour: Colour) -> tuple[int, int, int]:

@@ -14,12 +14,13 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.planning.steering.steering import angle_of_approach
 from graspd_core.types import TriangleMesh
 from graspd_core.viewer.drawing import OBJECT, Part
+from graspd_core.viewer.scene_nodes import PER_METRE
 from graspd_core.viewer.session import open_grasps
 
 
 def places(viewer) -> np.ndarray:
-    """Where the links of the hand are, in viser's scene."""
-    return np.array([node.position for node in viewer._nodes._links.values()])
+    """Where the links of the hand are [m]."""
+    return np.array([node.position for node in viewer._nodes._links.values()]) / PER_METRE
 
 
 def unlike(one: np.ndarray, other: np.ndarray) -> float:
@@ -63,6 +64,17 @@ def test_closed_bodies_are_drawn_from_outside_and_open_ones_from_both_sides(page
     page.until(lambda: page.tab.locator("canvas").first.bounding_box()["width"] < 600)
 
 
+def test_the_empty_background_of_the_page_is_not_drawn(page):
+    """It is the one opaque mesh of the page that has a shader of its own, and costs a software browser every pixel."""
+    near, away = page.tab.evaluate("""() => {
+      const {scene, camera} = window.__viserMutable, found = [];
+      scene.traverse(o => o.material?.type === "ShaderMaterial" && !o.material.transparent && found.push(o));
+      return [camera.near, found.map(o => camera.position.distanceTo(o.position))];
+    }""")
+    assert len(away) == 1
+    assert away[0] < near < 0.015 * PER_METRE
+
+
 def test_keys_go_to_the_next_grasp_and_back(page):
     page.key("n")
     page.text("#1 verified")
@@ -87,7 +99,7 @@ def test_a_failed_trial_is_replayed_to_its_reason(page, viewer):
     page.text("1 of 1 shown")
     page.press("Run and play")
     page.text(re.compile(r"failed at \d+\.\d\d s: the object moved .* under a pull along"))
-    page.until(lambda: np.linalg.norm(viewer._nodes._object.position) > 0.04)
+    page.until(lambda: np.linalg.norm(viewer._nodes._object.position) > 0.04 * PER_METRE)
     page.set("Way", 1)
     page.until(lambda: np.linalg.norm(viewer._nodes._object.position) == 0)
 
