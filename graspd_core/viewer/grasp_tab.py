@@ -17,6 +17,9 @@ from graspd_core.viewer.session import Session
 from graspd_core.viewer.trial_controls import TrialControls
 
 _NONE = "no grasp"
+# From half-way to the scrubber's place [s]: half of the time between two positions of a slider, of which the page sends
+# at most 20 a second.
+_HALF_PERIOD = 0.025
 _AXES = ("none", "x", "y", "z")
 # What a visitor may hide, by group of nodes, and whether it is shown at first.
 _SHOWN = {"contacts": True, "forces": True, "weakest": True, "around": True, "cloud": True, "object": True}
@@ -36,6 +39,7 @@ class GraspTab:
         self._mechanics: Mechanics | None = None
         self._ranks: list[int] = []
         self._chosen: int | None = None
+        self._at = 2.0
         self._build(server.gui)
         for name, key, step in (("Next grasp", "N", 1), ("Previous grasp", "P", -1)):
             command = server.gui.add_command(name, hotkey=key)
@@ -69,7 +73,7 @@ class GraspTab:
         by_visitor(self._filter, "list", self._list)
         by_visitor(self._order, "list", self._list)
         by_visitor(self._choice, "choose", self._read_choice)
-        by_visitor(self._stage, "pose", self.draw_pose)
+        by_visitor(self._stage, "pose", self._follow)
         by_visitor(self._solid, "solid", lambda: self._nodes.fade_hand(float(self._solid.value)))
         by_visitor(self._axis, "slice", self._draw_slice)
         by_visitor(self._share, "slice", self._draw_slice)
@@ -97,15 +101,21 @@ class GraspTab:
         """Choose the next grasp of the list, or the one before."""
         self._jobs.submit("choose", lambda: self._choose_place(by))
 
-    def draw_pose(self) -> None:
-        """Put hand and object where the scrubber says."""
+    def draw_pose(self, at: float | None = None) -> None:
+        """Put hand and object where the scrubber says, or at another place of the way."""
+        self._at = float(self._stage.value) if at is None else at
         grasp = self._grasp()
         if self.trial.stop():
             self._draw_contacts()
         self._nodes.show_hand(grasp is not None)
         if self._session is not None and grasp is not None:
-            self._nodes.pose_hand(self._session.hand, posture_at(self._session.hand, grasp, float(self._stage.value)))
+            self._nodes.pose_hand(self._session.hand, posture_at(self._session.hand, grasp, self._at))
         self._nodes.pose_object(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def _follow(self) -> None:
+        """Move the hand to where the scrubber was dragged, in two steps."""
+        self.draw_pose(0.5 * (self._at + float(self._stage.value)))
+        self._jobs.submit("pose", self.draw_pose, after=_HALF_PERIOD)
 
     def _grasp(self) -> Grasp | None:
         return None if self._session is None or self._chosen is None else self._session.grasps[self._chosen]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.topology import is_closed
 from graspd_core.se3 import perpendicular, quaternion_from_rotation
-from graspd_core.types import Posture
+from graspd_core.types import Posture, TriangleMesh
 from graspd_core.viewer.drawing import SEEN, Colour, Part, hand_parts, scene_parts, sdf_slice, slice_axes
 from graspd_core.viewer.motion import placed_links
 from graspd_core.viewer.session import Session
@@ -141,10 +141,15 @@ class SceneNodes:
 
     def _mesh(self, name: str, part: Part) -> Any:
         # Of a closed body nobody sees the inside: to draw it takes a software browser a fifth of a frame's time.
-        closed = name.startswith("/hand") or is_closed(part.mesh)
+        mesh, hand = part.mesh, name.startswith("/hand")
+        closed = hand or is_closed(mesh)
+        # Solids look much the same in five shades, which take a sixth less of that time. They know no flat shading, so
+        # that every face has corners of its own.
+        if hand:
+            mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
         return self._server.scene.add_mesh_simple(
-            name, PER_METRE * part.mesh.vertices, part.mesh.faces, color=_bytes(part.colour), flat_shading=True,
-            side="front" if closed else "double",
+            name, PER_METRE * mesh.vertices, mesh.faces, color=_bytes(part.colour), flat_shading=True,
+            material="toon5" if hand else "standard", side="front" if closed else "double",
             opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 

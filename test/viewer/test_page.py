@@ -56,10 +56,26 @@ def test_the_scrubber_moves_the_hand(page, viewer):
     page.until(lambda: unlike(page.picture(), seen) < 0.01)
 
 
+def test_a_dragged_hand_goes_half_way_first(page, viewer):
+    ways: list[float] = []
+    tab, draw = viewer._grasps, viewer._grasps.draw_pose
+
+    def drawn(at: float | None = None) -> None:
+        draw(at)
+        ways.append(tab._at)
+
+    tab.draw_pose = drawn
+    page.set("Way", 0)
+    page.until(lambda: 0.0 in ways)
+    assert ways[:2] == [1.0, 0.0]
+
+
 def test_closed_bodies_are_drawn_from_outside_and_open_ones_from_both_sides(page, viewer):
     box, nodes = make_shape("box"), viewer._nodes
     nodes.draw("object", [Part("closed", box, OBJECT), Part("open", TriangleMesh(box.vertices, box.faces[1:]), OBJECT)])
     assert [node.side for node in nodes._groups["object"]] == ["front", "double"]
+    # Shades by facet, and fewer of them, for the hand.
+    assert all(node.material == "toon5" and len(node.vertices) == node.faces.size for node in nodes._links.values())
     # The panel stands beside the scene.
     page.until(lambda: page.tab.locator("canvas").first.bounding_box()["width"] < 600)
 
