@@ -2,8 +2,9 @@
 
 A trial that stops early goes through the same states as one of full length, so it can verify what that would not, never
 the reverse. What slides slowly may come to an edge and snap away, and what jitters on its contacts may be thrown off
-them much later: hence the large safety, and the demand for rest. Numbers are from trajectories of pulls of four hands;
-`graspd bench early` measures what they come to.
+them much later: hence the large safety, and the demand for rest. Small jitter hides how far an object drifts within a few
+steps; over more of them it cancels, so that the drift is taken over several spans and any of them may give the answer.
+Numbers are from trajectories of pulls of five hands on eleven shapes; `graspd bench early` measures what they come to.
 """
 
 from __future__ import annotations
@@ -26,27 +27,26 @@ class StopRule:
 
     Attributes:
         first: steps before the first look.
-        window: steps that the drift is taken over.
+        windows: steps that the drift is taken over; one of them is enough.
         safety: how many times that drift the object is supposed to keep until the end.
         speed: what is slower is at rest [m/s].
         spin: what turns slower is at rest [rad/s].
     """
 
     first: int
-    window: int
+    windows: tuple[int, ...]
     safety: float
     speed: float
     spin: float
 
 
-FIRM = StopRule(first=25, window=10, safety=16.0, speed=0.005, spin=math.radians(5.0))
-SLIPPERY = StopRule(first=25, window=10, safety=16.0, speed=0.002, spin=math.radians(2.0))
+FIRM = StopRule(first=20, windows=(10, 20, 40), safety=16.0, speed=0.01, spin=math.radians(10.0))
+SLIPPERY = StopRule(first=25, windows=(10, 20, 40), safety=32.0, speed=0.01, spin=math.radians(10.0))
 # Objects begin to slip as late as 1.9 s.
-CREEPING = StopRule(first=100, window=50, safety=16.0, speed=0.002, spin=math.radians(2.0))
-# Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
-_FEWEST_FINGERS = 3
-# The least impedance ratio and sliding friction of each, CREEPING below them all; measured at 0.6 and 0.3.
-_RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
+CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.002, spin=math.radians(2.0))
+# The least impedance ratio, sliding friction and number of ends of fingers of each, CREEPING below them all; measured at
+# 0.6 and 0.3. Between two ends an object turns about the line that joins them.
+_RULES = ((FIRM, 10.0, 0.6, 3), (SLIPPERY, 10.0, 0.3, 2))
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,8 @@ def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
     """The rule of a protocol, by its friction, and of a hand; None where trials run to their end."""
     if protocol.full_length:
         return None
-    if fingers < _FEWEST_FINGERS:
-        return CREEPING
-    fits = (r for r, ratio, friction in _RULES if protocol.impratio >= ratio and protocol.friction[0] >= friction)
+    ratio, friction = protocol.impratio, protocol.friction[0]
+    fits = (rule for rule, *least in _RULES if ratio >= least[0] and friction >= least[1] and fingers >= least[2])
     return next(fits, CREEPING)
 
 
@@ -84,15 +83,23 @@ def answer_known(
     Args:
         rule: of the hold.
         protocol: has the limits.
-        states: of the last `rule.window` steps, from its first to its last look.
+        states: of the last looks, oldest first; windows that reach back further are left out.
         moved: travel [m] and turn [rad] so far.
         left: steps that are left.
     """
-    if not all(state.speed < rule.speed and state.spin < rule.spin for state in states):
-        return False
-    drift, turned = drifted(states[0], states[-1])
-    share = rule.safety * left / rule.window
-    return moved[0] + share * drift < protocol.max_displacement and moved[1] + share * turned < protocol.max_rotation
+    spans = ((window, states[-(window // LOOK_EVERY + 1) :]) for window in rule.windows)
+    return any(
+        all(state.speed < rule.speed and state.spin < rule.spin for state in span)
+        and _stays(protocol, moved, drifted(span[0], span[-1]), rule.safety * left / window)
+        for window, span in spans
+        if len(span) > window // LOOK_EVERY
+    )
+
+
+def _stays(protocol: Protocol, moved: tuple[float, float], drift: tuple[float, float], times: float) -> bool:
+    """Whether the object is within the limits when it has drifted on so many times."""
+    travel, turn = (so_far + times * more for so_far, more in zip(moved, drift, strict=True))
+    return travel < protocol.max_displacement and turn < protocol.max_rotation
 
 
 def drifted(before: ObjectState, now: ObjectState) -> tuple[float, float]:

@@ -88,8 +88,7 @@ def step_until_known(
     """
 
     rule, done = stop_rule(protocol, world.fingers), 0
-    looks = 1 + rule.window // LOOK_EVERY if rule else 0
-    recent = deque[ObjectState](maxlen=looks)
+    recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)
     while done < steps:
         if done % CHECK_EVERY == 0 and stop():
             return STOPPED
@@ -103,8 +102,7 @@ def step_until_known(
         if rule is None:
             continue
         recent.append(object_state(world, data))
-        ripe = done >= rule.first and len(recent) == looks
-        if ripe and answer_known(rule, protocol, recent, moved(world, recent[-1]), steps - done):
+        if done >= rule.first and answer_known(rule, protocol, [*recent], moved(world, recent[-1]), steps - done):
             return breach(world, data, protocol, worst)
     return ""
 

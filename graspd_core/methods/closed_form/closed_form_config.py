@@ -68,7 +68,7 @@ class ClosedFormConfig:
     rotation_rate: float = 0.03
     joint_rate: float = 0.03
     obstacle_factor: float = 2.0
-    weights: LossWeights = field(default_factory=lambda: LossWeights(distance=4.0))
+    weights: LossWeights = field(default_factory=lambda: LossWeights(distance=4.0, self_collision=20.0))
     polish_weights: LossWeights = field(
         default_factory=lambda: LossWeights(
             wrench_resistance=6.0, distance=300.0, penetration=10.0, self_collision=100.0, obstacle=10.0
