@@ -2,7 +2,7 @@
 
 A trial that stops early goes through the same states as one of full length, so it can verify what that would not, never
 the reverse. What slides slowly may come to an edge and snap away, and what jitters on its contacts may be thrown off
-them much later: hence the large safety, and the demand for rest. Small jitter hides how far an object drifts within a few
+them much later: hence the large safety, and the demand for rest. Jitter hides how far an object drifts within a few
 steps; over more of them it cancels, so that the drift is taken over several spans and any of them may give the answer.
 Numbers are from trajectories of pulls of five hands on eleven shapes; `graspd bench early` measures what they come to.
 """
@@ -44,8 +44,8 @@ FIRM = StopRule(first=20, windows=(10, 20, 40), safety=16.0, speed=0.01, spin=ma
 SLIPPERY = StopRule(first=25, windows=(10, 20, 40), safety=32.0, speed=0.01, spin=math.radians(10.0))
 # Objects begin to slip as late as 1.9 s.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.002, spin=math.radians(2.0))
-# The least impedance ratio, sliding friction and number of ends of fingers of each, CREEPING below them all; measured at
-# 0.6 and 0.3. Between two ends an object turns about the line that joins them.
+# The least impedance ratio, sliding friction and number of ends of fingers of each, CREEPING below them all; measured
+# at 0.6 and 0.3. Between two ends an object turns about the line that joins them.
 _RULES = ((FIRM, 10.0, 0.6, 3), (SLIPPERY, 10.0, 0.3, 2))
 
 
