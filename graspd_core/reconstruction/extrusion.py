@@ -82,20 +82,16 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """Walls beneath the outlines of what was seen high above the support, where something hides what it rests on.
 
-    From straight above, each level goes down to the next, as a bottle's cap to its shoulder, and the lowest to the
-    support.
+    The outline of all goes down to the support, and what is high above the rest, as a bottle's cap, to the rest.
     """
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
-    walls, base = nothing(), nothing()
-    for k in range(int(level[-1]) + 1):
-        bottom = float(height[level == k - 1].max()) if k else 0.0
-        own, rim = _walls(take(surfels, order[level == k]), bottom, free_space, step)
-        walls = join(walls, own)
-        if k == 0:
-            base = _base(rim, free_space, step) if len(rim) > 3 else base
-    return join(walls, base)
+    walls, rim = _walls(surfels, 0.0, free_space, step)
+    for k in range(1, int(level[-1]) + 1):
+        bottom = float(height[level == k - 1].max())
+        walls = join(walls, _walls(take(surfels, order[level == k]), bottom, free_space, step)[0])
+    return join(walls, _base(rim, free_space, step)) if len(rim) > 3 else nothing()
 
 
 def _walls(

@@ -25,7 +25,7 @@ MIN_WALL_CELLS = 2.2
 # Beyond so many cells from the Poisson surface a node's side is its region's.
 BAND_CELLS = 2
 # A floor looks up by this cosine and is this much higher than the lowest points seen, at most [m].
-MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.9, 0.003
+MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
 
