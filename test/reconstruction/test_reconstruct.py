@@ -30,10 +30,10 @@ BALL *= 0.03 / np.linalg.norm(BALL, axis=1, keepdims=True)
 
 
 @functools.cache
-def seen(name: str, count: int = 1) -> tuple[TabletopScene, tuple[PointCloud, ...]]:
+def seen(name: str, count: int = 1, elevation: float = 0.75) -> tuple[TabletopScene, tuple[PointCloud, ...]]:
     """A shape on the table and the object's own pixels of clean views of it, cut off 4 mm above the table."""
     scene = tabletop(name, yaw=0.4)
-    poses = ring_poses((count + 1) // 2, elevation=0.75, distance=0.4, azimuth=0.3)
+    poses = ring_poses((count + 1) // 2, elevation=elevation, distance=0.4, azimuth=0.3)
     # From higher up, into the hollows.
     poses += ring_poses(count // 2, elevation=1.1, distance=0.4, azimuth=2.0) if count > 1 else ()
     views = []
@@ -154,6 +154,19 @@ def test_a_bottle_seen_from_straight_above_has_a_neck(elevation, noise):
     assert distances(stage.truth, found.mesh).mean() < 0.002
     assert distances(found.mesh, stage.truth).mean() < 0.002
     assert found.evidence is not None
+
+
+@pytest.mark.parametrize("name", ["sphere", "capsule"])
+def test_what_is_seen_all_round_is_not_doubted(name):
+    scene, views = seen(name, 8, elevation=0.4)
+    found = reconstruct(views, support=scene.support)
+    assert found.evidence is None
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(("name", "count"), [("sphere", 1), ("capsule", 1), ("hammer", 1), ("mug", 2), ("bowl", 2)])
+def test_what_has_an_unseen_side_is_doubted(name, count):
+    assert made(name, count).evidence is not None
 
 
 def test_more_views_are_nearer_the_truth():
