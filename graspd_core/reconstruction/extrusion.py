@@ -80,13 +80,30 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Walls beneath the outline of what was seen high above the support, where something hides what it rests on."""
+    """Walls beneath the outlines of what was seen high above the support, where something hides what it rests on.
+
+    The outline of all goes down to the support, and what is high above the rest, as a bottle's cap, to the rest.
+    """
+    order = np.argsort(surfels.points[:, 2])
+    height = surfels.points[order, 2]
+    level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
+    walls, rim = _walls(surfels, 0.0, free_space, step)
+    for k in range(1, int(level[-1]) + 1):
+        bottom = float(height[level == k - 1].max())
+        walls = join(walls, _walls(take(surfels, order[level == k]), bottom, free_space, step)[0])
+    return join(walls, _base(rim, free_space, step)) if len(rim) > 3 else nothing()
+
+
+def _walls(
+    surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
+) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
+    """Walls beneath the outline seen from above, down to the height `bottom` [m], and where they stand."""
     from scipy.spatial import ConvexHull, KDTree, QhullError
 
     try:
         hull = ConvexHull(surfels.points[:, :2])
     except QhullError:
-        return nothing()
+        return nothing(), np.zeros((0, 2))
     corners = surfels.points[hull.vertices, :2]
     edges = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(edges, axis=1)
@@ -96,13 +113,12 @@ def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     # Counter-clockwise corners: outwards is to the right.
     outward = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])[edge] / length[edge, None]
     top = surfels.points[KDTree(surfels.points[:, :2]).query(rim)[1], 2]
-    levels = np.arange(0.5 * step, max(float(top.max()), step), step)
+    levels = np.arange(bottom + 0.5 * step, max(float(top.max()), bottom + step), step)
     row, level = np.nonzero(levels[None] < top[:, None] - 0.5 * step)
     points = np.column_stack([rim[row], levels[level]])
     wrong = empty_depth(free_space, points) > free_space.slack
     bad = np.bincount(row, wrong, len(rim)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(rim))
-    walls = take(Surfels(points, outward[row]), ~bad[row])
-    return join(walls, _base(rim[~bad], free_space, step)) if (~bad).sum() > 3 else nothing()
+    return take(Surfels(points, outward[row]), ~bad[row]), rim[~bad]
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:

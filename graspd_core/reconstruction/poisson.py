@@ -24,6 +24,8 @@ GRID_CELLS = 60
 MIN_WALL_CELLS = 2.2
 # Beyond so many cells from the Poisson surface a node's side is its region's.
 BAND_CELLS = 2
+# A floor looks up by this cosine and is this much higher than the lowest points seen, at most [m].
+MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
 
@@ -79,20 +81,31 @@ def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace
     """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
     from scipy.ndimage import gaussian_filter
 
-    low, high = surfels.points.min(0), surfels.points.max(0)
+    known = surfels.points
+    if free_space.standing:
+        known = np.concatenate([known, _beneath_floors(surfels, free_space.lowest)])
+    low, high = known.min(0), known.max(0)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     value = _signed(surface, nodes, cell)
     inner = value < BAND_CELLS * cell
     beyond = (
-        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(surfels.points, nodes[inner], cell))
-        - free_space.slack
+        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell)) - free_space.slack
     )
     value[inner] = np.maximum(value[inner], beyond)
     value = gaussian_filter(value, 0.5)
     if free_space.standing:
         value = np.maximum(value, -nodes[..., 2])
     return march(_one_solid(value, cell), axes)
+
+
+def _beneath_floors(surfels: Surfels, lowest: float) -> Float[np.ndarray, "n 3"]:
+    """Points of the support, at z = 0, beneath level surface that is nearly as low as anything seen: a cup's floor.
+
+    The hull of what was seen ends at that floor, and would cut away all but a sheet thinner than the grid's cells.
+    """
+    floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
+    return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 
 
 def march(value: Float[np.ndarray, "x y z"], axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:

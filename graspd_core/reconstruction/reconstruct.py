@@ -95,9 +95,7 @@ def reconstruct(
         evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings)
     mesh = closed_mesh(seen, guess.surfels, free_space, step, settings)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
-    # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
-    missing = max(guess.openness, _guessed_share(mesh, confidence, standing))
-    if evidence is not None and (guess.method or missing > settings.open_share):
+    if evidence is not None and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings):
         warnings = (_sentence(len(views), guess.method),)
     else:
         evidence = None
@@ -227,15 +225,47 @@ def _confidence(
     return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
 
 
-def _guessed_share(mesh: TriangleMesh, confidence: Float[np.ndarray, "vertices"], standing: bool) -> float:
-    """Share of a surface that was not seen; what stands on the support at z = 0 is known."""
+def _is_guessed(
+    mesh: TriangleMesh,
+    seen: Surfels,
+    guess: Completion,
+    confidence: Float[np.ndarray, "vertices"],
+    views: int,
+    standing: bool,
+    settings: ReconstructionConfig,
+) -> bool:
+    """Whether a good part of a surface was not seen; what stands on the support at z = 0 is known."""
+    if views > 1 and _unseen_share(mesh, seen, standing, settings.seen_distance) <= settings.open_share:
+        # A rule may have filled, and normals may miss, what is next to nothing.
+        return False
+    # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
+    area = _open_area(mesh, standing)[0]
+    guessed = float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
+    return bool(guess.method) or max(guess.openness, guessed) > settings.open_share
+
+
+def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: float) -> float:
+    """Share of a surface that no seen surface is near in place and normal: the back of what is thin is not seen.
+
+    Args:
+        reach: how far is near [m]; a turn of 60° is as far.
+    """
+    from scipy.spatial import KDTree
+
+    area, normals = _open_area(mesh, standing)
+    place = np.hstack([mesh.vertices[mesh.faces].mean(1), reach * normals])
+    far = KDTree(np.hstack([seen.points, reach * seen.normals])).query(place)[0] > reach
+    return float((area * far).sum() / max(area.sum(), 1e-12))
+
+
+def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:
+    """Area [m²] and normal of each face, the area none where the face stands on the support at z = 0."""
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     across = np.cross(b - a, c - a)
-    area = np.linalg.norm(across, axis=1)
-    if standing:
-        foot = (across[:, 2] < -_DOWN * area) & (np.maximum(np.maximum(a, b), c)[:, 2] < MAX_FOOT_HEIGHT_M)
-        area = np.where(foot, 0.0, area)
-    return float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
+    length = np.linalg.norm(across, axis=1)
+    foot = (across[:, 2] < -_DOWN * length) & (np.maximum(np.maximum(a, b), c)[:, 2] < MAX_FOOT_HEIGHT_M)
+    normals = across / np.maximum(length, 1e-30)[:, None]
+    return 0.5 * np.where(foot & standing, 0.0, length), normals
 
 
 def _sentence(views: int, method: str) -> str:

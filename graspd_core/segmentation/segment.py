@@ -61,7 +61,7 @@ def segment(
     scene = voxel_downsample(views, settings)
     check_target(target, views)
     eyes, ground, label = _parted(scene, views, settings)
-    free = _candidates(scene, label, ground, settings)
+    free = _candidates(scene, eyes, label, ground, settings)
     marked = target.box is not None or target.mask is not None
     if not free and not (marked and label.max(initial=-1) >= 0):
         raise NoObjectError(_nothing(scene, label, ground, settings))
@@ -90,9 +90,9 @@ def find_things(
     """
     settings = settings or SegmentationConfig()
     scene = voxel_downsample(views, settings)
-    _, ground, label = _parted(scene, views, settings)
+    eyes, ground, label = _parted(scene, views, settings)
     of_points = label[scene.voxel]
-    return tuple(scene.points[of_points == k] for k in _candidates(scene, label, ground, settings))
+    return tuple(scene.points[of_points == k] for k in _candidates(scene, eyes, label, ground, settings))
 
 
 def _parted(
@@ -139,7 +139,11 @@ def _tiny(scene: VoxelScene, rows: Int[np.ndarray, "rows"], ground: Ground, sett
 
 
 def _candidates(
-    scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentationConfig
+    scene: VoxelScene,
+    eyes: Float[np.ndarray, "views 3"],
+    label: Int[np.ndarray, "voxels"],
+    ground: Ground,
+    settings: SegmentationConfig,
 ) -> list[int]:
     """Things of a size to be grasped: those that stand on the support, else all."""
     things = range(int(label.max(initial=-1)) + 1)
@@ -147,7 +151,7 @@ def _candidates(
     if ground.support is None:
         return fits
     part, distance = ground.support, scene.mean_distance
-    standing = [k for k in fits if stands_on(part, scene.mean[label == k], distance[label == k], settings)]
+    standing = [k for k in fits if stands_on(part, scene.mean[label == k], distance[label == k], eyes, settings)]
     return standing or fits
 
 

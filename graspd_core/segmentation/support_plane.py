@@ -20,6 +20,8 @@ from graspd_core.segmentation.planes import FlatPart
 
 # Share of its width by which the lowest seen point of a thing may be above its support.
 HIDDEN_HEIGHT_SHARE = 0.5
+# Lines of sight this near to upright [cosine, 15°] show no sides, however high: what they end on rests on something.
+MIN_UPRIGHT_COSINE = 0.966
 # Less of a plane's hull seen than this share, it is a slice through several things.
 MIN_SEEN_SHARE = 0.3
 # Points down to so many tolerances below a part, as many as this share of its own, are a body's other faces.
@@ -67,7 +69,7 @@ def find_ground(
         if (viewpoints @ part.plane.normal <= part.plane.offset).any():
             continue
         others = covered([x for x in large if x is not part])
-        standing = _standing(scene, part, _left(scene, part, others), settings)
+        standing = _standing(scene, part, _left(scene, part, others), viewpoints, settings)
         if standing > most:
             best, most = part, standing
     background = tuple(part for part in large if part is not best)
@@ -118,7 +120,11 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 
 
 def _standing(
-    scene: VoxelScene, part: FlatPart, left: Bool[np.ndarray, "voxels"], settings: SegmentationConfig
+    scene: VoxelScene,
+    part: FlatPart,
+    left: Bool[np.ndarray, "voxels"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    settings: SegmentationConfig,
 ) -> tuple[int, int]:
     """How many voxels belong to things that touch that part, and to things that may stand on it."""
     points, distance = scene.mean[left], scene.mean_distance[left]
@@ -126,14 +132,18 @@ def _standing(
     touching, standing = 0, 0
     for k in range(min(int(label.max(initial=-1)) + 1, MAX_CLUSTERS)):
         rows = np.flatnonzero(label == k)
-        if stands_on(part, points[rows], distance[rows], settings):
+        if stands_on(part, points[rows], distance[rows], viewpoints, settings):
             standing += len(rows)
             touching += len(rows) if _clearance(part, points[rows], distance[rows]) <= settings.contact else 0
     return touching, standing
 
 
 def stands_on(
-    part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"], settings: SegmentationConfig
+    part: FlatPart,
+    thing: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    settings: SegmentationConfig,
 ) -> bool:
     """Whether a cluster of voxels is a thing on that support."""
     if not settings.smallest_object <= extent(thing) <= settings.largest_object:
@@ -141,10 +151,17 @@ def stands_on(
     flat = thing @ part.axes
     # From above, a round body hides as much of its height as half its width.
     hidden = HIDDEN_HEIGHT_SHARE * float(np.ptp(flat, axis=0).max())
-    if _clearance(part, thing, distance) > max(settings.contact, hidden):
+    hidden = settings.largest_object if _upright(part, thing, viewpoints) else max(settings.contact, hidden)
+    if _clearance(part, thing, distance) > hidden:
         return False
     over = part.beneath(thing, settings.gap).mean() >= 0.5
     return bool(over) and part.area >= settings.support_area_ratio * _outline_area(flat)
+
+
+def _upright(part: FlatPart, thing: Float[np.ndarray, "n 3"], viewpoints: Float[np.ndarray, "views 3"]) -> bool:
+    """Whether all cameras look straight down on a thing."""
+    sight = viewpoints - thing.mean(0)
+    return bool((sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all())
 
 
 def _clearance(part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"]) -> float:

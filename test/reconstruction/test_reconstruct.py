@@ -18,6 +18,8 @@ from graspd_core.pointcloud.depth_image import cloud_from_depth
 from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.reconstruction.reconstruct import Reconstruction, reconstruct
+from graspd_core.rendering.depth_noise import DEFAULT, NONE, DepthNoise
+from graspd_core.rendering.tabletop import CAMERA as D415
 from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
 from graspd_core.types import Plane, TriangleMesh
 
@@ -28,10 +30,10 @@ BALL *= 0.03 / np.linalg.norm(BALL, axis=1, keepdims=True)
 
 
 @functools.cache
-def seen(name: str, count: int = 1) -> tuple[TabletopScene, tuple[PointCloud, ...]]:
+def seen(name: str, count: int = 1, elevation: float = 0.75) -> tuple[TabletopScene, tuple[PointCloud, ...]]:
     """A shape on the table and the object's own pixels of clean views of it, cut off 4 mm above the table."""
     scene = tabletop(name, yaw=0.4)
-    poses = ring_poses((count + 1) // 2, elevation=0.75, distance=0.4, azimuth=0.3)
+    poses = ring_poses((count + 1) // 2, elevation=elevation, distance=0.4, azimuth=0.3)
     # From higher up, into the hollows.
     poses += ring_poses(count // 2, elevation=1.1, distance=0.4, azimuth=2.0) if count > 1 else ()
     views = []
@@ -120,18 +122,51 @@ def test_many_views_keep_a_mug_hollow():
     assert distances(whole.mesh, scene.truth).mean() < 0.0015
 
 
+def from_above(name: str, elevation: float, noise: DepthNoise = NONE) -> tuple[TabletopScene, Reconstruction]:
+    """A shape on the table and what one view of it at that elevation [deg] makes, cut off 4 mm above the table."""
+    stage = tabletop(name, yaw=0.3)
+    poses = ring_poses(1, elevation=np.deg2rad(elevation), azimuth=0.35)
+    ((depth, label),) = depth_views(stage, D415, poses, noise)
+    cloud = cloud_from_depth(np.where(label == 0, depth, 0.0), D415, poses[0])
+    own = PointCloud(cloud.points[cloud.points[:, 2] > 0.004], cloud.viewpoint, cloud.forward)
+    return stage, reconstruct([own], support=stage.support)
+
+
 @pytest.mark.parametrize("name", ["bottle", "cylinder", "mug"])
 @pytest.mark.parametrize("elevation", [70.0, 80.0])
 def test_sides_that_a_view_from_above_does_not_show_are_doubted(name, elevation):
-    stage = tabletop(name, yaw=0.3)
-    poses = ring_poses(1, elevation=np.deg2rad(elevation), azimuth=0.4)
-    ((depth, label),) = depth_views(stage, CAMERA, poses)
-    cloud = cloud_from_depth(np.where(label == 0, depth, 0.0), CAMERA, poses[0])
-    found = reconstruct(
-        [PointCloud(cloud.points[cloud.points[:, 2] > 0.004], cloud.viewpoint, cloud.forward)], support=stage.support
-    )
+    found = from_above(name, elevation)[1]
     assert found.evidence is not None
     assert "one side only; the rest is guessed" in found.warnings[0]
+
+
+@pytest.mark.parametrize("elevation", [80.0, 85.0, 88.0])
+def test_the_floor_of_a_mug_seen_from_above_stays_whole(elevation):
+    stage, found = from_above("mug", elevation, DEFAULT)
+    assert distances(stage.truth, found.mesh).mean() < 0.003
+    assert found.evidence is not None
+
+
+@pytest.mark.parametrize("elevation", [85.0, 88.0])
+@pytest.mark.parametrize("noise", [NONE, DEFAULT])
+def test_a_bottle_seen_from_straight_above_has_a_neck(elevation, noise):
+    stage, found = from_above("bottle", elevation, noise)
+    assert distances(stage.truth, found.mesh).mean() < 0.002
+    assert distances(found.mesh, stage.truth).mean() < 0.002
+    assert found.evidence is not None
+
+
+@pytest.mark.parametrize("name", ["sphere", "capsule"])
+def test_what_is_seen_all_round_is_not_doubted(name):
+    scene, views = seen(name, 8, elevation=0.4)
+    found = reconstruct(views, support=scene.support)
+    assert found.evidence is None
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(("name", "count"), [("sphere", 1), ("capsule", 1), ("hammer", 1), ("mug", 2), ("bowl", 2)])
+def test_what_has_an_unseen_side_is_doubted(name, count):
+    assert made(name, count).evidence is not None
 
 
 def test_more_views_are_nearer_the_truth():

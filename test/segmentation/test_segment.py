@@ -156,6 +156,17 @@ def test_walls_and_floors_are_not_what_it_stands_on():
         assert share_near(found.views[0].points, scene.truth, 0.009) > 0.99
 
 
+@pytest.mark.parametrize("shape", ["cylinder", "bottle"])
+@pytest.mark.parametrize("noise", ["none", "default"])
+def test_what_is_seen_from_straight_above_stands_on_the_table(shape, noise):
+    stage = tabletop(shape)
+    views = views_of(stage, CAMERA, ring_poses(1, elevation=np.deg2rad(88.0)), LEVELS[noise])
+    found = segment(views)
+    assert found.support is not None
+    assert found.support.offset == pytest.approx(0, abs=0.002)
+    assert found.obstacles == ()
+
+
 def test_before_a_wall_without_a_table_nothing_supports_it():
     mug = tabletop("mug").truth
     view, label = seen([mug, block((-0.35, -0.6, -0.2), (-0.33, 0.6, 0.6))])

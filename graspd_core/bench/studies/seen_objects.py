@@ -41,17 +41,18 @@ from graspd_core.types import Grasp, GraspResult, Verdict
 SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
 # Cameras; 0 plans on the true mesh.
 VIEWS = (0, 1, 3, 15)
-# Elevation of the camera at each start: a robot looks at its table from half above [deg].
-ELEVATIONS = (40.0, 50.0, 30.0)
+# Elevation of the camera at each start: a robot looks at its table from half above; from a wrist, from above [deg].
+ELEVATIONS, ABOVE = (40.0, 50.0, 30.0), (75.0, 88.0, 60.0)
 YAW = 0.3
 # Room between the object and each thing beside it [m].
 CLEAR = 0.04
 # Where a sphere of 5 mm about a true point meets the reconstruction, that point counts as found.
 FOUND, SAMPLES = 0.005, 20_000
-# By number of views, and whether other things stand beside.
+# By number of views, and how they see the object: from half above, with other things beside, from above.
+PLAIN, CROWDED, FROM_ABOVE = "plain", "crowded", "from above"
 NAMES = {
-    (1, False): "1 view", (1, True): "1 view, crowded", (3, False): "3 views", (15, False): "15 views",
-    (0, False): "full mesh",
+    (1, PLAIN): "1 view", (1, CROWDED): "1 view, crowded", (1, FROM_ABOVE): "1 view, from above", (3, PLAIN): "3 views",
+    (15, PLAIN): "15 views", (0, PLAIN): "full mesh",
 }  # fmt: skip
 _HEADINGS = [
     "planned on", "first grasp holds on the truth", "of the full mesh's figure", "verified grasps that hold",
@@ -66,15 +67,15 @@ class Seen(ObjectCase):
     of the first camera. Where it is crowded, two other things stand beside and hide a part."""
 
     views: int = 1
-    crowded: bool = False
+    sight: str = PLAIN
 
 
 def seen_cases(request: Request) -> tuple[Seen, ...]:
     """Every object from every number of views, by default from two places."""
     request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
-    seen = [(views, False) for views in VIEWS[: 2 if request.quick else None]] + [(1, True)]
-    return tuple(Seen(**vars(case), views=views, crowded=crowded) for case in cases for views, crowded in seen)
+    seen = [(views, PLAIN) for views in VIEWS[: 2 if request.quick else None]] + [(1, CROWDED), (1, FROM_ABOVE)]
+    return tuple(Seen(**vars(case), views=views, sight=sight) for case in cases for views, sight in seen)
 
 
 def seen_seconds(case: Seen) -> float:
@@ -93,7 +94,7 @@ def run_seen(case: Seen) -> Record:
     began = time.perf_counter()
     try:
         middle = Target(point=0.5 * (stage.truth.vertices.min(0) + stage.truth.vertices.max(0)))
-        target = middle if case.crowded else None
+        target = middle if case.sight == CROWDED else None
         scene = scene_from_views(clouds, target=target) if case.views else _true_scene(stage, case.object)
     except GraspdError as error:
         return {"refused": str(error), "scene_s": time.perf_counter() - began, "verified": 0, "held": 0}
@@ -105,7 +106,7 @@ def _stage(case: Seen) -> TabletopScene:
     """The object on its table, and what stands `CLEAR` beside it, one of them towards the camera."""
     thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)
     alone = tabletop(thing, yaw=YAW)
-    if not case.crowded:
+    if case.sight != CROWDED:
         return alone
     low, high = alone.truth.vertices.min(0), alone.truth.vertices.max(0)
     beside = (("box", float(high[0]) + CLEAR + 0.03, 0.02), ("cylinder", -0.03, float(low[1]) - CLEAR - 0.033))
@@ -115,7 +116,8 @@ def _stage(case: Seen) -> TabletopScene:
 def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
     """One camera, three around, or two rings of eight and seven."""
     azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
-    elevation = np.deg2rad(ELEVATIONS[case.seed % len(ELEVATIONS)])
+    places = ABOVE if case.sight == FROM_ABOVE else ELEVATIONS
+    elevation = np.deg2rad(places[case.seed % len(places)])
     if case.views <= 3:
         return ring_poses(case.views, elevation=elevation, azimuth=azimuth)
     upper = ring_poses(case.views // 2, elevation=np.deg2rad(60.0), azimuth=azimuth + 0.2)
@@ -187,8 +189,8 @@ def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
 
 def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Both tables."""
-    rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["crowded"]) == row])}
-    full = _share(rows[0, False], "first_held") if (0, False) in rows else 0.0
+    rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["sight"]) == row])}
+    full = _share(rows[0, PLAIN], "first_held") if (0, PLAIN) in rows else 0.0
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
     shown = [views for views in NAMES if views in rows]
     objects = [
