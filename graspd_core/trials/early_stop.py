@@ -44,9 +44,10 @@ FIRM = StopRule(first=20, windows=(10, 20, 40), safety=16.0, speed=0.01, spin=ma
 SLIPPERY = StopRule(first=25, windows=(10, 20, 40), safety=32.0, speed=0.01, spin=math.radians(10.0))
 # Objects begin to slip as late as 1.9 s.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.002, spin=math.radians(2.0))
-# The least impedance ratio, sliding friction and number of ends of fingers of each, CREEPING below them all; measured
-# at 0.6 and 0.3. Between two ends an object turns about the line that joins them.
-_RULES = ((FIRM, 10.0, 0.6, 3), (SLIPPERY, 10.0, 0.3, 2))
+# Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
+_FEWEST_FINGERS = 3
+# The least impedance ratio and sliding friction of each, CREEPING below them all; measured at 0.6 and 0.3.
+_RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,9 @@ def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
     """The rule of a protocol, by its friction, and of a hand; None where trials run to their end."""
     if protocol.full_length:
         return None
-    ratio, friction = protocol.impratio, protocol.friction[0]
-    fits = (rule for rule, *least in _RULES if ratio >= least[0] and friction >= least[1] and fingers >= least[2])
+    if fingers < _FEWEST_FINGERS:
+        return CREEPING
+    fits = (r for r, ratio, friction in _RULES if protocol.impratio >= ratio and protocol.friction[0] >= friction)
     return next(fits, CREEPING)
 
 
