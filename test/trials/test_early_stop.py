@@ -126,9 +126,10 @@ def test_what_is_not_finite_is_never_known(bad):
         replace(REST, speed=bad),
         replace(REST, spin=bad),
     ):
-        assert not answer_known(FIRM, STANDARD, [REST, lost], (0.0, 0.0), 100)
-    assert not answer_known(FIRM, STANDARD, [REST, REST], (bad, 0.0), 100)
-    assert not answer_known(FIRM, STANDARD, [REST, REST], (0.0, bad), 100)
+        assert not answer_known(FIRM, STANDARD, [REST, REST, lost], (0.0, 0.0), 100)
+    assert not answer_known(FIRM, STANDARD, [REST, REST, REST], (bad, 0.0), 100)
+    assert not answer_known(FIRM, STANDARD, [REST, REST, REST], (0.0, bad), 100)
+    assert answer_known(FIRM, STANDARD, [REST, REST, REST], (0.0, 0.0), 100)
 
 
 @pytest.mark.parametrize("protocol", [STANDARD, at_friction(STANDARD, 0.3), HARD], ids=["standard", "slippery", "hard"])
