@@ -175,7 +175,7 @@ class Grasp:
         score: the optimiser's own measure, larger is better; ranks grasps before any trial.
         metrics: static quality, None until measured.
         trials: in the order that they were run; the first failure ends them.
-        probability: of holding on the true object, where a part of its shape was guessed (docs/clouds.md); else None.
+        probability: of holding on the true object, where cameras saw it (docs/clouds.md); else None.
         arm: how the arm gets there, where one was given (docs/arms.md); else None.
     """
 

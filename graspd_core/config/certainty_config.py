@@ -1,4 +1,4 @@
-"""Settings of how sure a verified grasp must be where a part of the object's shape was guessed."""
+"""Settings of how sure a verified grasp must be of an object that cameras saw."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ HELD_AFTER = (0.98, 0.93, 0.93, 0.87, 0.51)
 
 @dataclass(frozen=True)
 class CertaintyConfig:
-    """What a grasp of an object whose hidden side was guessed must survive to be called verified.
+    """What a grasp of an object that cameras saw must survive to be called verified.
 
     Attributes:
         probability: of holding on the true object, at least; 0 asks for trials of the likeliest shape alone, more for

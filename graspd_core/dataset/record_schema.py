@@ -51,7 +51,7 @@ _BEFORE = (
     Column("verdict", "string", "verified, failed, or unverified"),
     Column("reason", "string", "why the first failed trial failed; empty without one"),
     Column("score", "double", "the optimiser's own measure before any trial; larger is better"),
-    Column("probability", "double", "of holding where a part of the shape was guessed; else null"),
+    Column("probability", "double", "of holding, where cameras saw the object; else null"),
     *_posture("pregrasp", "open and clear of the object"),
     *_posture("grasp", "the fingers just touch"),
     *_posture("squeeze", "targets that press"),

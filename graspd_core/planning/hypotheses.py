@@ -1,4 +1,4 @@
-"""What else may be true of an object whose hidden side was guessed: less friction, another place, another shape.
+"""What else may be true of an object that cameras saw: less friction, another place, another shape of a hidden side.
 
 A grasp that holds on the likeliest scene is tried on these too, cheapest first. How often grasps that held under so
 many hold on the true object was measured (docs/clouds.md).
@@ -105,7 +105,7 @@ def other_worlds(run: Run, scene: Scene, hand: HandModel, protocol: Protocol, pr
     from graspd_core.reconstruction.other_shapes import other_rules
 
     rules = other_rules(scene.evidence)
-    return OtherWorlds(run, scene, hand, protocol, rules, 1 + len(rules) - allowed)
+    return OtherWorlds(run, scene, hand, protocol, rules, max(1 + len(rules) - allowed, 0))
 
 
 def hypotheses_of(others: OtherWorlds, trials: TrialContext, probability: float) -> Hypotheses:

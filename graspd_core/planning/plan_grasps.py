@@ -124,10 +124,12 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.grasps)
     if scene.evidence is None or not held:
         return result
-    from graspd_core.reconstruction.next_view import next_view
+    told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None
+    if scene.evidence.hidden:
+        from graspd_core.reconstruction.next_view import next_view
 
-    view = next_view(scene.evidence, scene.object.mesh, far)
-    told = f"{held} grasps hold on the likeliest shape, none is sure enough, since a part of the object was guessed"
+        told += ", since a part of the object was guessed"
+        view = next_view(scene.evidence, scene.object.mesh, far)
     if view is not None:
         told += "; one more view, from next_view, would show most of it"
     return replace(result, message="; ".join(filter(None, (told, result.message))), next_view=view)

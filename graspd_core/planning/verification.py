@@ -57,7 +57,7 @@ class TrialsAhead:
     Attributes:
         protocol: of the trials.
         parts: the object's convex parts.
-        others: the worlds of what else may be true of it; None where nothing was guessed.
+        others: the worlds of what else may be true of it; None for a mesh, or where none is needed.
     """
 
     protocol: Protocol

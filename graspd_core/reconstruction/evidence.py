@@ -14,13 +14,14 @@ from graspd_core.reconstruction.merge_views import Surfels
 
 @dataclass(frozen=True)
 class Evidence:
-    """What was seen of an object of which a good part was hidden: other guesses of that part are made of it.
+    """What was seen of an object: other guesses of what was hidden are made of it.
 
     Attributes:
         seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
         rotation, origin: of that frame in the views' [m].
         chosen: the rule that the reconstruction took; empty where none applied.
         settings: of the reconstruction.
+        hidden: whether a good part of the surface was.
     """
 
     seen: Surfels
@@ -30,3 +31,4 @@ class Evidence:
     origin: Float[np.ndarray, "3"]
     chosen: str
     settings: ReconstructionConfig
+    hidden: bool

@@ -22,9 +22,9 @@ _SAME_M = 5e-4
 _SAMPLES = 1500
 
 
-def other_rules(evidence: Evidence | None) -> tuple[str, ...]:
+def other_rules(evidence: Evidence) -> tuple[str, ...]:
     """The rules that the reconstruction did not take, in the order of `RULES`; none where nothing was hidden."""
-    return () if evidence is None else tuple(rule for rule in RULES if rule != evidence.chosen)
+    return tuple(rule for rule in RULES if rule != evidence.chosen) if evidence.hidden else ()
 
 
 def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMesh | None:

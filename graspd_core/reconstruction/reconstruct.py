@@ -43,14 +43,14 @@ class Reconstruction:
         confidence: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
         method: "poisson", and what completed it, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
-        evidence: what else the hidden side may be; None where next to nothing was hidden.
+        evidence: what else the hidden side may be.
     """
 
     mesh: TriangleMesh
     confidence: Float[np.ndarray, "vertices"]
     method: str
     warnings: tuple[str, ...]
-    evidence: Evidence | None
+    evidence: Evidence
 
 
 def reconstruct(
@@ -80,8 +80,8 @@ def reconstruct(
     around = [_in_frame(by_eye[tuple(view.viewpoint)], rotation, origin) for view in views] if whole else ()
     step = point_step(local)
     standing = support is not None
-    method, warnings, evidence = "poisson", (), None
-    if len(local) == 1 and is_unposed(local[0], axis_known):
+    unposed = len(local) == 1 and is_unposed(local[0], axis_known)
+    if unposed:
         seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing, 0.0, settings.outline_slack)
         guess = Completion("", nothing(), 0.0)
     else:
@@ -91,14 +91,12 @@ def reconstruct(
             make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
-        method += f", {guess.method}" if guess.method else ""
-        evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings)
     mesh = closed_mesh(seen, guess.surfels, free_space, step, settings)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
-    if evidence is not None and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings):
-        warnings = (_sentence(len(views), guess.method),)
-    else:
-        evidence = None
+    hidden = not unposed and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings)
+    warnings = (_sentence(len(views), guess.method),) if hidden else ()
+    method = f"poisson, {guess.method}" if guess.method else "poisson"
+    evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden)
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
     return Reconstruction(mesh, confidence, method, warnings, evidence)
 

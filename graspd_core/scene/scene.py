@@ -85,7 +85,7 @@ class Scene:
         support: what the object stands on, if anything; gravity points against its normal.
         obstacles: other things, only those that the hand could reach.
         confidence: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it known.
-        evidence: of what else the object's hidden side may be; None: next to nothing was hidden.
+        evidence: of what else may be true of an object that cameras saw; None: of a mesh.
     """
 
     object: ObjectModel

@@ -25,7 +25,7 @@ _COLUMNS, _AROUND = ("epsilon", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _OTHER_FIGURES = {
     "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",
-    "probability": "of holding on the true object, where a part of its shape was guessed",
+    "probability": "of holding on the true object, where cameras saw it",
     "displacement": "farthest that the object's centre of mass moved in the trial, until the answer was known",
     "rotation": "farthest that the object turned in the trial",
 }

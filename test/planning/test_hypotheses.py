@@ -1,4 +1,4 @@
-"""Grasps of an object of which one side was seen: what else may be true, how many survive it, what is said of it."""
+"""Grasps of an object that cameras saw: what else may be true, how many survive it, what is said of it."""
 
 from __future__ import annotations
 
@@ -31,6 +31,12 @@ def seen_from(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
     """A cylinder on a table, seen by one camera, in coordinates moved by `shift` [m]."""
     views = views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8))
     return scene_from_views([PointCloud(view.points + shift, view.viewpoint + np.array(shift)) for view in views])
+
+
+@cache
+def seen_all_round() -> Scene:
+    """The same cylinder, seen by eight cameras."""
+    return scene_from_views(views_of(tabletop("cylinder"), CAMERA, ring_poses(8, elevation=0.8)))
 
 
 def plan(scene: Scene, probability: float, rounds: int = 3) -> GraspResult:
@@ -107,17 +113,27 @@ def test_a_mesh_is_not_doubted():
     assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.grasps)
 
 
-def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from(monkeypatch):
+def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
+    monkeypatch.delattr("graspd_core.planning.hypotheses._other_world")
+    verified = [grasp for grasp in plan(seen_all_round(), 0.98).grasps if grasp.verdict is Verdict.VERIFIED]
+    assert verified
+    for grasp in verified:
+        assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
+        assert grasp.probability == 0.98
+
+
+@pytest.mark.parametrize(("seen", "hidden"), [(seen_from, True), (seen_all_round, False)])
+def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from(seen, hidden, monkeypatch):
     monkeypatch.setattr("graspd_core.planning.hypotheses._LESS_FRICTION", 0.01)
     monkeypatch.setattr(
         "graspd_core.planning.hypotheses.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
     )
-    result = plan(seen_from(), 0.98, rounds=1)
+    result = plan(seen(), 0.98, rounds=1)
     assert result.grasps
     assert not any(grasp.usable for grasp in result.grasps)
     assert result.grasps[0].verdict is Verdict.UNVERIFIED
     assert "none is sure enough" in result.message
-    assert result.next_view is not None
+    assert ("was guessed" in result.message) == (result.next_view is not None) == hidden
 
 
 def test_far_from_the_origin_the_other_shapes_are_where_the_object_is():
