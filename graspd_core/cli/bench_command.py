@@ -37,7 +37,7 @@ def add_command(commands: Any) -> None:
         metavar="CASE",
         help="of stress: names, families; maps: names; piles: sizes",
     )
-    parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: 0")
+    parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: by study")
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument("--trials", default="", metavar="A,B", help="of raw grasps (docs/bench.md lists them)")

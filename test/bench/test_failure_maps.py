@@ -14,7 +14,17 @@ import pytest
 from graspd_core.bench.charts.failure_map_chart import Shares, draw_map, map_sections, reasons, shares
 from graspd_core.bench.failure_maps import map_runs
 from graspd_core.bench.failure_maps.map_case import MapCase, hand_for, kind_of, run_on
-from graspd_core.bench.failure_maps.map_registry import COUNT, MAPS, METHODS, MapAxis, cases_of, run_map
+from graspd_core.bench.failure_maps.map_registry import (
+    COUNT,
+    MAPS,
+    METHODS,
+    SEEDS,
+    MapAxis,
+    cases_of,
+    map_cases,
+    run_map,
+)
+from graspd_core.bench.study import Request
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import BOX_HALF, make_shape
 from graspd_core.rendering.depth_noise import DEFAULT, NONE
@@ -44,6 +54,14 @@ def test_jobs_cover_every_cell_once(name: str, method: str):
             asked[case.across, up] += case.count
     assert asked == dict.fromkeys(product(drawn.across.places, drawn.up.places), COUNT)
     assert len(asked) <= 36
+
+
+def test_every_seed_has_every_case():
+    asked = map_cases(Request(cases=("wall",)))
+    once = [case for method in METHODS for case in cases_of("wall", method)]
+    assert Counter(asked) == Counter(replace(case, seed=seed) for case in once for seed in SEEDS)
+    assert len({case.label for case in asked}) == len(asked)
+    assert {case.seed for case in map_cases(Request(cases=("wall",), seeds=(5,)))} == {5}
 
 
 def test_a_real_case_leaves_a_record():
@@ -86,7 +104,7 @@ def test_shares_and_reasons_are_of_all_objects_together():
 
 
 def test_the_report_names_every_failure_and_draws_what_there_is(tmp_path: Path):
-    sections = map_sections(records_of("wall", "closed_form", 7), tmp_path / "bench")
+    sections = map_sections(records_of("wall", "closed_form", COUNT - 1), tmp_path / "bench")
     assert list(sections) == ["map-wall", "map-failures"]
     assert (tmp_path / "map_wall.png").is_file()
     (table,) = sections["map-failures"]
@@ -98,7 +116,7 @@ def test_the_report_names_every_failure_and_draws_what_there_is(tmp_path: Path):
 def test_pictures_show_what_is_recorded_and_are_the_same_every_time(tmp_path: Path):
     from matplotlib.image import imread
 
-    panels = {m: shares(records_of("wall", m, held)) for m, held in (("closed_form", 8), ("graspd2022", 0))}
+    panels = {m: shares(records_of("wall", m, held)) for m, held in (("closed_form", COUNT), ("graspd2022", 0))}
     draw_map(MAPS["wall"], panels, tmp_path / "one")
     draw_map(MAPS["wall"], panels, tmp_path / "two")
     for ending in ("png", "svg"):

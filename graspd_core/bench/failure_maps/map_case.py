@@ -52,7 +52,8 @@ class MapCase(Case):
 
     @property
     def label(self) -> str:
-        return " ".join(str(word) for word in (self.map, self.preset, self.thing, self.across, *self.up[:1]))
+        place = (self.thing, self.across, *self.up[:1])
+        return " ".join(str(word) for word in (self.map, self.preset, *place, f"seed {self.seed}"))
 
 
 @dataclass(frozen=True)
