@@ -144,7 +144,7 @@ STUDIES: dict[str, Study] = {
         steered.steered_sections,
         ("studies/steered.py", "object_case.py"),
         _PLANS,
-        lambda case: 3.0,
+        lambda case: 1.2,
     ),
     "reach": Study(
         "inverse kinematics of the arms, and requests with and without an arm",
@@ -153,7 +153,7 @@ STUDIES: dict[str, Study] = {
         arm_reach.reach_sections,
         ("studies/arm_reach.py", "object_case.py"),
         _PLANS,
-        lambda case: 10.0,
+        lambda case: 3.0,
         came=arm_reach.came,
     ),
     "imported": Study(

@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from graspd_core.types import TriangleMesh
+
 PrimitiveKind = Literal["box", "sphere", "capsule", "cylinder", "hull"]
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
@@ -112,6 +114,7 @@ class HandModel:
         warnings: what had to be guessed while loading.
         mimics: the coupled joints, in the order of their links.
         mount: where the base link sits on an arm, None where nobody said.
+        skins: links, and the surfaces that their contact candidates lie on where it is not that of their solids [m].
     """
 
     name: str
@@ -145,6 +148,7 @@ class HandModel:
     warnings: tuple[str, ...] = ()
     mimics: tuple[Mimic, ...] = ()
     mount: Mount | None = None
+    skins: tuple[tuple[int, TriangleMesh], ...] = ()
 
     @property
     def base_link(self) -> str:

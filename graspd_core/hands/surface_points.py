@@ -19,6 +19,7 @@ from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.link_distance import primitive_sdf, within_bounds
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
+from graspd_core.mesh.surface_queries import closest_points, make_surface
 from graspd_core.runtime import disk_cache as cache
 
 # What no sample depends on.
@@ -81,7 +82,8 @@ def candidates(
 
     Corners of boxes that face the grasp are always in, since they are what sinks in unnoticed; then farthest-point
     sampling (Gonzalez 1985) within each rigid group of links, denser on fingertips and sparser on backs (`_weights`).
-    The order is that of the sampling: the first n of many cover the hand evenly too.
+    The order is that of the sampling: the first n of many cover the hand evenly too. They lie on a link's skin where it
+    has one.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
@@ -97,8 +99,18 @@ def candidates(
     picked = _farthest(placed, groups, weights, corners, count)
     # Sampled once more among themselves, so that the first few of them are not the corners alone.
     picked = picked[_farthest(placed[picked], groups[picked], weights[picked], np.zeros(0, int), count)]
-    chosen = pool.take(picked)
-    return chosen.points, chosen.normals, chosen.links
+    return _on_skin(hand, pool.take(picked))
+
+
+def _on_skin(
+    hand: HandModel, pool: _Pool
+) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"], Int[np.ndarray, "count"]]:
+    """Points, normals and links of a pool, drawn to the nearest skin of their link where it has one."""
+    points, normals = pool.points.copy(), pool.normals.copy()
+    for link, skin in hand.skins:
+        own = pool.links == link
+        points[own], normals[own] = closest_points(make_surface(skin), points[own])
+    return points, normals, pool.links
 
 
 def dense_samples(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from graspd_core.bench.report import sourced, written
 from graspd_core.bench.result_store import case_file, case_key, code_version
 from graspd_core.bench.run_cases import Job, run_job
 from graspd_core.bench.run_studies import make_plan, studies_of
+from graspd_core.bench.studies.human_hand import SOFTNESS
 from graspd_core.bench.study import Request, all_shapes
 from graspd_core.bench.study_registry import STUDIES
 from graspd_core.errors import ConfigError
@@ -87,6 +89,20 @@ def test_the_smallest_run_ends_in_a_record_and_fills_its_section(name: str, tmp_
     assert study.faults(record) == ()
     sections = sourced(f"graspd bench {name}", [record], study.sections([record], tmp_path / "bench"))
     assert f"by `graspd bench {name}` at commit" in written(sections[PAGES[name][0]])
+
+
+def test_a_human_hand_is_measured_rigid_and_with_flesh_that_gives(tmp_path: Path):
+    file = tmp_path / "MANO_RIGHT.pkl"
+    runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "mano_synthetic.py"))["write_synthetic"](file, 0)
+    study = STUDIES["mano"]
+    cases = study.cases(Request(hand=str(file), objects=("shape:sphere",), seeds=(0,), presets=("fast",), count=2))
+    assert [vars(case)["softness"] for case in cases] == list(SOFTNESS)
+    jobs = [Job("mano", case, study.run, "1+a") for case in cases]
+    records = [run_job(job) for job in jobs]
+    assert [record["error"] for record in records] == ["", ""]
+    (table,) = study.sections(records, None)["mano"]
+    names = [line.split(" | ")[0].strip("| ") for line in str(table).splitlines()[2:6]]
+    assert names == ["sphere, rigid", "**mean**, rigid", "sphere, 1 mm", "**mean**, 1 mm"]
 
 
 def test_an_option_that_no_study_looks_at_is_named(tmp_path: Path):

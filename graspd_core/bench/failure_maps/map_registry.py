@@ -116,5 +116,5 @@ def run_map(case: MapCase) -> Record:
 
 def map_seconds(case: MapCase) -> float:
     """CPU seconds of a case, roughly."""
-    each = {"balanced": 0.05, "graspd2022_short": 0.7}.get(case.preset, 1.0)
+    each = {"balanced": 0.1, "graspd2022_short": 0.45}.get(case.preset, 1.0)
     return 0.5 + case.count * (each + 0.05 * len(case.up))

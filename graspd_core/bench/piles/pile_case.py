@@ -72,7 +72,7 @@ def _size(text: str) -> int:
 
 def pile_seconds(case: PileCase) -> float:
     """CPU seconds of a case, roughly: among more neighbours every plan takes longer."""
-    return 4.0 * case.size + 1.6 * case.size**2
+    return 4.0 * case.size + 0.3 * case.size**2
 
 
 def drawn_things(case: PileCase) -> list[str]:

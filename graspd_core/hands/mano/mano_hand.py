@@ -3,7 +3,7 @@
 The methods, the metrics and the trials see a hand like any other; figures of the skinned surface come from
 `ManoHand.skinned_mesh`, the mesh that MANO itself makes of the same joint values. The hulls stand for the skin at rest:
 they do not follow the blend shapes of the pose, and at a strongly bent joint the skin bulges by a few millimetres
-against them.
+against them. Contact candidates lie on the skin at rest, since hulls are fuller where it is hollow.
 
 Base frame: the model's axes, origin in the wrist joint. The wrist body carries the palm.
 """
@@ -81,7 +81,8 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     normal = mano_joints.palm_normal(data, joints)
     frames = mano_joints.anatomical_frames(joints, tips, normal)
     hand = _bare_hand(data, vertices, joints, owner, tips, normal, frames)
-    hand = replace(hand, adjacent=adjacent_links(hand))
+    skins = _skins(hand, data, vertices, joints, owner, frames)
+    hand = replace(hand, adjacent=adjacent_links(hand), skins=skins)
     return ManoHand(with_candidates(hand, candidates), data, shape, frames)
 
 
@@ -148,6 +149,23 @@ def _bare_hand(
         candidate_points=np.zeros((0, 3)),
         candidate_normals=np.zeros((0, 3)),
         candidate_link=np.zeros(0, dtype=np.int64),
+    )
+
+
+def _skins(
+    hand: HandModel,
+    data: ManoData,
+    vertices: Float[np.ndarray, "vertices 3"],
+    joints: Float[np.ndarray, "16 3"],
+    owner: Int[np.ndarray, "vertices"],
+    frames: Float[np.ndarray, "16 3 3"],
+) -> tuple[tuple[int, TriangleMesh], ...]:
+    """Each body's link, and in its frame the faces of the skin that have a vertex of it."""
+    own = [data.faces[(owner[data.faces] == body).any(1)] for body in range(len(BODIES))]
+    return tuple(
+        (hand.link_index[name], TriangleMesh((vertices - joints[body]) @ frames[body], own[body]))
+        for body, name in enumerate(BODIES)
+        if len(own[body])
     )
 
 

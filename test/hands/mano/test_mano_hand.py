@@ -14,7 +14,7 @@ import trimesh
 from hypothesis import given
 
 from graspd_core.errors import HandError
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.mano import mano_joints
 from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
@@ -30,7 +30,8 @@ from graspd_core.hands.mano.mano_skin import (
     wrist_loop,
 )
 from graspd_core.hands.self_collision import deepest_overlap
-from graspd_core.mesh.mesh_distance import make_distance_query
+from graspd_core.hands.surface_points import with_candidates
+from graspd_core.mesh.mesh_distance import make_distance_query, signed_distance
 from graspd_core.metrics.skin_metrics import measure_skin
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.scene.load_scene import load_scene
@@ -209,6 +210,17 @@ def test_hulls_hold_the_skin_at_rest(mano: ManoHand) -> None:
         gaps = [np.linalg.norm(own - corner, axis=1).min() for corner in hull.vertices]
         assert max(gaps) < 1e-12
     assert 0.2 < hand.link_mass.sum() < 0.8  # a hand has some 0.4 kg
+
+
+def test_candidates_lie_on_the_skin_at_rest_and_look_out_of_it(mano: ManoHand) -> None:
+    hand = mano.model
+    skin = make_distance_query(mano.skinned_mesh(Posture(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(45))))
+    poses = link_poses(hand, np.zeros(45))
+    placed = in_base(poses, hand.candidate_points, hand.candidate_link)
+    raised = in_base(poses, hand.candidate_points + 1e-4 * hand.candidate_normals, hand.candidate_link)
+    assert np.abs(signed_distance(skin, placed)).max() < 1e-9
+    assert (signed_distance(skin, raised) > 0).mean() > 0.95
+    assert len(with_candidates(hand, 300).candidate_link) == 300
 
 
 def test_the_hand_is_anatomical(mano: ManoHand) -> None:
