@@ -14,8 +14,8 @@ and as MuJoCo measured them while a trial plays. Purple is the push that the gra
 turn that goes with it. In a slice of the signed distance blue is inside.
 
 **Verdicts.** A grasp is *verified* when it passed every physics trial, *failed* when it did not: press R to see when
-and why. One that is *less sure* holds on the likeliest shape of an object whose hidden side was guessed, and fails
-under too much else that may be true; the share beside it is how probably it holds. *Unverified* grasps were not tried.
+and why. One that is *less sure* holds on the likeliest shape of an object that cameras saw, and fails under too
+much else that may be true; the share beside it is how probably it holds. *Unverified* grasps were not tried.
 
 **Trials.** In the hold trial the hand closes on the free object, which is then pulled along six axes. In the lift trial
 it comes from a retreat, closes on the object on its support, and lifts it.
