@@ -15,10 +15,11 @@ def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
     """
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
-    rows = rows - rows.min(0)
-    sides = tuple(int(side) for side in rows.max(0) + 1)
+    # Column by column: NumPy takes seven times as long for the least of short rows.
+    columns = tuple(column - column.min() for column in rows.T)
+    sides = tuple(int(column.max()) + 1 for column in columns)
     if math.prod(sides) < 2**63:
-        return np.asarray(np.ravel_multi_index(tuple(rows.T), sides))
+        return np.asarray(np.ravel_multi_index(columns, sides))
     # No room: the rows' ranks among each other.
     return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
 

@@ -16,6 +16,8 @@ MIN_SIDE_SHARE = 0.1
 # A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
 # of a thing to the corner of the table behind it has none between.
 SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
+# Most objects are far from the outline, which the hull of so many points shows as well as that of all.
+HULL_POINTS = 2000
 
 
 def reaches_image_border(
@@ -32,6 +34,8 @@ def reaches_image_border(
     local = (points - eye) @ view_frame(PointCloud(points, eye))
     ahead = local[:, 2] > 1e-3
     plane, mine = local[ahead, :2] / local[ahead, 2:], mine[ahead]
+    if _well_within(plane[mine], plane[:: 1 + len(plane) // HULL_POINTS], width):
+        return False
     try:
         hull = ConvexHull(plane)
     except (QhullError, ValueError):
@@ -50,6 +54,17 @@ def reaches_image_border(
         if _filled(np.concatenate([near, beside]), start, end) >= MIN_FILLED_SHARE:
             return True
     return False
+
+
+def _well_within(own: Float[np.ndarray, "own 2"], some: Float[np.ndarray, "some 2"], width: float) -> bool:
+    """Whether no point is within `width` of the hull of all, since none is of the hull of some, which lies within."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        sides = ConvexHull(some).equations
+    except (QhullError, ValueError):
+        return False
+    return all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in sides)
 
 
 def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:

@@ -136,9 +136,10 @@ def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
 
 def _voxels(points: Float[np.ndarray, "n 3"], size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
     """Which voxel each point lies in, counted without gaps, and the side it came to."""
-    low = points.min(0)
+    # Column by column: NumPy takes seven times as long for the least of short rows.
+    low = np.array([column.min() for column in points.T])
     # So many cells an axis have room in one number.
-    size = max(size, float(np.ptp(points, axis=0).max()) / 2**20)
+    size = max(size, max(float(np.ptp(column)) for column in points.T) / 2**20)
     cell, voxel = _distinct(((points - low) / size).astype(np.int64))
     while len(cell) > most:
         growth = max(1.2, (len(cell) / most) ** 0.5)

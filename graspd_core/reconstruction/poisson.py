@@ -22,6 +22,8 @@ from graspd_core.types import TriangleMesh
 GRID_CELLS = 60
 # Cells that a wall is made thick, if it is thinner.
 MIN_WALL_CELLS = 2.2
+# The sides of a wall face apart by this cosine at least.
+OPPOSITE_COSINE = 0.7
 # Beyond so many cells from the Poisson surface a node's side is its region's.
 BAND_CELLS = 2
 # A floor looks up by this cosine and is this much higher than the lowest points seen, at most [m].
@@ -66,13 +68,15 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
 
     points, normals = surfels.points, surfels.normals
     thinnest = MIN_WALL_CELLS * cell
-    # Nearest in place and in opposite normal: the other side of a wall.
+    # Nearest in place and in opposite normal: the other side of a wall. None is farther away in these six dimensions.
     tree = KDTree(np.hstack([points, thinnest * normals]))
-    _, other = tree.query(np.hstack([points, -thinnest * normals]))
+    farthest = np.sqrt(2 + 2 * (1 - OPPOSITE_COSINE)) * thinnest
+    _, other = tree.query(np.hstack([points, -thinnest * normals]), distance_upper_bound=farthest)
+    other = np.minimum(other, len(points) - 1)
     offset = points - points[other]
     thickness = (offset * normals).sum(1)
     beside = np.linalg.norm(offset - thickness[:, None] * normals, axis=1)
-    opposite = (normals * normals[other]).sum(1) < -0.7
+    opposite = (normals * normals[other]).sum(1) < -OPPOSITE_COSINE
     wall = opposite & (np.abs(thickness) < thinnest) & (beside < thinnest)
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 

@@ -90,8 +90,8 @@ def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float
     from scipy.spatial import KDTree
 
     guess = take(guess, empty_depth(free_space, guess.points) < free_space.slack)
-    distance, nearest = KDTree(known.points).query(guess.points)
-    alike = (guess.normals * known.normals[nearest]).sum(1) > 0
+    distance, nearest = KDTree(known.points).query(guess.points, distance_upper_bound=3 * step)
+    alike = (guess.normals * known.normals[np.minimum(nearest, len(known.points) - 1)]).sum(1) > 0
     return thin(take(guess, distance > np.where(alike, 2.5, 1.2) * step), step)
 
 

@@ -23,6 +23,14 @@ def test_what_lies_on_the_border_reaches_it(middle: tuple[float, float], reaches
     assert reaches_image_border(points, EYE, mine, WIDTH) is reaches
 
 
+@pytest.mark.parametrize("away", [0.5, 0.8, 1.3, 2.0])
+def test_what_is_almost_on_the_border_is_told_from_what_is(away: float):
+    """The hull of a few points, which is asked first, is smaller than that of all."""
+    points = picture(rows=300)
+    mine = (points[:, 0] < 0.25 - away * WIDTH) & (points[:, 0] > 0.15) & (np.abs(points[:, 1]) < 0.05)
+    assert reaches_image_border(points, EYE, mine, WIDTH) is (away < 1)
+
+
 def test_what_makes_the_outline_alone_does_not():
     points = picture()
     out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
