@@ -233,9 +233,9 @@ def _is_guessed(
     settings: ReconstructionConfig,
 ) -> bool:
     """Whether a good part of a surface was not seen; what stands on the support at z = 0 is known."""
-    if views > 1 and _unseen_share(mesh, seen, standing, settings.seen_distance) <= settings.open_share:
-        # A rule may have filled, and normals may miss, what is next to nothing.
-        return False
+    if views > 1:
+        # Whatever a rule filled; and normals of what was seen may cancel though much was not, as of a bottle's sides.
+        return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
     # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
     area = _open_area(mesh, standing)[0]
     guessed = float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))

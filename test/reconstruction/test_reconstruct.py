@@ -11,7 +11,7 @@ from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_distance import inside, make_distance_query, unsigned_distance
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
-from graspd_core.mesh.shapes import SHAPES, make_shape, shape_volume
+from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape, shape_volume
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.depth_image import cloud_from_depth
@@ -153,6 +153,17 @@ def test_a_bottle_seen_from_straight_above_has_a_neck(elevation, noise):
     stage, found = from_above("bottle", elevation, noise)
     assert distances(stage.truth, found.mesh).mean() < 0.002
     assert distances(found.mesh, stage.truth).mean() < 0.002
+    assert found.evidence.hidden
+
+
+def test_a_bar_of_which_no_camera_sees_top_and_bottom_is_doubted():
+    # Normals of the four sides cancel, and no point of it is far from them.
+    half = np.array([0.045, 0.01, 0.01])
+    bar = TriangleMesh(make_shape("box").vertices / BOX_HALF * half, make_shape("box").faces)
+    points, normals = surface_samples(bar, 24_000, 0)
+    eyes = np.array([[0.4, 0.3, 0.0], [-0.4, -0.3, 0.0]])
+    found = reconstruct([PointCloud(points[((eye - points) * normals).sum(1) > 0], eye) for eye in eyes])
+    assert found.method == "poisson"
     assert found.evidence.hidden
 
 
