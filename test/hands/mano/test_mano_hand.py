@@ -212,15 +212,16 @@ def test_hulls_hold_the_skin_at_rest(mano: ManoHand) -> None:
     assert 0.2 < hand.link_mass.sum() < 0.8  # a hand has some 0.4 kg
 
 
-def test_candidates_lie_on_the_skin_at_rest_and_look_out_of_it(mano: ManoHand) -> None:
-    hand = mano.model
+@pytest.mark.parametrize("count", [200, 300])
+def test_candidates_lie_on_the_skin_at_rest_and_look_out_of_it(mano: ManoHand, count: int) -> None:
+    hand = with_candidates(mano.model, count)
+    assert len(hand.candidate_link) == count
     skin = make_distance_query(mano.skinned_mesh(Posture(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(45))))
     poses = link_poses(hand, np.zeros(45))
     placed = in_base(poses, hand.candidate_points, hand.candidate_link)
     raised = in_base(poses, hand.candidate_points + 1e-4 * hand.candidate_normals, hand.candidate_link)
     assert np.abs(signed_distance(skin, placed)).max() < 1e-9
     assert (signed_distance(skin, raised) > 0).mean() > 0.95
-    assert len(with_candidates(hand, 300).candidate_link) == 300
 
 
 def test_the_hand_is_anatomical(mano: ManoHand) -> None:
