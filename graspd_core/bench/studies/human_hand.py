@@ -46,8 +46,10 @@ _HEADINGS = [
     "contact area cm² within 2 mm (5, 10)",
     "intersection cm³",
     "CA/IV 1/cm",
+    "displacement cm",
+    "penetration mm",
+    "CPU s per grasp",
 ]
-_HEADINGS += ["displacement cm", "penetration mm", "CPU s per grasp"]
 
 
 @dataclass(frozen=True)
