@@ -57,7 +57,12 @@ class _Cut:
 
 
 def convex_parts(
-    mesh: TriangleMesh, sdf: GridSDF, *, tolerance: float = 0.002, max_parts: int = 64
+    mesh: TriangleMesh,
+    sdf: GridSDF,
+    *,
+    tolerance: float = 0.002,
+    max_parts: int = 64,
+    surface_points: int = SURFACE_POINTS,
 ) -> tuple[TriangleMesh, ...]:
     """Convex closed meshes whose union approximates the object.
 
@@ -65,9 +70,10 @@ def convex_parts(
         sdf: the object's distance grid, which tells what lies outside.
         tolerance: how far a part may reach outside the object [m] (98th percentile of its surface) before it is cut.
         max_parts: parts at most; an object that needs more keeps its last parts bulging.
+        surface_points: that the parts are made of, and up to half as many of the mesh's vertices.
     """
-    points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], SURFACE_POINTS // 2),
-                        surface_samples(mesh, SURFACE_POINTS, 0)[0]])  # fmt: skip
+    points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], surface_points // 2),
+                        surface_samples(mesh, surface_points, 0)[0]])  # fmt: skip
     if _hull(points) is None:
         return (_slab(points),)
     clusters = _join(sdf, _cut_up(sdf, points, tolerance, round(SURPLUS * max_parts)), tolerance, max_parts)

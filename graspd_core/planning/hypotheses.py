@@ -17,22 +17,26 @@ from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.planning.run_clock import Run
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.scene.scene import Scene, build_scene, object_parts
+from graspd_core.scene.scene import ObjectModel, Scene, build_scene, object_parts
 from graspd_core.trials.hold_trial import STOPPED, hold_trial
 from graspd_core.trials.noisy_trial import PoseError, displaced, pose_errors
 from graspd_core.trials.trial_registry import TrialContext
 from graspd_core.trials.world import Protocol, World, at_friction, build_world
-from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
+from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult, TriangleMesh
 
 # Of the friction that the scene says.
 _LESS_FRICTION = 2 / 3
 # Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
-# A guessed shape is not worth finer parts.
-_RESOLUTION, _PART_TOLERANCE_M, _PARTS = 40, 0.003, 32
+# A guessed shape is not worth finer parts: nodes of its distance grid along an axis, and how it is cut.
+_RESOLUTION, _CUTS = 32, {"tolerance": 0.003, "max_parts": 32, "surface_points": 3000}
 # How often the stop hook is asked while waiting for a world [s].
 _POLL = 0.02
+
+# Trials run in several threads, and one builds the world that all of them try in.
+_BUILDING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -57,20 +61,16 @@ class Hypotheses:
 
 
 class OtherWorlds:
-    """The worlds of the hypotheses that change the object itself, made one after another by a thread.
+    """The worlds of other shapes of the object, made one after another by a thread.
 
     As many are begun at once as a grasp that holds in all of them must be tried in, one more for each that cannot be
     made, and others when they are asked for.
     """
 
     def __init__(self, run: Run, scene: Scene, hand: HandModel, protocol: Protocol, rules: Sequence[str], begun: int):
-        slippery = at_friction(protocol, _LESS_FRICTION * Protocol.friction[0])
-        self.physics = {f"friction {slippery.friction[0]:.2g}": slippery}
-        self._builds: list[Callable[[], World | None]] = [partial(_own_world, scene, hand, slippery)]
-        for rule in rules:
-            self.physics[f"hidden side by {rule}" if rule else "hidden side closed smoothly"] = protocol
-            self._builds.append(partial(_other_world, scene, hand, protocol, rule))
+        self.rules, self.protocol = rules, protocol
         self._run, self._lock = run, threading.Lock()
+        self._make_world = lambda rule: _other_world(scene, hand, protocol, rule)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
         self._made: list[Future[World | None]] = []
         self._begin(begun)
@@ -85,13 +85,13 @@ class OtherWorlds:
 
     def _begin(self, count: int) -> None:
         with self._lock:
-            for build in self._builds[len(self._made) : count]:
-                self._made.append(self._pool.submit(self._make, build))
+            for rule in self.rules[len(self._made) : count]:
+                self._made.append(self._pool.submit(self._make, rule))
 
-    def _make(self, build: Callable[[], World | None]) -> World | None:
+    def _make(self, rule: str) -> World | None:
         if self._run.known_over():
             return None
-        made = build()
+        made = self._make_world(rule)
         if made is None:
             self._begin(len(self._made) + 1)
         return made
@@ -105,20 +105,24 @@ def other_worlds(run: Run, scene: Scene, hand: HandModel, protocol: Protocol, pr
     from graspd_core.reconstruction.other_shapes import other_rules
 
     rules = other_rules(scene.evidence)
-    return OtherWorlds(run, scene, hand, protocol, rules, max(1 + len(rules) - allowed, 0))
+    return OtherWorlds(run, scene, hand, protocol, rules, max(len(rules) - allowed, 0))
 
 
-def hypotheses_of(others: OtherWorlds, trials: TrialContext, probability: float) -> Hypotheses:
+def hypotheses_of(
+    others: OtherWorlds, scene: Scene, hand: HandModel, trials: TrialContext, probability: float
+) -> Hypotheses:
     """All that a grasp is tried under, cheapest first."""
     places = [
         Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
     ]
-    found = [
-        Hypothesis(name, partial(_hold_in, others, k, protocol))
-        for k, (name, protocol) in enumerate(others.physics.items())
+    slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
+    less = Hypothesis(f"friction {slippery.friction[0]:.2g}", partial(_hold_at, slippery, scene, hand))
+    shapes = [
+        Hypothesis(f"hidden side by {rule}" if rule else "hidden side closed smoothly", partial(_hold_in, others, k))
+        for k, rule in enumerate(others.rules)
     ]
-    return Hypotheses((*places, *found), _allowed_failures(probability))
+    return Hypotheses((*places, less, *shapes), _allowed_failures(probability))
 
 
 def _allowed_failures(probability: float) -> int:
@@ -152,9 +156,15 @@ def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tupl
     return TrialResult(HYPOTHESES, passed, worst[0], worst[1], reason), HELD_AFTER[worst_case]
 
 
-def _hold_in(worlds: OtherWorlds, index: int, protocol: Protocol, grasp: Grasp, stop: StopHook) -> TrialResult | None:
+def _hold_in(worlds: OtherWorlds, index: int, grasp: Grasp, stop: StopHook) -> TrialResult | None:
     world = worlds.world(index, stop)
-    return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
+    return None if world is None else hold_trial(world, grasp, worlds.protocol, stop=stop)
+
+
+def _hold_at(protocol: Protocol, scene: Scene, hand: HandModel, grasp: Grasp, stop: StopHook) -> TrialResult:
+    with _BUILDING:
+        world = _own_world(scene, hand, protocol)
+    return hold_trial(world, grasp, protocol, stop=stop)
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:
@@ -171,17 +181,25 @@ def _own_world(scene: Scene, hand: HandModel, protocol: Protocol) -> World:
 @lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
     """The world of another shape of the object's own mass and friction; None where there is no such shape."""
+    made = run_isolated(other_object, scene.evidence, rule, scene.object)
+    return None if made is None else build_world(hand, *made, protocol)
+
+
+def other_object(
+    evidence: Evidence, rule: str, likeliest: ObjectModel
+) -> tuple[ObjectModel, tuple[TriangleMesh, ...]] | None:
+    """An object of the same mass and friction whose hidden side is guessed by a rule, and its convex parts.
+
+    None where there is no such shape.
+    """
     from graspd_core.reconstruction.other_shapes import other_shape
 
-    mesh = run_isolated(other_shape, scene.evidence, rule, scene.object.mesh)
+    mesh = other_shape(evidence, rule, likeliest.mesh)
     if mesh is None:
         return None
-    target = scene.object
+    named = {"source": likeliest.source, "mass": likeliest.mass, "friction": likeliest.friction}
     try:
-        other = build_scene(
-            mesh, source=target.source, mass=target.mass, friction=target.friction, resolution=_RESOLUTION
-        )
+        scene = build_scene(mesh, resolution=_RESOLUTION, **named)
     except GraspdError:
         return None
-    parts = run_isolated(convex_parts, other.object.mesh, other.sdf, tolerance=_PART_TOLERANCE_M, max_parts=_PARTS)
-    return build_world(hand, other.object, parts, protocol)
+    return scene.object, convex_parts(scene.object.mesh, scene.sdf, **_CUTS)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from graspd_core.runtime.worker_process import start_worker_process
 
-# What the child's work imports: all of a scene from clouds, and the library behind it.
-_MODULES = ("graspd_core.scene.scene_from_views", "open3d")
+# What the child's work imports: all of a scene from clouds and of other shapes, and the library behind them.
+_MODULES = ("graspd_core.scene.scene_from_views", "graspd_core.planning.hypotheses", "open3d")
 
 
 def start_planning_worker() -> None:

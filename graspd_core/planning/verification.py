@@ -93,7 +93,9 @@ def make_trial_context(
         return None
     ahead.parts.result()
     worlds = _worlds(scene, hand, ahead.protocol)
-    hypotheses = None if ahead.others is None else hypotheses_of(ahead.others, worlds, certainty.probability)
+    hypotheses = (
+        None if ahead.others is None else hypotheses_of(ahead.others, scene, hand, worlds, certainty.probability)
+    )
     return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
 
 
@@ -160,11 +162,15 @@ def run_trials(
             if seen is not None:
                 seen = replace(seen, verdicts=(*seen.verdicts[:index], tried.verdict, *seen.verdicts[index + 1 :]))
                 run.show(seen)
+            enough = len(verified) + passed == count
+            if enough:
+                # What is tried ahead takes no more time from measuring.
+                trials.close()
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
                 tried = replace(tried, metrics=measure(context.metrics(), tried.grasp))
             (verified if passed else others).append(tried)
-            if len(verified) == count:
+            if enough:
                 break
     return TriedGrasps(surest_first((*verified, *others)), first, audits)
 

@@ -10,13 +10,14 @@ from graspd_core.errors import GraspdError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.reconstruction.evidence import Evidence
+from graspd_core.reconstruction.grid_poisson import grid_poisson_field
 from graspd_core.reconstruction.merge_views import thin
 from graspd_core.reconstruction.reconstruct import closed_mesh
 from graspd_core.reconstruction.shape_completion import RULES, guess_by
 from graspd_core.types import TriangleMesh
 
-# A trial feels no finer detail: spacing of points, cells along the longest side, Poisson's finest cell.
-_STEP_M, _CELLS, _POISSON_CELL_M = 0.003, 40, 0.006
+# A trial feels no finer detail: spacing of points, cells along the longest side, faces.
+_STEP_M, _CELLS, _FACES = 0.003, 40, 4000
 # Two shapes nearer to each other than this are one [m].
 _SAME_M = 5e-4
 _SAMPLES = 1500
@@ -37,9 +38,9 @@ def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMe
     guess = guess_by(rule, seen, evidence.free_space, step)
     if guess is None:
         return None
-    settings = replace(evidence.settings, poisson_cell=max(evidence.settings.poisson_cell, _POISSON_CELL_M))
+    settings = replace(evidence.settings, max_faces=min(evidence.settings.max_faces, _FACES))
     try:
-        mesh = closed_mesh(seen, guess, evidence.free_space, step, settings, _CELLS)
+        mesh = closed_mesh(seen, guess, evidence.free_space, step, settings, grid_poisson_field, _CELLS)
     except GraspdError:
         return None
     mesh = TriangleMesh(mesh.vertices @ evidence.rotation.T + evidence.origin, mesh.faces)

@@ -6,7 +6,7 @@ to be empty and by the support, and surfaced again, which closes it whatever it 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,9 @@ BAND_CELLS = 2
 MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
+
+# Signed distance near a surface through surfels, at the nodes of three axes [m].
+Field = Callable[[Surfels, Sequence[Float[np.ndarray, "_"]]], Float[np.ndarray, "x y z"]]
 
 
 def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
@@ -81,8 +84,21 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 
 
-def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace, cell: float) -> TriangleMesh:
-    """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty."""
+def poisson_field(
+    surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]], finest: float
+) -> Float[np.ndarray, "x y z"]:
+    """Signed distance to the Poisson surface [m] at the nodes of a grid of cubes, as `_signed`; `finest` as above."""
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    return _signed(fit_poisson(surfels, finest), nodes, float(axes[0][1] - axes[0][0]))
+
+
+def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: float) -> TriangleMesh:
+    """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty.
+
+    Args:
+        field: signed distance near that surface [m], at the nodes of a grid's axes.
+        cell: width of that grid's cells [m].
+    """
     from scipy.ndimage import gaussian_filter
 
     known = surfels.points
@@ -91,7 +107,7 @@ def close_surface(surface: TriangleMesh, surfels: Surfels, free_space: FreeSpace
     low, high = known.min(0), known.max(0)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    value = _signed(surface, nodes, cell)
+    value = field(surfels, axes)
     inner = value < BAND_CELLS * cell
     beyond = (
         np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell)) - free_space.slack

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -22,7 +23,7 @@ from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
 from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
 from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, nothing, point_step
-from graspd_core.reconstruction.poisson import GRID_CELLS, close_surface, fit_poisson, grid_cell, part_walls
+from graspd_core.reconstruction.poisson import GRID_CELLS, Field, close_surface, grid_cell, part_walls, poisson_field
 from graspd_core.reconstruction.shape_completion import Completion, complete_shape
 from graspd_core.reconstruction.unposed_cloud import is_unposed, orient_unposed
 from graspd_core.se3 import perpendicular
@@ -91,7 +92,8 @@ def reconstruct(
             make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
-    mesh = closed_mesh(seen, guess.surfels, free_space, step, settings)
+    field = partial(poisson_field, finest=settings.poisson_cell)
+    mesh = closed_mesh(seen, guess.surfels, free_space, step, settings, field)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
     hidden = not unposed and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings)
     warnings = (_sentence(len(views), guess.method),) if hidden else ()
@@ -111,11 +113,13 @@ def closed_mesh(
     free_space: FreeSpace,
     step: float,
     settings: ReconstructionConfig,
+    field: Field,
     cells: int = GRID_CELLS,
 ) -> TriangleMesh:
     """The closed surface through what was seen and what is guessed, standing on the support where there is one.
 
     Args:
+        field: how a surface is fitted to points.
         cells: of the grid that it is closed on, along the object's longest side.
 
     Raises:
@@ -125,7 +129,7 @@ def closed_mesh(
     known = join(known, stand(known, free_space, step)) if free_space.standing else known
     known = part_walls(known, grid_cell(known, settings.min_cell, cells))
     cell = grid_cell(known, settings.min_cell, cells)
-    return _finished(close_surface(fit_poisson(known, settings.poisson_cell), known, free_space, cell), seen, settings)
+    return _finished(close_surface(known, field, free_space, cell), seen, settings)
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:

@@ -110,6 +110,7 @@ CASES = {
     ),
     "graspd2022.simulation.stopping_force": Case(base=(("graspd2022.simulation.scaling", "object"),)),
     "graspd2022.contact.friction_stiffness": Case(1e-3),
+    "graspd2022.contact.leak": Case(1.0),
     "graspd2022.level_set.clearance": Case(-0.02, base=(("graspd2022.level_set.schedule", "code"),)),
     "graspd2022.pose_steps.within_limits": Case(base=(("graspd2022.pose_rate", 1.0),)),
     "graspd2022.constraints.limit_bound": Case(base=(("graspd2022.pose_rate", 1.0),)),
