@@ -33,21 +33,22 @@ def grid_poisson_field(surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]])
     Raises:
         CloudError: the normals are not those of one surface.
     """
-    from scipy import fft
+    from scipy.fft import next_fast_len
 
     cell = float(axes[0][1] - axes[0][0])
     counts = [len(axis) for axis in axes]
-    shape = tuple(fft.next_fast_len(count + _MARGIN, real=True) for count in counts)
+    fast: Any = next_fast_len
+    shape = tuple(int(fast(count + _MARGIN, real=True)) for count in counts)
     before = [(most - count) // 2 for most, count in zip(shape, counts, strict=True)]
     at = _trilinear((surfels.points - [axis[0] for axis in axes]) / cell + before, shape)
     waves = _waves(shape)
     square = sum(wave**2 for wave in waves)
 
     def spread(values: Float[np.ndarray, "points"]) -> np.ndarray:
-        return fft.rfftn((at.T @ values).reshape(shape))
+        return np.fft.rfftn((at.T @ values).reshape(shape))
 
     def at_points(spectrum: np.ndarray) -> tuple[Float[np.ndarray, "nodes"], Float[np.ndarray, "points"]]:
-        field = np.asarray(fft.irfftn(spectrum, shape)).ravel()
+        field = np.fft.irfftn(spectrum, shape, axes=(0, 1, 2)).ravel()
         return field, at @ field
 
     _, density = at_points(spread(np.ones(len(surfels.points))) * np.exp(-0.5 * _DENSITY_BLUR**2 * square))
@@ -84,9 +85,7 @@ def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> 
 
 def _waves(shape: tuple[int, ...]) -> list[np.ndarray]:
     """Wave numbers [rad per cell] of a real field's spectrum along each axis, to be broadcast."""
-    from scipy import fft
-
-    turns = [fft.fftfreq(shape[0]), fft.fftfreq(shape[1]), fft.rfftfreq(shape[2])]
+    turns = [np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), np.fft.rfftfreq(shape[2])]
     return list(np.meshgrid(*(2 * np.pi * turn for turn in turns), indexing="ij", sparse=True))
 
 
