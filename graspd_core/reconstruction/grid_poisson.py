@@ -27,15 +27,20 @@ _STEPS, _REACH = 3, 2.0
 _MARGIN = 16
 
 
-def grid_poisson_field(surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]]) -> Float[np.ndarray, "x y z"]:
+def grid_poisson_field(
+    surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]], cell: float
+) -> Float[np.ndarray, "x y z"]:
     """Signed distance near the points' surface [m] at the nodes of a grid of cubes, outside positive, at most a band.
+
+    Args:
+        surfels: all within the grid.
+        axes: places of its nodes [m], `cell` [m] apart.
 
     Raises:
         CloudError: the normals are not those of one surface.
     """
     from scipy.fft import next_fast_len
 
-    cell = float(axes[0][1] - axes[0][0])
     counts = [len(axis) for axis in axes]
     fast: Any = next_fast_len
     shape = tuple(int(fast(count + _MARGIN, real=True)) for count in counts)

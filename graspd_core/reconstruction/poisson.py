@@ -31,8 +31,8 @@ MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
 
-# Signed distance near a surface through surfels, at the nodes of three axes [m].
-Field = Callable[[Surfels, Sequence[Float[np.ndarray, "_"]]], Float[np.ndarray, "x y z"]]
+# Signed distance near a surface through surfels [m], at the nodes of three axes with cells of that width [m].
+Field = Callable[[Surfels, Sequence[Float[np.ndarray, "_"]], float], Float[np.ndarray, "x y z"]]
 
 
 def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
@@ -85,11 +85,11 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
 
 
 def poisson_field(
-    surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]], finest: float
+    surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]], cell: float, finest: float
 ) -> Float[np.ndarray, "x y z"]:
     """Signed distance to the Poisson surface [m] at the nodes of a grid of cubes, as `_signed`; `finest` as above."""
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    return _signed(fit_poisson(surfels, finest), nodes, float(axes[0][1] - axes[0][0]))
+    return _signed(fit_poisson(surfels, finest), nodes, cell)
 
 
 def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: float) -> TriangleMesh:
@@ -107,7 +107,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
     low, high = known.min(0), known.max(0)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    value = field(surfels, axes)
+    value = field(surfels, axes, cell)
     inner = value < BAND_CELLS * cell
     beyond = (
         np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell)) - free_space.slack

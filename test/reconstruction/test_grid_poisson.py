@@ -29,7 +29,7 @@ def samples(shape: str, count: int, seed: int = 0) -> Surfels:
 def test_the_surface_goes_through_its_points(shape, worst_mm):
     surfels = samples(shape, 4000)
     axes = axes_about(surfels.points)
-    surface = make_surface(march(grid_poisson_field(surfels, axes), axes))
+    surface = make_surface(march(grid_poisson_field(surfels, axes, CELL), axes))
     apart = 1000 * surface_distance(surface, samples(shape, 2000, seed=1).points)
     # Edges are rounded by about half a cell.
     assert np.quantile(apart, 0.98) < worst_mm
@@ -46,7 +46,7 @@ def test_near_a_sphere_the_field_is_the_distance_and_far_from_it_has_its_sign(ra
     normals = np.random.default_rng(seed).normal(size=(6000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     axes = axes_about(radius * normals + centre)
-    field = grid_poisson_field(Surfels(radius * normals + centre, normals), axes)
+    field = grid_poisson_field(Surfels(radius * normals + centre, normals), axes, CELL)
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     distance = np.linalg.norm(nodes - centre, axis=-1) - radius
     near, far = np.abs(distance) < CELL, np.abs(distance) > 1.5 * CELL
@@ -59,7 +59,7 @@ def test_a_half_that_was_not_seen_is_closed():
     surfels = samples("sphere", 6000)
     seen = surfels.points[:, 2] > -0.3 * np.abs(surfels.points[:, 2]).max()
     axes = axes_about(surfels.points)
-    field = grid_poisson_field(Surfels(surfels.points[seen], surfels.normals[seen]), axes)
+    field = grid_poisson_field(Surfels(surfels.points[seen], surfels.normals[seen]), axes, CELL)
     inside = winding_inside(march(field, axes), np.array([[0.0, 0.0, 0.0], surfels.points.min(0) - CELL]))
     assert inside.tolist() == [True, False]
 
@@ -69,11 +69,13 @@ def test_where_the_density_of_points_changes_the_surface_stays():
     top, few = surfels.points[:, 2] > 0, np.arange(24_000) % 10 == 0
     kept = top | few
     axes = axes_about(surfels.points)
-    surface = make_surface(march(grid_poisson_field(Surfels(surfels.points[kept], surfels.normals[kept]), axes), axes))
+    surface = make_surface(
+        march(grid_poisson_field(Surfels(surfels.points[kept], surfels.normals[kept]), axes, CELL), axes)
+    )
     assert 1000 * surface_distance(surface, surfels.points).max() < 0.5
 
 
 def test_normals_of_no_surface_are_refused():
     surfels = samples("sphere", 2000)
     with pytest.raises(CloudError, match="2000 points"):
-        grid_poisson_field(Surfels(surfels.points, np.zeros((2000, 3))), axes_about(surfels.points))
+        grid_poisson_field(Surfels(surfels.points, np.zeros((2000, 3))), axes_about(surfels.points), CELL)
