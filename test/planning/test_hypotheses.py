@@ -12,6 +12,7 @@ from graspd_core.config import CertaintyConfig
 from graspd_core.config.certainty_config import HELD_AFTER
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
+from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.methods.plan_config import load_preset
 from graspd_core.planning.hypotheses import Hypotheses, Hypothesis, try_hypotheses
 from graspd_core.planning.plan_grasps import plan_grasps
@@ -120,6 +121,15 @@ def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     for grasp in verified:
         assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
         assert grasp.probability == 0.98
+
+
+def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
+    cut = []
+    monkeypatch.setenv("GRASPD_CACHE", "off")
+    monkeypatch.setattr("graspd_core.scene.scene.convex_parts", lambda *given: cut.append(1) or convex_parts(*given))
+    result = plan(seen_from((0.001, 0.0, 0.0)), 0.9)
+    assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.grasps)
+    assert len(cut) == 1
 
 
 @pytest.mark.parametrize(("seen", "hidden"), [(seen_from, True), (seen_all_round, False)])
