@@ -6,7 +6,6 @@ As in screened Poisson (Kazhdan and Hoppe 2013), the field is then drawn to zero
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -28,24 +27,24 @@ _MARGIN = 16
 
 
 def grid_poisson_field(
-    surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]], cell: float
+    surfels: Surfels, nodes: Float[np.ndarray, "x y z 3"], cell: float
 ) -> Float[np.ndarray, "x y z"]:
     """Signed distance near the points' surface [m] at the nodes of a grid of cubes, outside positive, at most a band.
 
     Args:
         surfels: all within the grid.
-        axes: places of its nodes [m], `cell` [m] apart.
+        nodes: of the grid, `cell` apart [m].
 
     Raises:
         CloudError: the normals are not those of one surface.
     """
     from scipy.fft import next_fast_len
 
-    counts = [len(axis) for axis in axes]
+    counts = nodes.shape[:3]
     fast: Any = next_fast_len
     shape = tuple(int(fast(count + _MARGIN, real=True)) for count in counts)
     before = [(most - count) // 2 for most, count in zip(shape, counts, strict=True)]
-    at = _trilinear((surfels.points - [axis[0] for axis in axes]) / cell + before, shape)
+    at = _trilinear((surfels.points - nodes[0, 0, 0]) / cell + before, shape)
     waves = _waves(shape)
     square = sum(wave**2 for wave in waves)
 

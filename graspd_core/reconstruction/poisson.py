@@ -31,8 +31,8 @@ MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 # Distances that are kept at a time.
 MAX_DISTANCES = 2_000_000
 
-# Signed distance near a surface through surfels [m], at the nodes of three axes with cells of that width [m].
-Field = Callable[[Surfels, Sequence[Float[np.ndarray, "_"]], float], Float[np.ndarray, "x y z"]]
+# Signed distance near a surface through surfels [m], at the nodes of a grid of cubes of that width [m].
+Field = Callable[[Surfels, Float[np.ndarray, "x y z 3"], float], Float[np.ndarray, "x y z"]]
 
 
 def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
@@ -85,10 +85,9 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
 
 
 def poisson_field(
-    surfels: Surfels, axes: Sequence[Float[np.ndarray, "_"]], cell: float, finest: float
+    surfels: Surfels, nodes: Float[np.ndarray, "x y z 3"], cell: float, finest: float
 ) -> Float[np.ndarray, "x y z"]:
     """Signed distance to the Poisson surface [m] at the nodes of a grid of cubes, as `_signed`; `finest` as above."""
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     return _signed(fit_poisson(surfels, finest), nodes, cell)
 
 
@@ -96,7 +95,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
     """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty.
 
     Args:
-        field: signed distance near that surface [m], at the nodes of a grid's axes.
+        field: signed distance near that surface, at the nodes of a grid.
         cell: width of that grid's cells [m].
     """
     from scipy.ndimage import gaussian_filter
@@ -107,7 +106,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
     low, high = known.min(0), known.max(0)
     axes = [np.arange(low[k] - 3.5 * cell, high[k] + 4.5 * cell, cell) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    value = field(surfels, axes, cell)
+    value = field(surfels, nodes, cell)
     inner = value < BAND_CELLS * cell
     beyond = (
         np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell)) - free_space.slack

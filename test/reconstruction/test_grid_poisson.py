@@ -21,6 +21,10 @@ def axes_about(points: np.ndarray) -> list[np.ndarray]:
     return [np.arange(points[:, k].min() - 3.5 * CELL, points[:, k].max() + 4.5 * CELL, CELL) for k in range(3)]
 
 
+def field_of(surfels: Surfels, axes: list[np.ndarray]) -> np.ndarray:
+    return grid_poisson_field(surfels, np.stack(np.meshgrid(*axes, indexing="ij"), -1), CELL)
+
+
 def samples(shape: str, count: int, seed: int = 0) -> Surfels:
     return Surfels(*surface_samples(make_shape(shape), count, seed))
 
@@ -29,7 +33,7 @@ def samples(shape: str, count: int, seed: int = 0) -> Surfels:
 def test_the_surface_goes_through_its_points(shape, worst_mm):
     surfels = samples(shape, 4000)
     axes = axes_about(surfels.points)
-    surface = make_surface(march(grid_poisson_field(surfels, axes, CELL), axes))
+    surface = make_surface(march(field_of(surfels, axes), axes))
     apart = 1000 * surface_distance(surface, samples(shape, 2000, seed=1).points)
     # Edges are rounded by about half a cell.
     assert np.quantile(apart, 0.98) < worst_mm
@@ -46,7 +50,7 @@ def test_near_a_sphere_the_field_is_the_distance_and_far_from_it_has_its_sign(ra
     normals = np.random.default_rng(seed).normal(size=(6000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     axes = axes_about(radius * normals + centre)
-    field = grid_poisson_field(Surfels(radius * normals + centre, normals), axes, CELL)
+    field = field_of(Surfels(radius * normals + centre, normals), axes)
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     distance = np.linalg.norm(nodes - centre, axis=-1) - radius
     near, far = np.abs(distance) < CELL, np.abs(distance) > 1.5 * CELL
@@ -59,7 +63,7 @@ def test_a_half_that_was_not_seen_is_closed():
     surfels = samples("sphere", 6000)
     seen = surfels.points[:, 2] > -0.3 * np.abs(surfels.points[:, 2]).max()
     axes = axes_about(surfels.points)
-    field = grid_poisson_field(Surfels(surfels.points[seen], surfels.normals[seen]), axes, CELL)
+    field = field_of(Surfels(surfels.points[seen], surfels.normals[seen]), axes)
     inside = winding_inside(march(field, axes), np.array([[0.0, 0.0, 0.0], surfels.points.min(0) - CELL]))
     assert inside.tolist() == [True, False]
 
@@ -69,13 +73,11 @@ def test_where_the_density_of_points_changes_the_surface_stays():
     top, few = surfels.points[:, 2] > 0, np.arange(24_000) % 10 == 0
     kept = top | few
     axes = axes_about(surfels.points)
-    surface = make_surface(
-        march(grid_poisson_field(Surfels(surfels.points[kept], surfels.normals[kept]), axes, CELL), axes)
-    )
+    surface = make_surface(march(field_of(Surfels(surfels.points[kept], surfels.normals[kept]), axes), axes))
     assert 1000 * surface_distance(surface, surfels.points).max() < 0.5
 
 
 def test_normals_of_no_surface_are_refused():
     surfels = samples("sphere", 2000)
     with pytest.raises(CloudError, match="2000 points"):
-        grid_poisson_field(Surfels(surfels.points, np.zeros((2000, 3))), axes_about(surfels.points), CELL)
+        field_of(Surfels(surfels.points, np.zeros((2000, 3))), axes_about(surfels.points))
