@@ -1,10 +1,11 @@
-"""When a hold is over early: the object is at rest, and its drift cannot carry it to a limit in the time that is left.
+"""When a hold is over early: the object's drift cannot carry it to a limit in the time that is left.
 
-A trial that stops early goes through the same states as one of full length, so it can verify what that would not, never
-the reverse. What slides slowly may come to an edge and snap away, and what jitters on its contacts may be thrown off
-them much later: hence the large safety, and the demand for rest. Jitter hides how far an object drifts within a few
-steps; over more of them it cancels, so that the drift is taken over several spans and any of them may give the answer.
-Numbers are from trajectories of pulls of five hands on eleven shapes; `graspd bench early` measures what they come to.
+A trial that stops early goes through the same states as one of full length, so it can verify what that would not,
+never the reverse. What slides slowly may come to an edge and snap away: hence the safety. Jitter on the contacts
+hides how far an object drifts within a few steps; over more of them it cancels, so that the drift is taken over
+several spans and any of them may give the answer. Where friction is low or fingers are few, the object has to be at
+rest as well. Numbers are from trajectories of pulls of four hands on eleven shapes and ten scans; `graspd bench
+early` measures what they come to.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ class StopRule:
     first: int
     windows: tuple[int, ...]
     safety: float
-    speed: float
-    spin: float
+    speed: float = math.inf
+    spin: float = math.inf
 
 
-FIRM = StopRule(first=20, windows=(10, 20, 40), safety=16.0, speed=0.01, spin=math.radians(10.0))
-SLIPPERY = StopRule(first=25, windows=(10, 20, 40), safety=32.0, speed=0.01, spin=math.radians(10.0))
+FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
+SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
 # Objects begin to slip as late as 1.9 s.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.002, spin=math.radians(2.0))
 # Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.

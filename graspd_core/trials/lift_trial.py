@@ -34,6 +34,7 @@ from graspd_core.trials.hold_trial import (
     set_joints,
     set_targets,
     step_until_known,
+    straight_way,
 )
 from graspd_core.trials.world import Protocol, World, advance, trial_data
 from graspd_core.types import Grasp, Posture, TrialResult
@@ -129,8 +130,9 @@ def _raise(
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
         steps = round(duration / protocol.timestep)
+        way = straight_way(start, end, np.arange(1, steps + 1) / steps)
         for step in range(1, steps + 1):
-            set_targets(data, start, end, step / steps)
+            set_targets(data, way, step - 1)
             if name == _LIFTING:
                 _sink(world, data, away if world.up is None else world.up, step / steps, settings)
             advance(world, data)
@@ -190,8 +192,9 @@ def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit:
     worst, reason = 0.0, ""
     names = ("while coming", "while closing")
     for (start, end), name in zip(pairwise(postures), names, strict=True):
-        for a in (*_SHARES, 1.0):
-            set_targets(data, start, end, a)
+        way = straight_way(start, end, np.array([*_SHARES, 1.0]))
+        for index in range(len(way.positions)):
+            set_targets(data, way, index)
             set_joints(world, data, data.ctrl)
             mujoco.mj_kinematics(world.model, data)
             for geom, said in world.obstacles:

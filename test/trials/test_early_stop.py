@@ -100,16 +100,16 @@ def test_what_moves_evenly_to_a_limit_is_never_known_to_hold(speed, done, spin):
 REST = ObjectState((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0, 0.0)
 
 
-def test_what_jitters_on_the_spot_is_not_at_rest():
-    # Contacts that throw the object to and fro sooner or later throw it out.
-    assert answer_known(FIRM, STANDARD, [REST, REST, REST], (0.0, 0.0), 400)
-    assert not answer_known(FIRM, STANDARD, [REST, replace(REST, speed=0.011), REST], (0.0, 0.0), 400)
-    assert not answer_known(FIRM, STANDARD, [REST, replace(REST, spin=0.18), REST], (0.0, 0.0), 400)
-    assert not answer_known(CREEPING, STANDARD, [*[REST] * 10, replace(REST, speed=0.003)], (0.0, 0.0), 400)
+@pytest.mark.parametrize("jitter", [replace(REST, speed=0.003), replace(REST, spin=0.04)])
+def test_only_a_loose_hold_asks_for_rest(jitter):
+    # Where friction is low or fingers are few, contacts that throw the object to and fro sooner or later throw it out.
+    assert answer_known(CREEPING, STANDARD, [REST] * 11, (0.0, 0.0), 400)
+    assert not answer_known(CREEPING, STANDARD, [*[REST] * 10, jitter], (0.0, 0.0), 400)
+    assert answer_known(FIRM, STANDARD, [*[REST] * 10, jitter], (0.0, 0.0), 400)
 
 
 def test_jitter_that_hides_the_drift_of_a_few_steps_cancels_over_more_of_them():
-    # 0.2 mm to and fro between two looks comes to 16 times 8 mm in 400 steps.
+    # 0.2 mm to and fro within 10 steps comes to 8 times 8 mm in 400.
     jitter = [replace(REST, center=(0.0002 * (look % 4 == 0), 0.0, 0.0)) for look in range(9)]
     assert not answer_known(FIRM, STANDARD, jitter[-3:], (0.0, 0.0), 400)
     assert answer_known(FIRM, STANDARD, jitter, (0.0, 0.0), 400)
@@ -162,16 +162,15 @@ def test_a_firm_grasp_takes_a_fraction_of_the_steps(gripper, cube, closing, step
 @pytest.mark.parametrize(("speed", "held"), [(0.002, True), (0.0027, False)])
 def test_a_slow_creep_that_breaks_a_limit_late_is_not_verified(speed, held, gripper, cube, closing):
     # In a fluid thicker than honey an object that nothing holds drifts evenly: 4 mm in 2 s, or 5 mm after 1.85 s.
-    world = build_world(gripper, cube, (cube.mesh,), STANDARD)
+    world = replace(build_world(gripper, cube, (cube.mesh,), STANDARD), fingers=3)
     world.model.opt.viscosity = STANDARD.pull * cube.mass / (3 * np.pi * 0.04 * speed)
     adrift, protocol = closing(0.0, 0.0, (0.0, 0.0), height=FAR), replace(STANDARD, max_displacement=0.005)
     late, early = (hold_trial(world, adrift, p) for p in (full(protocol), protocol))
     assert late.passed == early.passed == held
     if not held:
         assert early == late
-        # Most of the way it is within the limit, and slower than what is called at rest.
+        # Most of the way it is within the limit.
         assert hold_trial(world, adrift, replace(full(protocol), hold_time=1.7)).passed
-        assert speed < FIRM.speed
 
 
 # Too far below for any hand that holds the object, which rests on a plane of its own.
