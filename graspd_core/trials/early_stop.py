@@ -30,8 +30,8 @@ class StopRule:
         first: steps before the first look.
         windows: steps that the drift is taken over; one of them is enough.
         safety: how many times that drift the object is supposed to keep until the end.
-        speed: what is slower is at rest [m/s].
-        spin: what turns slower is at rest [rad/s].
+        speed: what is slower is at rest [m/s]; infinite where rest is not asked for.
+        spin: what turns slower is at rest [rad/s], likewise.
     """
 
     first: int
