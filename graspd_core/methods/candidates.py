@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -34,6 +35,9 @@ _AT_ONCE = 128
 _KNOCK_COST = 100.0
 # A score that no candidate has.
 _WORST = -1e3
+# Share of the grasps asked for that the ranking expects to hold, below which a method searches again; and how far apart
+# the seeds of two searches are: not those of two rounds.
+_LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
 
 
 @dataclass(frozen=True)
@@ -58,13 +62,34 @@ def find_candidates(
 ) -> Candidates:
     """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless.
 
+    Where the ranking expects too few of those asked for to hold, as many starts again are searched from: small, large
+    and long things gain by that, ordinary ones would not.
     The restrictions shape the starts alone: who asked for them refuses candidates.
     """
     task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
-    found = METHODS[config.method].plan(task)
+    found = _searched(task)
+    for again in range(1, METHODS[config.method].searches(config.settings)):
+        if found.interrupted or expected_to_hold(found.grasps[:count]) >= _LEAST_EXPECTED * count:
+            break
+        more = _searched(replace(task, seed=seed + _SEED_STEP * again))
+        found = Candidates(_best_first((*found.grasps, *more.grasps)), more.interrupted)
+    return found
+
+
+def expected_to_hold(grasps: Sequence[Grasp]) -> float:
+    """How many of the grasps the ranking expects to pass the hold trial."""
+    return sum(0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps)
+
+
+def _searched(task: PlannerInput) -> Candidates:
+    found = METHODS[task.config.method].plan(task)
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
-    return Candidates(assemble(found.problem, hand, found.poses, config, hooks.stop), found.interrupted)
+    return Candidates(assemble(found.problem, task.hand, found.poses, task.config, task.hooks.stop), found.interrupted)
+
+
+def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
+    return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
 
 
 def assemble(
@@ -81,7 +106,7 @@ def assemble(
         rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
         some = staged(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
         grasps += [grasp for grasp in finished(problem, hand, some) if grasp.score > _WORST]
-    return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
+    return _best_first(grasps)
 
 
 def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:

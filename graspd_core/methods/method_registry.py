@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.methods.annealing.annealing_config import AnnealingConfig
@@ -20,6 +21,10 @@ def _unchanged(settings: Any, budget: float) -> Any:
     return settings
 
 
+def _one(settings: Any) -> int:
+    return 1
+
+
 @dataclass(frozen=True)
 class Method:
     """One way to find grasps.
@@ -31,6 +36,7 @@ class Method:
         colour, marker: of its points in charts, as Matplotlib takes them.
         benchmark_count: grasps of one unfiltered batch in the benchmark.
         at_budget: its settings at a share of the usual budget; a method without one keeps its settings.
+        searches: of a round at most, by its settings: again only where too few grasps are expected to hold.
     """
 
     module: str
@@ -40,6 +46,7 @@ class Method:
     marker: str
     benchmark_count: int
     at_budget: Callable[[Any, float], Any] = _unchanged
+    searches: Callable[[Any], int] = _one
 
     def plan(self, task: PlannerInput) -> PlannerOutput:
         """Find poses. Numerical trouble is a pose that is not there, never an exception."""
@@ -48,7 +55,14 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "closed_form": Method(
-        "graspd_core.methods.closed_form.closed_form", ClosedFormConfig, "closed form", "#0072B2", "o", 16, at_budget
+        "graspd_core.methods.closed_form.closed_form",
+        ClosedFormConfig,
+        "closed form",
+        "#0072B2",
+        "o",
+        16,
+        at_budget,
+        attrgetter("searches"),
     ),
     "graspd2022": Method(
         "graspd_core.methods.graspd2022.graspd2022", Graspd2022Config, "Grasp'D (2022)", "#D55E00", "s", 8

@@ -26,6 +26,10 @@ def test_half_the_budget_is_half_the_steps_and_twice_is_twice_the_starts():
     assert figures(CONFIG.at_budget(2.0), STARTS) == [16.0, 4.0]
 
 
+def test_less_than_the_budget_searches_once():
+    assert [CONFIG.at_budget(budget).settings.searches for budget in (0.9, 1.0, 2.0)] == [1, 3, 3]
+
+
 @given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
 def test_more_budget_is_never_less_of_anything(one: float, other: float):
     small, large = (CONFIG.at_budget(budget) for budget in sorted((one, other)))

@@ -73,6 +73,7 @@ class Case:
 TWO_ROUNDS = (
     ("rounds.most", 2),
     ("rounds.first_budget", 1.0),
+    ("closed_form.searches", 1),
     ("closed_form.starts_per_grasp", 1.0),
     ("closed_form.keep_per_grasp", 0.1),
 )
@@ -99,7 +100,6 @@ table = Case(scene="table")
 CASES = {
     "closed_form.keep_per_grasp": Case(1.0, (("closed_form.keep_per_grasp", 0.1),), count=10),
     "closed_form.drops": Case(6, (("closed_form.keep_per_grasp", 0.1), ("closed_form.explore_steps", 6)), count=10),
-    "closed_form.obstacle_factor": table,
     "problem.confidence_floor": table,
     "closed_form.weights.obstacle": table,
     "closed_form.polish_weights.obstacle": table,

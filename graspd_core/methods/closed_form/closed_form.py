@@ -118,11 +118,10 @@ def plan(task: PlannerInput) -> PlannerOutput:
     """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
     settings = task.config.settings
     problem = problem_of(task)
-    count = task.count * (1.0 if problem.obstacles is None else settings.obstacle_factor)
-    starts = initial_poses_of(task, max(_FEWEST_STARTS, round(count * settings.starts_per_grasp)))
+    starts = initial_poses_of(task, max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp)))
     if len(starts.joints) == 0:
         return PlannerOutput(problem, starts)
-    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(count * settings.keep_per_grasp)))
+    solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
     compiled = kernel_problem(problem)
     if compiled is None:
         solution = minimise(solver, problem, starts, task.hooks)

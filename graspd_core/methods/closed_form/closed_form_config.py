@@ -47,10 +47,9 @@ class ClosedFormConfig:
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
         joint_rate: step size of the joints [rad]; sliding ones take 0.05 m for a radian.
+        searches: times at most that starts are tried, again only where too few grasps are expected to hold.
         weights: of the loss terms while exploring and refining.
         polish_weights: of the loss terms while polishing.
-        obstacle_factor: times as many starts are tried and kept where there is a support or a neighbour, which rule
-            out most ways to grasp a thing.
     """
 
     starts_per_grasp: float = 8.0
@@ -67,7 +66,7 @@ class ClosedFormConfig:
     translation_rate: float = 0.003
     rotation_rate: float = 0.03
     joint_rate: float = 0.03
-    obstacle_factor: float = 2.0
+    searches: int = 3
     weights: LossWeights = field(default_factory=lambda: LossWeights(distance=4.0, self_collision=20.0))
     polish_weights: LossWeights = field(
         default_factory=lambda: LossWeights(
@@ -91,7 +90,7 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """The settings at a budget: below one that share of the steps, above it as many times the starts.
+    """The settings at a budget: below one that share of the steps and one search, above it as many times the starts.
 
     Steps are what a small batch costs, and fewer of them do on easy objects. Starts are what hard objects want.
     """
@@ -101,4 +100,5 @@ def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
         for name in ("explore_steps", "refine_steps", "polish_steps", "fine_steps")
     }
     starts = {name: getattr(settings, name) * times for name in ("starts_per_grasp", "keep_per_grasp")}
-    return replace(settings, **steps, **starts)
+    searches = settings.searches if budget >= 1.0 else 1
+    return replace(settings, **steps, **starts, searches=searches)
