@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.hands.link_distance import hand_sdf
+from graspd_core.hands.link_distance import depth_inside, hand_sdf, within_bounds
 from graspd_core.mesh.mesh_distance import inside, unsigned_distance
 from graspd_core.metrics.hand_contacts import PlacedHand
 from graspd_core.metrics.metrics_context import MetricsContext
@@ -25,14 +25,11 @@ def penetration(placed: PlacedHand) -> float:
 
 def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
     """Greatest depth of a hand sample inside a link that is not adjacent to its own [m]."""
-    hand, surface = context.hand, context.surface
-    worst = 0.0
-    for link in np.flatnonzero(surface.radii > 0):
+    hand, worst = context.hand, 0.0
+    for link in range(hand.num_links):
         others = placed.points[~hand.adjacent[link][placed.links]]
         local = (others - placed.translations[link]) @ placed.rotations[link]
-        near = local[((local - surface.centers[link]) ** 2).sum(1) < surface.radii[link] ** 2]
-        if len(near):
-            worst = max(worst, float(-hand_sdf(hand, int(link), torch.as_tensor(near)).min()))
+        worst = max(worst, float(depth_inside(hand, link, local).max(initial=0.0)))
     return worst
 
 
@@ -115,8 +112,7 @@ def _touches_hand(
     touches = np.zeros(len(points), dtype=bool)
     for link in links:
         local = (points - placed.translations[link]) @ placed.rotations[link]
-        reach = context.surface.radii[link] + within
-        near = np.flatnonzero(~touches & (((local - context.surface.centers[link]) ** 2).sum(1) < reach**2))
+        near = np.flatnonzero(~touches & within_bounds(context.hand.primitives_of[link], local, within))
         if len(near):
             touches[near] = hand_sdf(context.hand, int(link), torch.as_tensor(local[near])).numpy() < within
     return touches
