@@ -126,6 +126,13 @@ def pair_distance(
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)
+    return local_distance(solids, local, which)
+
+
+def local_distance(
+    solids: CollisionTensors, local: Float[Tensor, "*batch 3"], which: Int[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Signed distance [m] of points in the frame of a solid to it, each to one."""
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 

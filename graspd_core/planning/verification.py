@@ -112,8 +112,10 @@ def _metrics_context(scene: Scene, hand: HandModel) -> MetricsContext:
 
 def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
     """Candidates with their metrics, none of them tried."""
-    context = _metrics_context(scene, hand)
-    return tuple(replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in candidates)
+    postures = [grasp.grasp for grasp in candidates]
+    with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="graspd-metrics") as pool:
+        metrics = list(pool.map(partial(measure, _metrics_context(scene, hand)), postures))
+    return tuple(replace(grasp, metrics=one) for grasp, one in zip(candidates, metrics, strict=True))
 
 
 @dataclass(frozen=True)
@@ -142,14 +144,17 @@ def run_trials(
 ) -> TriedGrasps:
     """Try candidates in rank order until `count` are verified; `before` are already.
 
-    On as many threads as torch may use in the calling one; verdicts and order do not depend on their number.
+    On as many threads as torch may use in the calling one; verdicts and order do not depend on their number. What is
+    verified is measured beside the trials of the next.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []
+    metrics: list[Future[GraspMetrics]] = []
+    threads = torch.get_num_threads()
     first, audits = None, AuditCount()
     seen = None if run.watch is None else candidates_seen(candidates)
-    trials = results_in_order(run, partial(_all_trials, context), candidates, torch.get_num_threads())
-    with closing(trials):
+    trials = results_in_order(run, partial(_all_trials, context), candidates, threads)
+    with closing(trials), ThreadPoolExecutor(threads, thread_name_prefix="graspd-metrics") as pool:
         for index, (tried, audit) in enumerate(trials):
             passed = tried.verdict is Verdict.VERIFIED
             if run.over() and not passed:
@@ -168,10 +173,14 @@ def run_trials(
                 trials.close()
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
-                tried = replace(tried, metrics=measure(context.metrics(), tried.grasp))
+                metrics.append(pool.submit(measure, context.metrics(), tried.grasp))
+                # A run that ends now still measures what it found: that is never more than there are threads.
+                wait(metrics[: 1 - threads or None])
             (verified if passed else others).append(tried)
             if enough:
                 break
+    if metrics:
+        verified = [replace(grasp, metrics=one.result()) for grasp, one in zip(verified, metrics, strict=True)]
     return TriedGrasps(surest_first((*verified, *others)), first, audits)
 
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+import trimesh
 
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.link_distance import hand_sdf
 from graspd_core.metrics.hand_contacts import contact_area, contact_links, placed_hand, touching
 from graspd_core.metrics.intersection import intersection_volume, penetration, self_penetration
 from graspd_core.metrics.metrics_context import make_metrics_context
@@ -84,6 +88,39 @@ def test_fingers_that_pass_through_each_other(gripper, box, as_object, at):
     # Inner faces are 45 mm − q from the middle: at 46 mm each is 2 mm inside the other finger.
     assert self_penetration(context, placed_hand(context, at(far, (0.046, 0.046)))) == pytest.approx(0.002, abs=1e-9)
     assert self_penetration(context, placed_hand(context, at(far, (0.044, 0.044)))) == 0.0
+
+
+SOLIDS = """<robot name="solids"><link name="base">
+  <collision><origin xyz="0 0 0.02" rpy="0.3 0 0.2"/><geometry><box size="0.03 0.02 0.05"/></geometry></collision>
+  <collision><origin xyz="0.01 0 0.01"/><geometry><sphere radius="0.012"/></geometry></collision>
+  <collision><origin xyz="0 0.01 0.03" rpy="1 0 0"/><geometry><cylinder radius="0.01" length="0.04"/></geometry>
+  </collision>
+  <collision><origin xyz="-0.01 0 0.04"/><geometry><mesh filename="lump.stl"/></geometry></collision>
+  </link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="0 0 0.05"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <link name="tip"><collision><geometry><capsule radius="0.008" length="0.03"/></geometry></collision></link>
+</robot>"""
+
+
+@pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (0.02, 0.01, -0.05), (0.025, 0.025, 0.0)])
+def test_what_solids_of_every_kind_share_with_an_object_is_that_of_all_voxels(where, box, as_object, at, tmp_path):
+    trimesh.creation.icosphere(subdivisions=1, radius=0.015).export(tmp_path / "lump.stl")
+    (tmp_path / "hand.urdf").write_text(SOLIDS)
+    hand = load_hand(tmp_path / "hand.urdf", candidates=8)
+    assert sorted(primitive.kind for primitive in hand.primitives) == ["box", "capsule", "cylinder", "hull", "sphere"]
+    context = make_metrics_context(as_object(box), hand)
+    placed = placed_hand(context, at(where, (0.4,), (0.9, 0.1, -0.2, 0.3)))
+    ticks = np.arange(-100, 100) + 0.5
+    voxels = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3) * 0.001
+    points = voxels @ placed.rotations[0].T + placed.translations[0]
+    points = points[(np.abs(points) < box.vertices.max(0)).all(1)]
+    shared = np.zeros(len(points), dtype=bool)
+    for link in range(hand.num_links):
+        local = (points - placed.translations[link]) @ placed.rotations[link]
+        shared |= hand_sdf(hand, link, torch.as_tensor(local)).numpy() < 0
+    assert shared.sum() > 1000
+    assert intersection_volume(context, placed) == pytest.approx(shared.sum() * MM3, rel=1e-12)
 
 
 def test_a_hand_far_away_touches_nothing(gripper, box, as_object, at):

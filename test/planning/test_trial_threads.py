@@ -16,6 +16,7 @@ from graspd_core.methods.candidates import find_candidates
 from graspd_core.methods.loop import Hooks
 from graspd_core.methods.plan_config import load_preset
 from graspd_core.metrics.metrics_context import make_metrics_context
+from graspd_core.planning import verification
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.trial_threads import results_in_order
 from graspd_core.planning.verification import VerificationContext, rank_by_robustness, run_trials
@@ -25,7 +26,7 @@ from graspd_core.trials import audit
 from graspd_core.trials.noisy_trial import displaced, pose_errors
 from graspd_core.trials.trial_registry import build_worlds
 from graspd_core.trials.world import PROTOCOLS
-from graspd_core.types import Grasp, StopHook, Verdict
+from graspd_core.types import Grasp, GraspMetrics, Progress, StopHook, Verdict
 
 
 def a_run(stop: StopHook | None = None) -> Run:
@@ -136,3 +137,27 @@ def test_verdicts_order_and_audits_do_not_depend_on_the_number_of_threads(candid
     assert outcomes[0][1].disagreed == 0
     # As many data as threads, kept for all of it.
     assert 1 <= len(context.trials.alone.spare) <= 3
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_what_waits_to_be_measured_is_never_more_than_the_threads(number, candidates, threads, monkeypatch):
+    begun, ended, most = [], [], 0
+
+    def slow(*_: object) -> GraspMetrics:
+        begun.append(threading.get_ident())
+        time.sleep(0.3)
+        ended.append(1)
+        return GraspMetrics({})
+
+    def count(progress: Progress) -> None:
+        nonlocal most
+        most = max(most, len(begun) - len(ended))
+
+    context, grasps = candidates
+    torch.set_num_threads(number)
+    monkeypatch.setattr(verification, "measure", slow)
+    tried = run_trials(Run(time.perf_counter(), None, count, None), context, grasps, 3, 0)
+    assert len(ended) == sum(grasp.metrics is not None for grasp in tried.grasps) == 3
+    assert most < number
+    # Beside the trials, not between them.
+    assert threading.get_ident() not in begun
