@@ -71,7 +71,7 @@ def within_bounds(
     if not primitives:
         return np.zeros(len(points), dtype=bool)
     low, high = bounds_of_all(tuple(primitives))
-    return ((points >= low - margin) & (points <= high + margin)).all(1)
+    return np.all((points >= low - margin) & (points <= high + margin), axis=1)
 
 
 @lru_cache(maxsize=_MOST)
