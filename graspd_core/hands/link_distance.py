@@ -70,12 +70,12 @@ def within_bounds(
     """Which points in the link's frame lie within the bounding box of its primitives, or up to `margin` [m] off it."""
     if not primitives:
         return np.zeros(len(points), dtype=bool)
-    low, high = bounds_of_all(tuple(primitives))
+    low, high = _bounds_of_all(tuple(primitives))
     return np.all((points >= low - margin) & (points <= high + margin), axis=1)
 
 
 @lru_cache(maxsize=_MOST)
-def bounds_of_all(primitives: tuple[Primitive, ...]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _bounds_of_all(primitives: tuple[Primitive, ...]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Least and greatest coordinates of one or more primitives in their link's frame [m]."""
     low, high = zip(*(bounds(primitive) for primitive in primitives), strict=True)
     return np.min(low, axis=0), np.max(high, axis=0)
