@@ -16,13 +16,17 @@ from graspd_core.types import TriangleMesh
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
+# A finger goes through a wall between points farther apart than it is wide: thin surface of this area has a point at
+# least [m²], up to so many times the points asked for.
+_AREA_OF_POINT, _MOST = 2.5e-4, 4
 
 
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """At most `count` evenly spread surface points [m] with less than a probe's depth of material below them.
+    """Evenly spread surface points [m] with less than a probe's depth of material below them.
 
     A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
-    nearer. Returns fewer points, possibly none, on a smooth object.
+    nearer. At most `count` of them, more where that leaves large thin walls with too few, fewer on a smooth object,
+    possibly none. Each is the farthest from all before, so that the first of them are evenly spread too.
 
     Returns:
         The points, and the share of the surface with less than two probe depths of material below it: near one for
@@ -33,7 +37,9 @@ def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[n
     sharp = points[_is_thin(query, points, normals, _PROBE)]
     samples, sample_normals = surface_samples(mesh, _POOL // 6, seed)
     share = float(_is_thin(query, samples, sample_normals, 2 * _PROBE).mean())
-    return sharp[farthest_points(sharp, count)], share
+    walls = share * 0.5 * float(np.linalg.norm(_scaled_normals(mesh), axis=1).sum())
+    enough = min(max(count, round(walls / _AREA_OF_POINT)), _MOST * count)
+    return sharp[farthest_points(sharp, enough)], share
 
 
 def _is_thin(
@@ -56,10 +62,15 @@ def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
     return np.array(chosen)
 
 
+def _scaled_normals(mesh: TriangleMesh) -> Float[np.ndarray, "faces 3"]:
+    """Normals of the faces, as long as twice their areas [m²]."""
+    corners = mesh.vertices[mesh.faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def _pool(mesh: TriangleMesh, seed: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Vertices, points along edges, and surface samples, with normals: the places where something sharp may be."""
-    corners = mesh.vertices[mesh.faces]
-    scaled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    scaled = _scaled_normals(mesh)
     vertex_normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(vertex_normals, mesh.faces[:, corner], scaled)

@@ -186,7 +186,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
         sdf=sdf,
         # They were chosen one by one, each the farthest from all before: the first half is spread as well.
         features=torch.as_tensor(sharp if thin else sharp[: settings.features], device=device, dtype=dtype),
-        coarse_features=settings.features if thin else 0,
+        coarse_features=max(settings.features, len(sharp) // 2) if thin else 0,
         center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
         length=scene.object.radius,
         confidence=confidence,

@@ -167,7 +167,7 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 
 
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """At most `count` of the object's sharp points [m] and its share of thin surface, remembered by content."""
+    """The object's sharp points [m] and its share of thin surface (`sharp_points`), remembered by content."""
     near, far = near_object(model)
 
     def build() -> cache.Arrays:
