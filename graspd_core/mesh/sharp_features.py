@@ -18,7 +18,7 @@ _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
 # A finger goes through a wall between points farther apart than it is wide: thin surface of this area has a point at
 # least [m²], up to so many times the points asked for.
-_AREA_OF_POINT, _MOST = 2.5e-4, 4
+_AREA_OF_POINT, _MOST = 2e-4, 8
 
 
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "points 3"], float]:
