@@ -19,7 +19,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.se3 import SE3, safe_norm
 
 # Distances at once; each takes some hundred bytes on the way.
-_AT_ONCE = 2**23
+_AT_ONCE = 2**21
 
 
 @dataclass(frozen=True, eq=False)
