@@ -16,7 +16,7 @@ class ProblemConfig:
             to touch; zero: of each rigid group of links the nearest candidate is drawn.
         softness: how deep the hand gives, as flesh does [m]: the object is planned with as so much thinner, without its
             sharp points. Trials know nothing of it.
-        features: sharp points of the object looked at while polishing.
+        features: sharp points of the object looked at while polishing; more on large thin walls.
         directions: disturbance wrenches.
         friction: coefficient planned with; below the object's own, so that contacts keep a margin.
         confidence_floor: what a contact counts on surface that was only guessed; one where it was seen.

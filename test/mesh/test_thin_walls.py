@@ -65,8 +65,10 @@ def large_cup() -> TriangleMesh:
 def test_a_large_thin_wall_has_more_points_and_they_are_as_dense():
     cup = large_cup()
     points, _ = sharp_points(cup, 256)
+    # Of 0.21 m², both sides of the wall together.
+    assert 1000 < len(points) < 1100
     gaps = np.linalg.norm(surface_samples(cup, 500, 1)[0][:, None] - points, axis=-1).min(1)
-    assert gaps.max() < 0.015
+    assert gaps.max() < 0.012
     # Never without bound: a sheet of two metres does not slow every step down.
     wide = TriangleMesh(20 * cup.vertices * np.array([1.0, 1.0, 1e-3]), cup.faces)
     assert len(sharp_points(wide, 16)[0]) == 8 * 16
@@ -88,7 +90,7 @@ def test_no_finger_goes_through_a_large_thin_wall(tmp_path):
     ]
     # A finger that is through the wall shares 2 cm³ with it, a palm 10; with 256 points the median was 8 cm³.
     assert len(shared) == 8
-    assert np.median(shared) < 3e-6
+    assert np.median(np.array(shared, dtype=float)) < 3e-6
 
 
 @pytest.mark.slow
