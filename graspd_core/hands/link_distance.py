@@ -24,14 +24,6 @@ from graspd_core.se3 import safe_norm
 _MOST = 2048
 
 
-def hand_sdf(hand: HandModel, link: int, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """Signed distance [m] of points in a link's frame to the union of its primitives, +inf for a bare link."""
-    distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
-    for primitive in hand.primitives_of[link]:
-        distance = torch.minimum(distance, primitive_sdf(primitive, points))
-    return distance
-
-
 def primitive_sdf(primitive: Primitive, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Signed distance [m] of points in the link's frame to one primitive."""
     rotation, translation = (torch.as_tensor(a).to(points) for a in (primitive.rotation, primitive.translation))

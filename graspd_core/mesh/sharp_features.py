@@ -16,8 +16,10 @@ from graspd_core.types import TriangleMesh
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
-# A finger goes through a wall between points farther apart than it is wide: thin surface of this area has a point at
-# least [m²], up to so many times the points asked for.
+# Share of thin surface from which an object counts as thin-walled.
+THIN_WALLED = 0.6
+# A finger goes through a wall between points farther apart than it is wide: a thin-walled object has at least one point
+# on so much of its surface [m²], up to so many times the points asked for.
 _AREA_OF_POINT, _MOST = 2e-4, 8
 
 
@@ -25,8 +27,8 @@ def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[n
     """Evenly spread surface points [m] with less than a probe's depth of material below them.
 
     A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
-    nearer. At most `count` of them, more where that leaves large thin walls with too few, fewer on a smooth object,
-    possibly none. Each is the farthest from all before, so that the first of them are evenly spread too.
+    nearer. At most `count` of them, more where that is too few for large thin walls, fewer on a smooth object, possibly
+    none. Each is the farthest from all before, so that the first of them are evenly spread too.
 
     Returns:
         The points, and the share of the surface with less than two probe depths of material below it: near one for
@@ -37,9 +39,10 @@ def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[n
     sharp = points[_is_thin(query, points, normals, _PROBE)]
     samples, sample_normals = surface_samples(mesh, _POOL // 6, seed)
     share = float(_is_thin(query, samples, sample_normals, 2 * _PROBE).mean())
-    walls = share * 0.5 * float(np.linalg.norm(_scaled_normals(mesh), axis=1).sum())
-    enough = min(max(count, round(walls / _AREA_OF_POINT)), _MOST * count)
-    return sharp[farthest_points(sharp, enough)], share
+    if share > THIN_WALLED:
+        walls = share * 0.5 * float(np.linalg.norm(_scaled_normals(mesh), axis=1).sum())
+        count = min(max(count, round(walls / _AREA_OF_POINT)), _MOST * count)
+    return sharp[farthest_points(sharp, count)], share
 
 
 def _is_thin(

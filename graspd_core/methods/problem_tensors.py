@@ -16,6 +16,7 @@ from graspd_core.hands.collision_tensors import CollisionTensors, make_collision
 from graspd_core.hands.kinematics import Kinematics, in_base, link_poses, make_kinematics, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import GridSDF
+from graspd_core.mesh.sharp_features import THIN_WALLED
 from graspd_core.scene.scene import Scene, object_sharp_points
 
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
@@ -25,8 +26,6 @@ _REACH_OF_OTHERS = 0.004
 _REACH_OF_PATCHES = 0.03
 # A base frame this near to the middle of the palm lies in the palm [m].
 _PALM_RADIUS = 0.05
-# Share of thin surface from which an object counts as thin-walled.
-_THIN_WALLED = 0.6
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
     """Lay the scene's object out; kept for the last few scenes, which are hashed by identity."""
     sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
-    thin = thin_share > _THIN_WALLED
+    thin = thin_share > THIN_WALLED
     floor, confidence = settings.confidence_floor, None
     if scene.confidence is not None:
         confidence = floor + (1 - floor) * scene.confidence.to(device, dtype)

@@ -9,7 +9,7 @@ import torch
 from graspd_core.hands.hand_mesh import hand_mesh, primitive_mesh
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.link_distance import hand_sdf
+from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples
@@ -125,9 +125,9 @@ def test_hand_mesh_lies_on_the_links_surfaces(hand: HandModel) -> None:
     mesh = hand_mesh(hand, hand.closed_posture)
     rotations, translations = link_poses(hand, hand.closed_posture)
     distance = torch.full((len(mesh.vertices),), torch.inf, dtype=torch.float64)
-    for link in range(hand.num_links):
-        local = torch.as_tensor((mesh.vertices - translations[link]) @ rotations[link])
-        distance = torch.minimum(distance, hand_sdf(hand, link, local))
+    for primitive in hand.primitives:
+        local = torch.as_tensor((mesh.vertices - translations[primitive.link]) @ rotations[primitive.link])
+        distance = torch.minimum(distance, primitive_sdf(primitive, local))
     assert float(distance.max()) < 1e-9
     assert mesh.faces.max() == len(mesh.vertices) - 1
 

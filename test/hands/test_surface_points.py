@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.link_distance import hand_sdf, primitive_sdf
+from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
 from graspd_core.hands.surface_points import dense_samples
@@ -45,10 +45,11 @@ def _group_distance(hand: HandModel, points: np.ndarray, links: np.ndarray) -> n
     rotations, translations = link_poses(hand, hand.open_posture)
     base = np.einsum("pij,pj->pi", rotations[links], points) + translations[links]
     distance = np.full(len(points), np.inf)
-    for link in range(hand.num_links):
+    for primitive in hand.primitives:
+        link = primitive.link
         same = hand.link_group[links] == hand.link_group[link]
         local = torch.as_tensor((base[same] - translations[link]) @ rotations[link])
-        distance[same] = np.minimum(distance[same], hand_sdf(hand, link, local).numpy())
+        distance[same] = np.minimum(distance[same], primitive_sdf(primitive, local).numpy())
     return distance
 
 
@@ -159,7 +160,8 @@ def test_proxy_spheres_fill_the_links_and_bulge_little(hand: HandModel) -> None:
     for link in range(hand.num_links):
         mine = links == link
         assert mine.any()
-        depth = hand_sdf(hand, link, torch.as_tensor(centers[mine])).numpy()
+        of_link = [primitive_sdf(p, torch.as_tensor(centers[mine])).numpy() for p in hand.primitives_of[link]]
+        depth = np.min(of_link, axis=0)
         assert (depth + radii[mine]).max() < 0.003  # the bulge that the module's docstring owns up to
         surface = points[owners == link]
         reach = np.linalg.norm(surface[:, None] - centers[mine][None], axis=-1) - radii[mine]

@@ -14,7 +14,7 @@ def test_a_sphere_has_no_sharp_points():
     assert sharp_points(make_shape("sphere"), 50)[0].shape == (0, 3)
 
 
-@pytest.mark.parametrize("count", [60, 120])
+@pytest.mark.parametrize("count", [8, 60])
 def test_the_sharp_points_of_a_box_lie_on_its_edges(count: int):
     points, _ = sharp_points(make_shape("box"), count)
     assert len(points) == count
