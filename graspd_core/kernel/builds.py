@@ -29,6 +29,7 @@ _ARGUMENTS = {
     "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _INT, _AT, _AT, _AT, _INT],
     "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
     "graspd_find_pregrasps": [_AT, _AT, _INT, _AT, _AT, _AT, _INT, POLL],
+    "graspd_nearest_features": [_AT, _INT, _AT, _AT, _AT, _AT, _INT],
     "graspd_self_overlap": [_AT, _INT, _AT, _AT, _AT, _INT],
     "graspd_run_steps": [_AT, _AT, _AT, _INT, _INT, _INT, _INT, POLL],
 }

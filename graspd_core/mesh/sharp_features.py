@@ -6,7 +6,7 @@ A hand sampled every few millimetres does not notice an edge that sinks in betwe
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from graspd_core.mesh.mesh_distance import DistanceQuery, make_distance_query, signed_distance
 from graspd_core.mesh.mesh_files import surface_samples
@@ -63,6 +63,20 @@ def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
         nearest = np.minimum(nearest, x * x + y * y + z * z)
         chosen.append(int(nearest.argmax()))
     return np.array(chosen)
+
+
+def neighbours_together(points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:
+    """An order of points in which those that follow each other lie near each other, by halving along the widest side.
+
+    Every sixteen from the first lie together, and so do any eight or four of them.
+    """
+    if len(points) <= 4:
+        return np.arange(len(points))
+    along = points[:, np.ptp(points, axis=0).argmax()].argsort(kind="stable")
+    step = 16 if len(points) > 16 else 4 if len(points) <= 8 else 8
+    half = step * -(-len(points) // (2 * step))
+    first, rest = along[:half], along[half:]
+    return np.concatenate([first[neighbours_together(points[first])], rest[neighbours_together(points[rest])]])
 
 
 def _scaled_normals(mesh: TriangleMesh) -> Float[np.ndarray, "faces 3"]:

@@ -16,7 +16,7 @@ from graspd_core.hands.collision_tensors import CollisionTensors, make_collision
 from graspd_core.hands.kinematics import Kinematics, in_base, link_poses, make_kinematics, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import GridSDF
-from graspd_core.mesh.sharp_features import THIN_WALLED
+from graspd_core.mesh.sharp_features import THIN_WALLED, neighbours_together
 from graspd_core.scene.scene import Scene, object_sharp_points
 
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
@@ -181,11 +181,15 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     if settings.softness:
         sharp, thin = sharp[:0], False
         sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
+    # They were chosen one by one, each the farthest from all before: the first half is spread as well.
+    coarse = max(settings.features, len(sharp) // 2) if thin else 0
+    features = [part[neighbours_together(part)] for part in (sharp[:coarse], sharp[coarse:])]
     return ObjectTensors(
         sdf=sdf,
-        # They were chosen one by one, each the farthest from all before: the first half is spread as well.
-        features=torch.as_tensor(sharp if thin else sharp[: settings.features], device=device, dtype=dtype),
-        coarse_features=max(settings.features, len(sharp) // 2) if thin else 0,
+        features=torch.as_tensor(
+            np.concatenate(features) if thin else sharp[: settings.features], device=device, dtype=dtype
+        ),
+        coarse_features=coarse,
         center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
         length=scene.object.radius,
         confidence=confidence,

@@ -77,6 +77,18 @@ int32_t graspd_find_pregrasps(const Problem* p, const Pregrasp* settings, int32_
     });
 }
 
+// Of every row of x (places those of the base) and every solid the nearest sharp point, its distance and the gradient of
+// that (rows x solids x 3).
+int32_t graspd_nearest_features(const Problem* p, int32_t rows, const float* x, int32_t* pick, float* distance,
+                                float* gradient, int32_t threads) {
+    return guarded([&] {
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
+            const int first = row * p->solids.count;
+            nearest_features(*p, x + row * (7 + p->hand.joints), pick + first, distance + first, gradient + 3 * first, s);
+        });
+    });
+}
+
 // Greatest depth of the hand in itself at every row of joints; `checked` is links x solids.
 int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints, const int32_t* checked, float* depth,
                             int32_t threads) {

@@ -60,6 +60,27 @@ struct Task {
     int count = 0;
 };
 
+// Sharp points that follow each other lie near each other: the middle of each vector of them, and how far they reach.
+struct Blocks {
+    explicit Blocks(const Object& object)
+        : count((object.feature_count + LANES - 1) / LANES), x(padded(count)), y(padded(count)), z(padded(count)),
+          reach(padded(count)) {
+        const float *fx = object.features, *fy = fx + object.feature_stride, *fz = fy + object.feature_stride;
+        for (int b = 0; b < count; b++) {
+            const int first = b * LANES, end = std::min(first + LANES, object.feature_count);
+            for (int i = first; i < end; i++) {
+                x[b] += fx[i] / (end - first);
+                y[b] += fy[i] / (end - first);
+                z[b] += fz[i] / (end - first);
+            }
+            for (int i = first; i < end; i++)
+                reach[b] = std::max(reach[b], hypotf(hypotf(fx[i] - x[b], fy[i] - y[b]), fz[i] - z[b]));
+        }
+    }
+    int count;
+    Array<float> x, y, z, reach;  // [m]
+};
+
 // A sharp point of the object and the solid that it is near to.
 struct Pair {
     int32_t solid, feature;
@@ -75,7 +96,8 @@ struct Scratch {
           task(padded(std::min(p.task_points, std::max(p.coarse.count, p.fine.count))), p.directions),
           gap(p.hand.groups), gap_at(p.hand.groups), gap_pair(p.hand.groups),
           solid(12 * p.solids.count),
-          bound(std::max(1, p.solids.count * p.object.feature_stride)),
+          blocks(p.object),
+          bound(p.solids.count * blocks.count * LANES), bounded(p.solids.count * blocks.count),
           picked(p.feature_pairs), pair(p.feature_pairs),
           sphere(padded(p.spheres.centers.count)),
           obstacle(padded(std::max(p.obstacles.corners.count, p.obstacles.spheres.count))) {}
@@ -87,7 +109,10 @@ struct Scratch {
     Array<float> gap;          // of each group
     Array<int32_t> gap_at, gap_pair;  // candidate or pair that has it
     Array<float> solid;        // T_object_solid
-    Array<float> bound;
+    Blocks blocks;
+    Array<float> bound;        // of the pairs of some solids and blocks
+    Array<int32_t> bounded;    // the first pair of each
+    float cut_of_task = 0, cut_of_pairs = INFINITY;  // up to where the last choice went
     Array<int32_t> picked;
     Array<Pair> pair;
     Samples sphere, obstacle;

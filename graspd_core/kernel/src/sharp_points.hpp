@@ -4,6 +4,9 @@
 
 namespace graspd {
 
+// How much farther than before the nearest pairs are looked for [m].
+constexpr float CUT_MARGIN = 0.005f;
+
 // Signed distance of a point to a solid, both in the solid's frame, and its gradient there.
 static float solid_distance(const float* core, float radius, bool round, const float* at, float* gradient) {
     float side[3] = {at[0] < 0 ? -1.f : 1.f, at[1] < 0 ? -1.f : 1.f, at[2] < 0 ? -1.f : 1.f};
@@ -32,49 +35,112 @@ static float solid_distance(const float* core, float radius, bool round, const f
     return length + (past[most] < 0 ? past[most] : 0.f) - radius;
 }
 
-// A lower bound of the distance of every point to every solid: the largest coordinate beyond its bounding box.
-static void bound_distances(const Problem& p, int features, Scratch& s) {
-    const Solids& solids = p.solids;
-    const float *fx = p.object.features, *fy = fx + p.object.feature_stride, *fz = fy + p.object.feature_stride;
-    const int whole = padded(features);
-    for (int k = 0; k < solids.count; k++) {
-        float* t = s.solid + 12 * k;
-        compose(s.link + 12 * solids.link[k], solids.pose + 12 * k, t);
+// The hand's solids where they are.
+static void place_solids(const Problem& p, Scratch& s) {
+    for (int k = 0; k < p.solids.count; k++)
+        compose(s.link + 12 * p.solids.link[k], p.solids.pose + 12 * k, s.solid + 12 * k);
+}
+
+// A lower bound of the distance of points to a solid: the largest coordinate beyond its bounding box.
+struct Bound {
+    Bound(const Solids& solids, int k, const float* placed) : t(placed) {
         const float *core = solids.core + 3 * k, radius = solids.radius[k];
-        float ox = t[0] * t[3] + t[4] * t[7] + t[8] * t[11], oy = t[1] * t[3] + t[5] * t[7] + t[9] * t[11],
-              oz = t[2] * t[3] + t[6] * t[7] + t[10] * t[11];
-        for (int i = 0; i < whole; i += LANES) {
-            Floats x = load(fx + i), y = load(fy + i), z = load(fz + i);
-            Floats a = magnitude(t[0] * x + t[4] * y + t[8] * z - ox) - (core[0] + radius);
-            Floats b = magnitude(t[1] * x + t[5] * y + t[9] * z - oy) - (core[1] + radius);
-            Floats c = magnitude(t[2] * x + t[6] * y + t[10] * z - oz) - (core[2] + radius);
-            store(s.bound + k * whole + i, greater(greater(a, b), c));
+        for (int i = 0; i < 3; i++) {
+            origin[i] = t[i] * t[3] + t[4 + i] * t[7] + t[8 + i] * t[11];
+            half[i] = core[i] + radius;
         }
-        for (int i = features; i < whole; i++) s.bound[k * whole + i] = INFINITY;
+    }
+    Floats operator()(Floats x, Floats y, Floats z) const {
+        Floats a = magnitude(t[0] * x + t[4] * y + t[8] * z - origin[0]) - half[0];
+        Floats b = magnitude(t[1] * x + t[5] * y + t[9] * z - origin[1]) - half[1];
+        Floats c = magnitude(t[2] * x + t[6] * y + t[10] * z - origin[2]) - half[2];
+        return greater(greater(a, b), c);
+    }
+    const float* t;
+    float origin[3], half[3];
+};
+
+// Bounds of the pairs of solids and blocks that may be as near as `most`; returns how many pairs these are.
+static int bound_distances(const Problem& p, int features, float most, Scratch& s) {
+    const float *fx = p.object.features, *fy = fx + p.object.feature_stride, *fz = fy + p.object.feature_stride;
+    const int whole = padded(features), blocks = whole / LANES;
+    int found = 0;
+    for (int k = 0; k < p.solids.count; k++) {
+        const Bound bound(p.solids, k, s.solid + 12 * k);
+        for (int first = 0; first < blocks; first += LANES) {
+            Floats nearest = bound(load(s.blocks.x + first), load(s.blocks.y + first), load(s.blocks.z + first));
+            for (unsigned set = bits(nearest - load(s.blocks.reach + first) <= most); set; set &= set - 1) {
+                const int block = first + __builtin_ctz(set), i = block * LANES;
+                if (block >= blocks) break;
+                store(s.bound + found * LANES, bound(load(fx + i), load(fy + i), load(fz + i)));
+                for (int j = features; j < i + LANES; j++) s.bound[found * LANES + j - i] = INFINITY;
+                s.bounded[found++] = k * whole + i;
+            }
+        }
+    }
+    return found * LANES;
+}
+
+// The nearest pairs, as solid · points + point: what is farther than they were a moment ago is left out, unless they
+// turn out to be farther now.
+static int nearest_pairs(const Problem& p, int features, Scratch& s) {
+    const int wanted = std::min(p.feature_pairs, features * p.solids.count);
+    const float most = s.cut_of_pairs + CUT_MARGIN;
+    int found = least(s.bound, bound_distances(p, features, most, s), wanted, &s.cut_of_pairs, s.picked);
+    if (found < wanted || s.cut_of_pairs > most)
+        found = least(s.bound, bound_distances(p, features, INFINITY, s), wanted, &s.cut_of_pairs, s.picked);
+    for (int m = 0; m < found; m++) s.picked[m] = s.bounded[s.picked[m] / LANES] + s.picked[m] % LANES;
+    return found;
+}
+
+// Signed distance of a sharp point to a solid, and its gradient at the point.
+static float feature_distance(const Problem& p, int solid, int feature, float* gradient, Scratch& s) {
+    const Solids& solids = p.solids;
+    const float *t = s.solid + 12 * solid, *at = p.object.features + feature;
+    float x = at[0] - t[3], y = at[p.object.feature_stride] - t[7], z = at[2 * p.object.feature_stride] - t[11];
+    float local[3] = {t[0] * x + t[4] * y + t[8] * z, t[1] * x + t[5] * y + t[9] * z, t[2] * x + t[6] * y + t[10] * z};
+    float slope[3];
+    float distance = solid_distance(solids.core + 3 * solid, solids.radius[solid], solids.round[solid] != 0, local, slope);
+    for (int r = 0; r < 3; r++) gradient[r] = t[4 * r] * slope[0] + t[4 * r + 1] * slope[1] + t[4 * r + 2] * slope[2];
+    return distance;
+}
+
+// For every solid the sharp point nearest to it, its distance, and the gradient of that. The solids are placed.
+static void nearest_features(const Problem& p, int32_t* pick, float* distance, float* gradient, Scratch& s) {
+    const Object& object = p.object;
+    for (int k = 0; k < p.solids.count; k++) {
+        const Bound bound(p.solids, k, s.solid + 12 * k);
+        pick[k] = 0;
+        distance[k] = INFINITY;
+        for (int first = 0; first < s.blocks.count; first += LANES) {
+            Floats least = bound(load(s.blocks.x + first), load(s.blocks.y + first), load(s.blocks.z + first)) -
+                           load(s.blocks.reach + first);
+            for (int block = first; block < std::min(first + LANES, s.blocks.count); block++) {
+                if (!(least[block - first] < distance[k])) continue;
+                for (int i = block * LANES; i < std::min((block + 1) * LANES, object.feature_count); i++) {
+                    float slope[3], d = feature_distance(p, k, i, slope, s);
+                    if (!(d < distance[k])) continue;
+                    pick[k] = i;
+                    distance[k] = d;
+                    memcpy(gradient + 3 * k, slope, sizeof slope);
+                }
+            }
+        }
     }
 }
 
 // Depth of the nearest pairs; their adjoints begin, and groups learn of pairs that are nearer than their candidates.
 static int sharp_points(const Problem& p, int features, float weight, float* penetration, Scratch& s) {
     const Solids& solids = p.solids;
-    const Object& object = p.object;
     if (features == 0 || solids.count == 0) return 0;
-    bound_distances(p, features, s);
-    const int whole = padded(features);
-    int pairs = least(s.bound, solids.count * whole, std::min(p.feature_pairs, features * solids.count), s.picked);
+    place_solids(p, s);
+    const int whole = padded(features), pairs = nearest_pairs(p, features, s);
     for (int m = 0; m < pairs; m++) {
+        float steep;
         Pair& pair = s.pair[m];
         pair.solid = s.picked[m] / whole;
         pair.feature = s.picked[m] % whole;
-        const float* t = s.solid + 12 * pair.solid;
-        float x = object.features[pair.feature] - t[3], y = object.features[object.feature_stride + pair.feature] - t[7],
-              z = object.features[2 * object.feature_stride + pair.feature] - t[11];
-        float local[3] = {t[0] * x + t[4] * y + t[8] * z, t[1] * x + t[5] * y + t[9] * z, t[2] * x + t[6] * y + t[10] * z};
-        float slope[3], steep;
-        pair.distance = solid_distance(
-            solids.core + 3 * pair.solid, solids.radius[pair.solid], solids.round[pair.solid] != 0, local, slope);
-        for (int r = 0; r < 3; r++)
-            pair.gradient[r] = t[4 * r] * slope[0] + t[4 * r + 1] * slope[1] + t[4 * r + 2] * slope[2];
+        pair.distance = feature_distance(p, pair.solid, pair.feature, pair.gradient, s);
         *penetration += tempered(-pair.distance, &steep);
         pair.adjoint = -weight * steep;
         int group = solids.group[pair.solid];

@@ -111,6 +111,15 @@ static float find_pregrasp(const Problem& p, const Pregrasp& settings, const flo
     return 1.f - worst / settings.clearance;
 }
 
+// The sharp points nearest to the solids of a hand at x, the base's place, quaternion and joints.
+static void nearest_features(const Problem& p, const float* x, int32_t* pick, float* distance, float* gradient, Scratch& s) {
+    float base[12];
+    turned_base(x + 3, x, base);
+    place_links(p.hand, base, x + 7, s.link);
+    place_solids(p, s);
+    nearest_features(p, pick, distance, gradient, s);
+}
+
 // Greatest depth of a fine candidate in a solid that `checked` (links x solids) asks about; zero where there is none.
 static float self_overlap(const Problem& p, const float* joints, const int32_t* checked, Scratch& s) {
     const float standing[7] = {0, 0, 0, 1, 0, 0, 0};

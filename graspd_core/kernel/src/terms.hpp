@@ -6,6 +6,8 @@
 namespace graspd {
 
 constexpr float MILLIMETRES = 1000.f, PER_CENTIMETRE = 100.f;
+// How far from the last cut the next is looked for, of the range of the keys.
+constexpr float NEAR_CUT = 1 / 64.f;
 
 // Tempered depth d²/(1 + d/10) for d in mm, over 10, and its slope per metre.
 INLINE float tempered(float depth, float* slope) {
@@ -15,8 +17,9 @@ INLINE float tempered(float depth, float* slope) {
 }
 
 // Indices of the `wanted` least keys; NaN is never among them. Halves between bounds until as many lie below, or the
-// bounds meet: then equal keys fill up from the first. Returns how many there are.
-static int least(const float* key, int count, int wanted, int32_t* out) {
+// bounds meet: then equal keys fill up from the first. It begins at `cut`, up to which the last choice went: keys change
+// little from step to step. Returns how many there are.
+static int least(const float* key, int count, int wanted, float* cut, int32_t* out) {
     const int whole = padded(count);
     Floats low = all(INFINITY), high = all(-INFINITY);
     for (int i = 0; i < whole; i += LANES) {
@@ -31,7 +34,9 @@ static int least(const float* key, int count, int wanted, int32_t* out) {
     }
     below = std::nextafter(below, -INFINITY);  // no key is at or under `below`; `upto` has all
     for (int round = 0; round < 64; round++) {
-        float middle = round == 0 ? below + 0.25f * (upto - below) : 0.5f * (below + upto);
+        float middle = round > 0 ? 0.5f * (below + upto) : *cut;
+        if (round == 1) middle = *cut + (*cut == below ? NEAR_CUT : -NEAR_CUT) * (upto - below);
+        if (!(middle > below && middle < upto)) middle = 0.5f * (below + upto);
         if (!(middle > below && middle < upto)) break;
         Ints under = {};
         for (int i = 0; i < whole; i += LANES) under -= load(key + i) <= middle;
@@ -41,6 +46,7 @@ static int least(const float* key, int count, int wanted, int32_t* out) {
         if (found >= wanted) upto = middle;
         if (found == wanted) break;
     }
+    *cut = upto;
     int picked = 0;
     for (bool ties : {false, true})
         for (int i = 0; i < whole && picked < wanted; i += LANES) {

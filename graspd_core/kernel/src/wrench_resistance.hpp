@@ -13,7 +13,7 @@ static int choose_contacts(const Problem& p, const Points& points, float delta, 
     Task& t = s.task;
     const Object& object = p.object;
     const Samples& at = s.candidates;
-    int count = least(s.key, points.count, std::min(p.task_points, points.count), t.index);
+    int count = least(s.key, points.count, std::min(p.task_points, points.count), &s.cut_of_task, t.index);
     const float inverse = 1.f / object.length;
     for (int j = 0; j < padded(count); j++) {
         t.ax[j] = t.ay[j] = t.az[j] = t.nx[j] = t.ny[j] = t.nz[j] = t.known[j] = 0;

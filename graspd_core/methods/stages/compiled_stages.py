@@ -6,7 +6,7 @@ from collections.abc import Callable
 from ctypes import byref
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.config import GraspStagesConfig
@@ -47,3 +47,15 @@ def self_overlap_compiled(
     arguments = len(joints), joints.data_ptr(), asked.data_ptr(), depth.data_ptr(), torch.get_num_threads()
     call("graspd_self_overlap", byref(compiled.struct), *arguments)
     return depth
+
+
+def nearest_features_compiled(
+    compiled: KernelProblem, poses: Poses, solids: int
+) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
+    """`contact_set.nearest_features` for the problem as the kernel reads it."""
+    x = pack(poses).contiguous()
+    pick = torch.zeros((len(x), solids), dtype=torch.int32)
+    distance, gradient = x.new_empty(pick.shape), x.new_zeros((*pick.shape, 3))
+    found = pick.data_ptr(), distance.data_ptr(), gradient.data_ptr()
+    call("graspd_nearest_features", byref(compiled.struct), len(x), x.data_ptr(), *found, torch.get_num_threads())
+    return pick.long(), distance, gradient

@@ -13,8 +13,8 @@ from graspd_core.hands.kinematics import forward, place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.kernel_problem import kernel_problem
 from graspd_core.methods.poses import Poses
-from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
-from graspd_core.methods.stages.compiled_stages import self_overlap_compiled
+from graspd_core.methods.problem import Problem, hand_forward
+from graspd_core.methods.stages.compiled_stages import nearest_features_compiled, self_overlap_compiled
 
 # Contacts of one link beyond its nearest.
 _SPREAD = 2
@@ -72,21 +72,12 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
         gap,
         (gap.abs() <= reach) & own_link & apart,
     )
-    return _with_features(problem, placed, found, reach) if len(problem.object.features) else found
+    return _with_features(problem, poses, found, reach) if len(problem.object.features) else found
 
 
-def _with_features(problem: Problem, placed: HandPlacement, found: ContactSet, reach: float) -> ContactSet:
+def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
     """Add one slot per solid: the object's sharp point nearest to it, with the solid's own normal turned round."""
-    in_base = placed.base.apply_inverse(problem.object.features)
-    nearest, pick = solid_distance(problem.hand.solids, placed.links, in_base).min(1)
-    rows = torch.arange(len(pick), device=pick.device)[:, None]
-    solids = torch.arange(len(problem.hand.solids.link), device=pick.device).expand_as(pick)
-    with torch.enable_grad():
-        points = in_base[rows, pick].requires_grad_(True)
-        (directions,) = torch.autograd.grad(
-            pair_distance(problem.hand.solids, placed.links, points, solids).sum(), points
-        )
-    outward = directions @ placed.base.rotation.transpose(-1, -2)
+    pick, nearest, outward = nearest_features(problem, poses)
     return ContactSet(
         torch.cat([found.link, problem.hand.solids.link]),
         torch.cat([found.position, problem.object.features[pick]], 1),
@@ -94,6 +85,25 @@ def _with_features(problem: Problem, placed: HandPlacement, found: ContactSet, r
         torch.cat([found.distance, nearest], 1),
         torch.cat([found.active, nearest.abs() <= reach], 1),
     )
+
+
+def nearest_features(
+    problem: Problem, poses: Poses
+) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
+    """Which sharp point is nearest to every solid of the hand, its signed distance [m], and the gradient of that."""
+    solids = problem.hand.solids
+    compiled = kernel_problem(problem)
+    if compiled is not None:
+        return nearest_features_compiled(compiled, poses, len(solids.link))
+    links, base = forward(problem.hand.kinematics, poses.joints), poses.base
+    in_base = base.apply_inverse(problem.object.features)
+    nearest, pick = solid_distance(solids, links, in_base).min(1)
+    rows = torch.arange(len(pick), device=pick.device)[:, None]
+    which = torch.arange(len(solids.link), device=pick.device).expand_as(pick)
+    with torch.enable_grad():
+        points = in_base[rows, pick].requires_grad_(True)
+        (directions,) = torch.autograd.grad(pair_distance(solids, links, points, which).sum(), points)
+    return pick, nearest, directions @ base.rotation.transpose(-1, -2)
 
 
 @torch.no_grad()
