@@ -18,16 +18,16 @@ _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
 # Share of thin surface from which an object counts as thin-walled.
 THIN_WALLED = 0.6
-# A finger goes through a wall between points farther apart than it is wide: a thin-walled object has at least one point
-# on so much of its surface [m²], up to so many times the points asked for.
-_AREA_OF_POINT, _MOST = 2e-4, 8
+# A finger goes through a wall between points that are far apart: a thin-walled object has at least one point on so much
+# of its surface [m²], up to so many times the points asked for.
+_AREA_OF_POINT, _MOST = 5e-5, 16
 
 
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "points 3"], float]:
     """Evenly spread surface points [m] with less than a probe's depth of material below them.
 
     A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
-    nearer. At most `count` of them, more where that is too few for large thin walls, fewer on a smooth object, possibly
+    nearer. At most `count` of them, more where that is too few for thin walls, fewer on a smooth object, possibly
     none. Each is the farthest from all before, so that the first of them are evenly spread too.
 
     Returns:

@@ -24,7 +24,7 @@ import numpy as np
 Arrays = dict[str, np.ndarray]
 
 # Part of every file's name: raise it when what is computed from the same mesh or hand changes.
-VERSION = 7
+VERSION = 8
 CAPACITY = 24
 # Size of all files together [bytes], and how many are written between two looks at it.
 MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16

@@ -7,7 +7,7 @@ import torch
 
 from graspd_core.config import GraspStagesConfig
 from graspd_core.methods.poses import Poses, moved_along, unpack
-from graspd_core.methods.stages.contact_set import self_overlap
+from graspd_core.methods.stages.contact_set import nearest_features, self_overlap
 from graspd_core.methods.stages.pregrasp import find_pregrasp
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
@@ -73,3 +73,21 @@ def test_overlap_is_torchs(problem_of, hands, torch_alone, hand):
     assert not everything.any()
     if hand.startswith("allegro"):
         assert mine.max() > 0.002
+
+
+@pytest.mark.parametrize("scene", ["mug", "box"])
+@pytest.mark.parametrize("hand", HANDS)
+def test_the_sharp_points_nearest_to_solids_are_torchs(problem_of, rows_of, torch_alone, hand, scene):
+    problem = problem_of(hand, scene)
+    poses = grasps_of(problem, rows_of(hand, scene, problem))
+    pick, distance, gradient = nearest_features(problem, poses)
+    torch_alone()
+    their_pick, their_distance, their_gradient = nearest_features(problem, poses)
+    assert distance.flatten().tolist() == pytest.approx(their_distance.flatten().tolist(), abs=2e-6)
+    same = (pick == their_pick).flatten()
+    assert len(pick.unique()) > 4
+    assert same.float().mean() > 0.99
+    alike = (gradient - their_gradient).abs().amax(-1).flatten() < 1e-3
+    # On an edge of a solid two slopes are right; whichever rounding chooses has length one.
+    assert alike[same].float().mean() > 0.99
+    assert gradient.norm(dim=-1).flatten().tolist() == pytest.approx([1.0] * pick.numel(), abs=1e-4)
