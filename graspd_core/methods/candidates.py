@@ -117,7 +117,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
         depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, some.poses.quaternion, *ends)
         knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
-    return [_grasp(hand, i, some, float(scores[i])) for i in range(len(scores))]
+    return _grasps(hand, some, scores)
 
 
 def staged(
@@ -136,31 +136,30 @@ def staged(
     return Staged(poses, opened, clearance, contact_set, pressed, overlap)
 
 
-def _grasp(hand: HandModel, row: int, some: Staged, value: float) -> Grasp:
-    poses, opened, contact_set = some.poses, some.opened, some.contact_set
-    quaternion = poses.quaternion[row] / poses.quaternion[row].norm()
-
-    def posture(translation: Tensor, joints: Tensor) -> Posture:
-        # Rounding to float32 and back may step over a limit by an ulp.
-        inside = np.clip(joints.double().cpu().numpy(), hand.lower, hand.upper)
-        return Posture(translation.double().cpu().numpy(), quaternion.double().cpu().numpy(), inside)
-
-    # One contact a link: of its active slots, the one nearest to the surface.
-    active = torch.nonzero(contact_set.active[row]).flatten()
-    active = active[contact_set.distance[row, active].abs().argsort(descending=True)]
-    nearest = {int(contact_set.link[slot]): int(slot) for slot in active}
-    contacts = tuple(
-        Contact(
-            hand.link_names[link],
-            tuple(contact_set.position[row, slot].tolist()),
-            tuple(contact_set.normal[row, slot].tolist()),
+def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
+    poses, opened, found = some.poses, some.opened, some.contact_set
+    quaternion = _numbers(poses.quaternion / poses.quaternion.norm(dim=-1, keepdim=True))
+    active, distance = found.active.cpu().numpy(), found.distance.abs().cpu().numpy()
+    link, position, normal = found.link.tolist(), _numbers(found.position), _numbers(found.normal)
+    places = [_numbers(x) for x in (opened.translation, poses.translation)]
+    # Rounding to float32 and back may step over a limit by an ulp.
+    joints = [np.clip(_numbers(x), hand.lower, hand.upper) for x in (opened.joints, poses.joints, some.pressed.joints)]
+    grasps = []
+    for row, odds in enumerate(scores.tolist()):
+        # One contact a link: of its active slots, the one nearest to the surface.
+        slots = np.flatnonzero(active[row])
+        nearest = {link[slot]: slot for slot in slots[np.argsort(-distance[row, slots], kind="stable")]}
+        contacts = tuple(
+            Contact(hand.link_names[of], tuple(position[row, slot].tolist()), tuple(normal[row, slot].tolist()))
+            for of, slot in sorted(nearest.items())
         )
-        for link, slot in sorted(nearest.items())
-    )
-    return Grasp(
-        pregrasp=posture(opened.translation[row], opened.joints[row]),
-        grasp=posture(poses.translation[row], poses.joints[row]),
-        squeeze=posture(poses.translation[row], some.pressed.joints[row]),
-        contacts=contacts,
-        score=value,
-    )
+        pregrasp, grasp, squeezed = (
+            Posture(place[row].copy(), quaternion[row].copy(), values[row].copy())
+            for place, values in zip((places[0], places[1], places[1]), joints, strict=True)
+        )
+        grasps.append(Grasp(pregrasp=pregrasp, grasp=grasp, squeeze=squeezed, contacts=contacts, score=odds))
+    return grasps
+
+
+def _numbers(values: Tensor) -> np.ndarray:
+    return values.double().cpu().numpy()

@@ -149,9 +149,8 @@ def half_widths(
     """
     normal = torch.as_tensor(hand.palm_normal)
     closing = torch.as_tensor(closing_axis(hand))
-    local = (surface[None] - palm[:, None]) @ rotation
-    along, depth = local @ closing, local @ normal
-    across = local @ torch.linalg.cross(normal, closing)
+    axes = (rotation @ torch.stack([closing, normal, torch.linalg.cross(normal, closing)], -1)).unbind(-1)
+    along, depth, across = (axis @ surface.T - (axis * palm).sum(-1, keepdim=True) for axis in axes)
     within = (across.abs() < _SLAB_HALF_BREADTH) & (depth < _SLAB_DEPTH)
     width = torch.where(within, along.abs(), 0.0).amax(-1)
     # A palm that faces past the object has nothing to close around.
