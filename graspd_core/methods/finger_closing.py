@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.hands.collision_spheres import collision_spheres
-from graspd_core.hands.collision_tensors import solid_distance
 from graspd_core.hands.kinematics import place_points
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.methods.poses import Poses
 from graspd_core.methods.problem import HandPlacement, Problem, hand_forward
+from graspd_core.methods.stages.contact_set import nearest_features
 
 # A finger whose step is halved to this share has arrived; steps are full travels of the closing over `close_steps`.
 _ARRIVED = 1 / 32
@@ -167,10 +167,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
     count = placed.links.translation.shape[1]
     gaps = [_least(sample_sdf(problem.object.sdf, placed.points)[0], problem.hand.fine.links, count)]
     if len(problem.object.features) and len(problem.hand.solids.link):
-        sharp = solid_distance(
-            problem.hand.solids, placed.links, placed.base.apply_inverse(problem.object.features)
-        ).amin(1)
-        gaps.append(_least(sharp, problem.hand.solids.link, count))
+        gaps.append(_least(nearest_features(problem, poses)[1], problem.hand.solids.link, count))
     overlap = _least(-sphere_overlap(problem, placed), sphere_links, count)
     return torch.stack([torch.stack(gaps).amin(0), overlap], 1)
 
