@@ -24,8 +24,9 @@ _SAMPLES = 1500
 
 
 def other_rules(evidence: Evidence) -> tuple[str, ...]:
-    """The rules that the reconstruction did not take, in the order of `RULES`; none where nothing was hidden."""
-    return tuple(rule for rule in RULES if rule != evidence.chosen) if evidence.hidden else ()
+    """The rules that the reconstruction did not take, the quickest first; none where nothing was hidden."""
+    # The later in `RULES`, the less is looked for in what was seen.
+    return tuple(rule for rule in reversed(RULES) if rule != evidence.chosen) if evidence.hidden else ()
 
 
 def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMesh | None:
