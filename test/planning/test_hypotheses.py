@@ -7,6 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from graspd_core.config import CertaintyConfig
 from graspd_core.config.certainty_config import HELD_AFTER
@@ -46,9 +48,13 @@ def plan(scene: Scene, probability: float, rounds: int = 3) -> GraspResult:
     return plan_grasps(scene, load_hand("allegro_right"), count=3, preset=config, measure=False)
 
 
-def under(*passed: bool) -> Hypotheses:
-    def hypothesis(number: int, held: bool) -> Hypothesis:
-        result = TrialResult("hold", held, 0.01 * number, 0.0, "" if held else "the object moved")
+def under(*passed: bool | None) -> Hypotheses:
+    """Hypotheses that a grasp passes, fails, or that cannot be tried."""
+
+    def hypothesis(number: int, held: bool | None) -> Hypothesis:
+        result = None
+        if held is not None:
+            result = TrialResult("hold", held, 0.01 * number, 0.0, "" if held else "the object moved")
         return Hypothesis(f"number {number}", lambda grasp, stop: result)
 
     return Hypotheses(tuple(hypothesis(number, held) for number, held in enumerate(passed)), allowed=1)
@@ -67,6 +73,16 @@ def test_a_grasp_may_fail_under_as_many_as_are_allowed(passed, verified, probabi
     assert (result.name, result.passed, likely) == (HYPOTHESES, verified, probability)
     assert bool(result.reason) is not verified
     assert result.displacement == travel
+
+
+@given(
+    st.lists(st.sampled_from([True, False, None]), max_size=9).flatmap(
+        lambda p: st.tuples(st.just(p), st.permutations(p))
+    )
+)
+def test_the_verdict_is_the_same_in_every_order(orders):
+    passed, turned = (try_hypotheses(under(*order), GRASP, lambda: False)[0].passed for order in orders)
+    assert passed == turned == (orders[0].count(False) <= 1)
 
 
 def test_the_reason_names_what_the_grasp_failed_under():
