@@ -26,7 +26,7 @@ STEADY = "balanced_steady"
 _RANKED = "robust"
 # Of settings with more steps than this a raw cell is asked for fewer grasps: they take seconds each.
 _LONG, _LONG_COUNT = 2000, 4
-# Settings with more steps than this are run on the objects of a quick run alone, unless they or objects are named.
+# A grasp of settings with more steps than this takes three times as long.
 _LONGEST = 7000
 # Trials of the settings sweeps.
 _SWEEP_TRIALS = ("standard",)
@@ -73,12 +73,11 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     planned = {name: config for name, config in presets.items() if name in PLANNED}
     if "balanced" in planned:
         planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
-    trials, named = _trials(request, USUAL), request.presets or request.objects
+    trials = _trials(request, USUAL)
     cells: list[Cell] = []
     for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
-            if named or _steps(config) <= _LONGEST or thing in _QUICK_OBJECTS:
-                cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
+            cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
         # The closed form's own presets are what `plan_grasps` is used with; the others are only compared raw.
         for name, config in planned.items():
             cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
@@ -143,11 +142,11 @@ def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
 def cell_seconds(cell: Cell) -> float:
     """CPU seconds of a cell, roughly; measured on one thread of a quiet core."""
     if cell.kind != "raw":
-        return {"verified": 2.5, "pace": 8.0, "start": 6.0}[cell.kind]
+        return {"verified": 1.5, "pace": 8.0, "start": 6.0}[cell.kind]
     each = _SECONDS.get(cell.settings.method, 1.0)
     if _steps(cell.settings) > _LONG:
-        each = 28.0 if _steps(cell.settings) > _LONGEST else 8.0
-    return 1.0 + cell.count * (each + 0.1 * len(cell.trials))
+        each = 25.0 if _steps(cell.settings) > _LONGEST else 8.0
+    return 1.0 + cell.count * (each + 0.075 * len(cell.trials))
 
 
 def _steps(config: PlanConfig) -> int:

@@ -19,7 +19,7 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.planning.run_clock import Run
 from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.scene.scene import ObjectModel, Scene, build_scene, object_parts
+from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, build_scene, object_parts
 from graspd_core.trials.hold_trial import STOPPED, hold_trial
 from graspd_core.trials.noisy_trial import PoseError, displaced, pose_errors
 from graspd_core.trials.trial_registry import TrialContext
@@ -30,8 +30,8 @@ from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult, Triangle
 _LESS_FRICTION = 2 / 3
 # Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
-# A guessed shape is not worth finer parts: nodes of its distance grid along an axis, and how it is cut.
-_RESOLUTION, _CUTS = 32, {"tolerance": 0.003, "max_parts": 32, "surface_points": 3000}
+# A guessed shape is not worth a finer distance grid: nodes along an axis.
+_RESOLUTION = 32
 # How often the stop hook is asked while waiting for a world [s].
 _POLL = 0.02
 
@@ -202,4 +202,4 @@ def other_object(
         scene = build_scene(mesh, resolution=_RESOLUTION, **named)
     except GraspdError:
         return None
-    return scene.object, convex_parts(scene.object.mesh, scene.sdf, **_CUTS)
+    return scene.object, convex_parts(scene.object.mesh, scene.sdf, **COARSE_CUTS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +30,9 @@ MAX_FACES = 25_000
 # Mean density of household things [kg/m³], for callers that know no mass: between wood-like solids and hollow ware.
 DEFAULT_DENSITY = 300.0
 
+# How a surface is cut into convex parts that is known to millimetres only, from cameras or by guess.
+COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 3000}
+
 
 @dataclass(frozen=True)
 class ObjectModel:
@@ -46,6 +50,7 @@ class ObjectModel:
         scale: factor that the file's coordinates were multiplied by.
         radius: distance from the centre of mass to the farthest vertex [m].
         warnings: what was found wrong with the input, one sentence each.
+        reconstructed: whether the mesh was made of what cameras saw.
     """
 
     source: str
@@ -59,6 +64,7 @@ class ObjectModel:
     scale: float
     radius: float
     warnings: tuple[str, ...]
+    reconstructed: bool = False
 
 
 @dataclass(frozen=True)
@@ -132,7 +138,7 @@ def build_scene(
     bodies, gap = bodies_apart(clean) if confidence is None else (1, 0.0)
     if bodies > 1:
         found += (f"{source}: {bodies} bodies, {1000 * gap:.0f} mm apart; they are grasped as one rigid thing",)
-    model = _object_model(clean, source, mass, friction, scale, warnings + found)
+    model = _object_model(clean, source, mass, friction, scale, warnings + found, confidence is not None)
     loaded = time.perf_counter()
     sdf = object_sdf(model, resolution)
     if not is_solid(sdf):
@@ -182,19 +188,23 @@ def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarra
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
-    """Convex parts that together fill the object and leave its hollows hollow, remembered by content."""
+    """Convex parts that together fill the object and leave its hollows hollow, remembered by content.
+
+    Those of a reconstructed object are coarser: cameras do not see it finer than that.
+    """
     near, far = near_object(model)
+    cuts = COARSE_CUTS if near.reconstructed else {}
 
     def build() -> cache.Arrays:
         # Some tenths of a second of Python's own work, beside the optimiser.
-        parts = run_isolated(convex_parts, near.mesh, object_sdf(near))
+        parts = run_isolated(convex_parts, near.mesh, object_sdf(near), **cuts)
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
     def valid(arrays: cache.Arrays) -> bool:
         names = {f"{kind}{i}" for i in range(len(arrays) // 2) for kind in ("vertices", "faces")}
         return bool(names) and set(arrays) == names and all(a.shape[1:] == (3,) for a in arrays.values())
 
-    arrays = cache.remember(f"parts-{near.sha256}", build, valid)
+    arrays = cache.remember(f"parts-{near.sha256}{'-coarse' if cuts else ''}", build, valid)
     parts = (TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
     return tuple(moved_mesh(part, far) for part in parts)
 
@@ -214,7 +224,7 @@ def moved_obstacle(neighbour: Obstacle, offset: Float[np.ndarray, "3"]) -> Obsta
     return Obstacle(moved_mesh(neighbour.mesh, offset), moved_sdf(neighbour.sdf, offset))
 
 
-def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:
+def _object_model(mesh, source, mass, friction, scale, warnings, reconstructed) -> ObjectModel:
     volume, center, unit_inertia = mass_properties(mesh)
     mass = DEFAULT_DENSITY * volume if mass is None else mass
     return ObjectModel(
@@ -229,6 +239,7 @@ def _object_model(mesh, source, mass, friction, scale, warnings) -> ObjectModel:
         scale=float(scale),
         radius=float(np.linalg.norm(mesh.vertices - center, axis=1).max()),
         warnings=warnings,
+        reconstructed=reconstructed,
     )
 
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import re
 import runpy
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from graspd_core.bench.measurements.measurement import Cell
 from graspd_core.bench.report import sourced, written
 from graspd_core.bench.result_store import case_file, case_key, code_version
 from graspd_core.bench.run_cases import Job, run_job
 from graspd_core.bench.run_studies import make_plan, studies_of
 from graspd_core.bench.studies.human_hand import SOFTNESS
-from graspd_core.bench.study import Request, all_shapes
+from graspd_core.bench.study import Request
 from graspd_core.bench.study_registry import STUDIES
 from graspd_core.errors import ConfigError
 
@@ -50,16 +48,6 @@ def test_cases_differ_and_a_small_run_has_fewer(name: str):
 def test_all_of_them_fit_into_eighty_minutes_on_two_cores():
     seconds = sum(study.seconds(case) for study in STUDIES.values() if study.usual for case in study.cases(Request()))
     assert seconds / 2 < 80 * 60
-
-
-def test_the_longest_preset_is_run_on_few_objects_unless_it_or_they_are_named():
-    def objects(**asked: Any) -> set[str]:
-        cells = STUDIES["main"].cases(Request(**asked))
-        return {cell.object for cell in cells if isinstance(cell, Cell) and cell.name == "graspd2022_code"}
-
-    assert objects() == {"shape:sphere", "shape:box", "shape:mug"}
-    assert objects(presets=("graspd2022_code",)) == set(all_shapes())
-    assert objects(objects=("shape:bowl",)) == {"shape:bowl"}
 
 
 def test_every_source_that_a_study_names_is_there():

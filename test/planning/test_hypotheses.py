@@ -21,7 +21,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Scene
+from graspd_core.scene.scene import COARSE_CUTS, Scene
 from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, TrialResult, Verdict
 
@@ -142,10 +142,13 @@ def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
 def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
     cut = []
     monkeypatch.setenv("GRASPD_CACHE", "off")
-    monkeypatch.setattr("graspd_core.scene.scene.convex_parts", lambda *given: cut.append(1) or convex_parts(*given))
+    monkeypatch.setattr(
+        "graspd_core.scene.scene.convex_parts",
+        lambda *given, **cuts: cut.append(cuts) or convex_parts(*given, **cuts),
+    )
     result = plan(seen_from((0.001, 0.0, 0.0)), 0.9)
     assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.grasps)
-    assert len(cut) == 1
+    assert cut == [COARSE_CUTS]
 
 
 @pytest.mark.parametrize(("seen", "hidden"), [(seen_from, True), (seen_all_round, False)])

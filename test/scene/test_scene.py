@@ -135,3 +135,12 @@ def test_parts_are_remembered():
     for one, other in zip(parts, again, strict=True):
         assert np.array_equal(one.vertices, other.vertices)
         assert np.array_equal(one.faces, other.faces)
+
+
+def test_a_reconstructed_object_has_coarser_parts_than_the_same_mesh():
+    mesh = load_scene("shape:bowl", resolution=32).object.mesh
+    seen = build_scene(mesh, resolution=32, confidence=np.ones(len(mesh.vertices))).object
+    known = build_scene(mesh, resolution=32).object
+    assert seen.sha256 == known.sha256
+    assert seen.reconstructed > known.reconstructed
+    assert len(object_parts(seen)) <= 32 < len(object_parts(known)) <= 64
