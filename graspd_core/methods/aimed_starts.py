@@ -12,8 +12,7 @@ from torch import Tensor
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import aligning_rotation, normalize, rotation_from_axis_angle
 
-# Distance of the palm from the object [m], spread of the joints.
-STANDOFF = (0.005, 0.05)
+# Spread of the joints.
 _JOINT_NOISE = 0.1
 # A palm stays off what lies so near to its axis [m].
 _PALM_RADIUS = 0.04
@@ -23,17 +22,21 @@ _INNER = 0.8
 
 @dataclass(frozen=True)
 class StartPool:
-    """Open hands that starts are chosen from, object frame.
+    """Hands that starts are chosen from, object frame.
 
     Attributes:
-        palm: middle of the palm [m].
+        grip: what of the hand is put to the object, base frame: the middle of the palm, or between fingertips [m].
+        standoff: how far from the object it is put [m].
+        middle: where it lies [m].
         rotation: turn of the base.
         translation: origin of the base [m].
         joints: [rad].
         depth: how far the wanted place lies behind what the palm meets first [m]; 0 where no place is wanted.
     """
 
-    palm: Float[Tensor, "batch 3"]
+    grip: Float[Tensor, "batch 3"]
+    standoff: Float[Tensor, "batch"]
+    middle: Float[Tensor, "batch 3"]
     rotation: Float[Tensor, "batch 3 3"]
     translation: Float[Tensor, "batch 3"]
     joints: Float[Tensor, "batch joints"]
@@ -108,7 +111,7 @@ def aimed(
 ) -> StartPool:
     """The hands turned and moved as is wanted; joints stay, and what is not wanted otherwise.
 
-    A palm faces a wanted place and stands off what lies about the line from there to it.
+    A palm, or the middle between fingertips, faces a wanted place and stands off what lies about the line from there.
 
     Args:
         pool: hands drawn without an aim.
@@ -136,10 +139,10 @@ def aimed(
     faced = places[torch.randint(len(places), (count,), generator=generator)]
     facing = rotation @ torch.as_tensor(hand.palm_normal)
     depth = _standing_off(faced, facing, surface)
-    palm = faced - (depth + uniform(*STANDOFF, count, generator))[:, None] * facing
-    translation = palm - rotation @ torch.as_tensor(hand.palm_center)
+    middle = faced - (depth + pool.standoff)[:, None] * facing
+    translation = middle - (rotation @ pool.grip[..., None]).squeeze(-1)
     depth = torch.zeros_like(depth) if aim.places is None else depth
-    return StartPool(palm, rotation, translation, pool.joints, depth)
+    return replace(pool, middle=middle, rotation=rotation, translation=translation, depth=depth)
 
 
 def _standing_off(

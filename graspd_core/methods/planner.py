@@ -62,9 +62,13 @@ def problem_of(task: PlannerInput) -> Problem:
     return build_problem(scene, task.hand, task.config.problem, seed=task.seed, device=task.device, dtype=task.dtype)
 
 
-def initial_poses_of(task: PlannerInput, count: int) -> Poses:
-    """`count` seeded poses on the object's hull; fewer, perhaps none, where the restrictions leave no more."""
-    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, restrictions=task.restrictions)
+def initial_poses_of(task: PlannerInput, count: int, fingertips: float = 0.0) -> Poses:
+    """`count` seeded poses on the object's hull; fewer, perhaps none, where the restrictions leave no more.
+
+    A share `fingertips` of them are put there with their fingertips, the others with their palms.
+    """
+    drawn = {"fingertips": fingertips, "restrictions": task.restrictions}
+    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, **drawn)
 
 
 def allowed_of(task: PlannerInput, starts: Poses) -> Poses:

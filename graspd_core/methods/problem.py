@@ -33,8 +33,8 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 REACH_WHEN_SHARP = 0.01
 # Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
 TASK_POINTS, FEATURE_PAIRS = 96, 96
-# Free space that the hand keeps to obstacles [m].
-OBSTACLE_MARGIN = 0.002
+# Free space that the hand keeps to obstacles [m]; what is low on a table is held by fingertips that all but touch it.
+OBSTACLE_MARGIN = 0.001
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from graspd_core import load_hand
+from graspd_core.hands.fingers import find_fingers, placed_tips
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import BOWL_RADIUS, make_shape
 from graspd_core.methods.initial_poses import (
+    between_fingertips,
     closing_axis,
     convex_hull,
     draw_starts,
@@ -96,6 +99,34 @@ def test_palms_look_at_the_middle_of_a_sphere(hand, scenes):
     cosine = ((rotation @ torch.as_tensor(hand.palm_normal)) * -palm).sum(-1) / palm.norm(dim=-1)
     # A tilt of 0.35 rad, and 3° of the sphere's facets.
     assert (cosine > np.cos(0.35 + 0.05)).all()
+
+
+@pytest.mark.parametrize("name", ["allegro_right", "leap_right", "barrett_like", "parallel_gripper"])
+def test_fingertips_start_on_both_sides_of_where_they_are_put(scenes, name):
+    hand, sphere = load_hand(name), scenes["sphere"]
+    starts = draw_starts(sphere, hand, COUNT, 0, "cpu", torch.float64, fingertips=1.0)
+    rotation = rotation_from_quaternion(starts.quaternion)
+    middle = (rotation @ between_fingertips(hand, starts.joints)[..., None]).squeeze(-1) + starts.translation
+    distance, _ = sample_sdf(sphere.sdf.to("cpu", torch.float64), middle)
+    # Up to 10 mm from the surface, and what a sphere of facets is off.
+    assert (distance.abs() < 0.0115).all()
+    fingers, closing = find_fingers(hand), torch.as_tensor(closing_axis(hand))
+    for at, q in zip(between_fingertips(hand, starts.joints), starts.joints, strict=True):
+        along = (torch.as_tensor(placed_tips(hand, fingers, q.numpy())) - at) @ closing
+        assert along.min() < 0 < along.max()
+    assert (starts.joints >= torch.as_tensor(hand.lower)).all()
+    assert (starts.joints <= torch.as_tensor(hand.upper)).all()
+
+
+def test_a_share_of_the_starts_is_put_there_with_the_fingertips(hand, scenes):
+    def near(fingertips: float) -> float:
+        starts = draw_starts(scenes["sphere"], hand, 200, 0, "cpu", torch.float64, fingertips=fingertips)
+        middle = rotation_from_quaternion(starts.quaternion) @ between_fingertips(hand, starts.joints)[..., None]
+        distance, _ = sample_sdf(scenes["sphere"].sdf.to("cpu", torch.float64), middle.squeeze(-1) + starts.translation)
+        return float((distance.abs() < 0.0115).double().mean())
+
+    assert near(1.0) == 1.0
+    assert 0.1 < near(0.25) - near(0.0) < 0.6
 
 
 def test_starts_are_seeded(hand, scenes):

@@ -118,7 +118,9 @@ def plan(task: PlannerInput) -> PlannerOutput:
     """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
     settings = task.config.settings
     problem = problem_of(task)
-    starts = initial_poses_of(task, max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp)))
+    starts = initial_poses_of(
+        task, max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp)), settings.fingertip_starts
+    )
     if len(starts.joints) == 0:
         return PlannerOutput(problem, starts)
     solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))

@@ -34,6 +34,7 @@ class ClosedFormConfig:
 
     Attributes:
         starts_per_grasp: starts tried for each grasp asked for; hopeless ones are dropped on the way.
+        fingertip_starts: share of them that begins with half-closed fingertips at the object, the others with the palm.
         explore_steps: steps with all starts, before the hopeless ones are dropped.
         refine_steps: steps with those that are kept.
         polish_steps: last steps, with all of the object's sharp points and weights that make contact exact.
@@ -53,6 +54,7 @@ class ClosedFormConfig:
     """
 
     starts_per_grasp: float = 8.0
+    fingertip_starts: float = 0.25
     explore_steps: int = 50
     refine_steps: int = 80
     polish_steps: int = 80
