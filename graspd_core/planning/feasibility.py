@@ -1,4 +1,4 @@
-"""Objects that a hand cannot hold anywhere are told before any search, in words that a user can act on.
+"""Why an object cannot be held, in words that a user can act on: before any search, and after trials that failed.
 
 A necessary condition of every grasp, from statics alone: contact forces that cancel cannot all point into one open
 half-space. All contacts of a hand lie within its span of each other; where the surface normals of every such patch of
@@ -7,6 +7,10 @@ handles, walls and thin plates have opposing normals next to each other and pass
 """
 
 from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -17,6 +21,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.unique_rows import packed_rows
 from graspd_core.scene.scene import Scene
+from graspd_core.types import Grasp, Verdict
 
 # The roughest surface that a trial believes in; see `trials.world.at_friction`.
 _MOST_FRICTION = 0.6
@@ -26,6 +31,11 @@ _SAMPLES = 4000
 _DIRECTIONS = 400
 # Steps of the search for a direction that all forces of a patch point away from.
 _STEPS = 60
+# Reasons of failed trials without their numbers and axes; so many of them are told.
+_NUMBERS, _REASONS_TOLD = re.compile(r"( by)? -?\d[\d.]*(°| [cm]?m)| along [+-][xyz]"), 3
+# An object is low on its support where most contacts press on it from above, 30° and more, and it is no higher than
+# fingers are thick [m].
+_FROM_ABOVE, _LOW = 0.5, 0.03
 
 
 def out_of_reach(scene: Scene, hand: HandModel) -> str:
@@ -42,6 +52,26 @@ def out_of_reach(scene: Scene, hand: HandModel) -> str:
     return (
         f"the object is {_centimetres(narrowest)} across where it is narrowest, without edge or handle to hold it by, "
         f"and the fingertips of {hand.name} open to {_centimetres(opening)}: smaller things or a larger hand"
+    )
+
+
+def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
+    """What became of the grasps whose trials failed, most frequent first, and what may help; empty without any."""
+    failed = [grasp for grasp in grasps if grasp.verdict is Verdict.FAILED and grasp.reason]
+    if not failed:
+        return ""
+    reasons = Counter(_NUMBERS.sub("", grasp.reason) for grasp in failed).most_common(_REASONS_TOLD)
+    told = f"{len(failed)} failed: {', '.join(f'{reason} ({count})' for reason, count in reasons)}"
+    if scene.support is None:
+        return told
+    heights = scene.object.mesh.vertices @ scene.support.normal - scene.support.offset
+    normals = np.array([contact.normal for grasp in failed for contact in grasp.contacts]).reshape(-1, 3)
+    above = np.median(normals @ scene.support.normal) if len(normals) else 0.0
+    if heights.max() > _LOW or above < _FROM_ABOVE:
+        return told
+    return (
+        f"{told}; it is {heights.max() * 1e3:.0f} mm high on its support, so that fingers press on it from above: "
+        "bring a part of it over an edge, or take a hand with thinner fingers"
     )
 
 

@@ -19,7 +19,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.methods.plan_config import PlanConfig, load_preset
 from graspd_core.methods.restrictions import BoundRestrictions, Restriction, restrictions_in_words
-from graspd_core.planning.feasibility import out_of_reach
+from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
 from graspd_core.planning.planning_scene import planning_scene
 from graspd_core.planning.planning_worker import start_planning_worker
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
@@ -29,7 +29,7 @@ from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Grasp, GraspResult, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
+from graspd_core.types import Grasp, GraspResult, Outcome, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
 
 
 def plan_grasps(
@@ -79,7 +79,7 @@ def plan_grasps(
     found = run_rounds(run, scene, hand, rounds, ahead, bound.moved(run.origin), measure=measure, **request)
     result = _result(run, scene, replace(found, grasps=_ranked(run, found, config, seed)), config, seed, count)
     told = "" if run.over() else restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
-    result = replace(result, message=message or told, support=support)
+    result = replace(result, message=message or told or _too_few(scene, result), support=support)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 
@@ -117,6 +117,12 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     if found.context is None or not config.robust.rank:
         return found.grasps
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
+
+
+def _too_few(scene: Scene, result: GraspResult) -> str:
+    """Why too few grasps passed, where a run was not cut short."""
+    why = why_trials_failed(scene, result.grasps) if result.outcome is Outcome.TOO_FEW else ""
+    return why and f"{result.outcome.value}: {why}"
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:

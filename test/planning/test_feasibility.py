@@ -11,11 +11,11 @@ import trimesh
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import SHAPES, make_shape
-from graspd_core.planning.feasibility import out_of_reach, reach_of
+from graspd_core.planning.feasibility import out_of_reach, reach_of, why_trials_failed
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import Scene
-from graspd_core.types import Outcome, Stage, TriangleMesh
+from graspd_core.types import Contact, Outcome, Plane, Stage, TrialResult, TriangleMesh, Verdict
 
 
 def scene_of(*meshes: TriangleMesh, friction: float = 0.6) -> Scene:
@@ -109,3 +109,40 @@ def test_a_ball_of_70_cm_ends_the_run_before_its_first_step(hand):
     assert told == [Stage.DONE]
     assert (result.outcome, result.grasps) == (Outcome.NO_CANDIDATES, ())
     assert "70 cm across" in result.message
+
+
+@pytest.fixture(scope="module")
+def card_on_table() -> Scene:
+    return replace(scene_of(box((0.043, 0.027, 0.001))), support=Plane(np.array([0.0, 0.0, 1.0]), -0.001))
+
+
+def test_what_is_too_low_for_the_fingers_is_told_with_what_became_of_the_trials(hand, card_on_table):
+    result = plan_grasps(card_on_table, hand, count=2, preset="fast", measure=False)
+    assert result.outcome is Outcome.TOO_FEW
+    assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+    assert result.message.startswith(f"{Outcome.TOO_FEW.value}: {len(result.grasps)} failed: the object turned while ")
+    assert "; it is 2 mm high on its support" in result.message
+
+
+def test_reasons_are_told_without_numbers_the_most_frequent_first(hand, card_on_table):
+    [held] = plan_grasps(scene_of(make_shape("sphere")), hand, count=1, preset="fast", measure=False).grasps[:1]
+    reasons = (
+        "the object turned 15° under a pull along +x",
+        "the object turned 132° under a pull along -y",
+        "the object moved 3.0 cm while closing",
+        "the pregrasp penetrates the object by 11.4 mm",
+        "the pregrasp penetrates the object by 2.0 mm",
+        "the pregrasp penetrates the object by 7.1 mm",
+    )
+    failed = [replace(held, trials=(TrialResult("hold", False, 0.0, 0.0, why),)) for why in reasons]
+    told = "6 failed: the pregrasp penetrates the object (3), the object turned under a pull (2), "
+    free = scene_of(make_shape("sphere"))
+    assert why_trials_failed(free, [held, *failed]) == told + "the object moved while closing (1)"
+    assert why_trials_failed(free, [held]) == ""
+    # Only what is low and pressed from above is called so.
+    aside = [replace(one, contacts=(Contact("tip", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),)) for one in failed]
+    assert "support" not in why_trials_failed(card_on_table, aside)
+    above = [replace(one, contacts=(Contact("tip", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),)) for one in failed]
+    assert "2 mm high on its support" in why_trials_failed(card_on_table, above)
+    tall = replace(card_on_table, support=Plane(np.array([0.0, 0.0, 1.0]), -0.2))
+    assert "support" not in why_trials_failed(tall, above)
