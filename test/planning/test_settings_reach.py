@@ -30,7 +30,13 @@ from graspd_core.types import Grasp, Plane, Posture, Progress, Stage
 # As short as a run can be that still does everything once.
 SETTINGS: dict[str, Any] = {
     "closed_form": ClosedFormConfig(
-        starts_per_grasp=9.0, explore_steps=2, refine_steps=2, polish_steps=2, fine_steps=1, keep_per_grasp=5.0
+        starts_per_grasp=9.0,
+        fingertip_starts=0.0,
+        explore_steps=2,
+        refine_steps=2,
+        polish_steps=2,
+        fine_steps=1,
+        keep_per_grasp=5.0,
     ),
     "graspd2022": Graspd2022Config(
         initial=InitialPosesConfig(starts_per_grasp=3.0), level_set=LevelSetConfig(coarse_steps=2), steps=4
@@ -98,6 +104,7 @@ HOLDING = tuple(
 held = partial(Case, base=HOLDING, hand="parallel_gripper", count=1, verify="standard")
 table = Case(scene="table")
 CASES = {
+    "closed_form.fingertip_starts": Case(1.0),
     "closed_form.keep_per_grasp": Case(1.0, (("closed_form.keep_per_grasp", 0.1),), count=10),
     "closed_form.drops": Case(6, (("closed_form.keep_per_grasp", 0.1), ("closed_form.explore_steps", 6)), count=10),
     "problem.confidence_floor": table,
