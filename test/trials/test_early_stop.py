@@ -179,7 +179,7 @@ TABLE = Plane(np.array([0.0, 0.0, 1.0]), -1.0)
 
 @pytest.fixture(scope="module")
 def real() -> tuple[Scene, Any, list[Grasp]]:
-    """Grasps that the method found on a mug-sized box, each once more out of place, and a hand that stays open above."""
+    """Grasps that the method found on a mug-sized box, each once more out of place, and an open hand far above."""
     config, hand = load_preset("fast"), load_hand("allegro_right")
     scene = load_scene("shape:box", resolution=config.resolution)
     found = find_candidates(scene, hand, count=3, seed=0, config=config, hooks=Hooks()).grasps[:3]
