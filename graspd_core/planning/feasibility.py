@@ -31,8 +31,8 @@ _SAMPLES = 4000
 _DIRECTIONS = 400
 # Steps of the search for a direction that all forces of a patch point away from.
 _STEPS = 60
-# Reasons of failed trials without their numbers and axes; so many of them are told.
-_NUMBERS, _REASONS_TOLD = re.compile(r"( by)? -?\d[\d.]*(°| [cm]?m)| along [+-][xyz]"), 3
+# Reasons of failed trials that are told.
+_REASONS_TOLD = 3
 # An object is low on its support where most contacts press on it from above, 30° and more, and it is no higher than
 # fingers are thick [m].
 _FROM_ABOVE, _LOW = 0.5, 0.03
@@ -60,7 +60,7 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
     failed = [grasp for grasp in grasps if grasp.verdict is Verdict.FAILED and grasp.reason]
     if not failed:
         return ""
-    reasons = Counter(_NUMBERS.sub("", grasp.reason) for grasp in failed).most_common(_REASONS_TOLD)
+    reasons = Counter(kind_of(grasp.reason) for grasp in failed).most_common(_REASONS_TOLD)
     told = f"{len(failed)} failed: {', '.join(f'{reason} ({count})' for reason, count in reasons)}"
     if scene.support is None:
         return told
@@ -73,6 +73,13 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
         f"{told}; it is {heights.max() * 1e3:.0f} mm high on its support, so that fingers press on it from above: "
         "bring a part of it over an edge, or take a hand with thinner fingers"
     )
+
+
+def kind_of(reason: str) -> str:
+    """A reason without its figures and directions, so that like ones can be counted."""
+    for figures in (r"\([^()]*\d[^()]*\)", r"(by )?[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?", r"along [-+][xyz]"):
+        reason = re.sub(figures, " ", reason)
+    return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
 
 
 def reach_of(hand: HandModel) -> tuple[float, float]:

@@ -13,7 +13,7 @@ import pytest
 
 from graspd_core.bench.charts.failure_map_chart import Shares, draw_map, map_sections, reasons, shares
 from graspd_core.bench.failure_maps import map_runs
-from graspd_core.bench.failure_maps.map_case import MapCase, hand_for, kind_of, run_on
+from graspd_core.bench.failure_maps.map_case import MapCase, hand_for, run_on
 from graspd_core.bench.failure_maps.map_registry import (
     COUNT,
     MAPS,
@@ -27,6 +27,7 @@ from graspd_core.bench.failure_maps.map_registry import (
 from graspd_core.bench.study import Request
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import BOX_HALF, make_shape
+from graspd_core.planning.feasibility import kind_of
 from graspd_core.rendering.depth_noise import DEFAULT, NONE
 from graspd_core.scene.load_scene import load_scene
 

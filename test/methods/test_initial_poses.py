@@ -112,8 +112,9 @@ def test_fingertips_start_on_both_sides_of_where_they_are_put(scenes, name):
     assert (distance.abs() < 0.0115).all()
     fingers, closing = find_fingers(hand), torch.as_tensor(closing_axis(hand))
     for at, q in zip(between_fingertips(hand, starts.joints), starts.joints, strict=True):
-        along = (torch.as_tensor(placed_tips(hand, fingers, q.numpy())) - at) @ closing
-        assert along.min() < 0 < along.max()
+        tips = torch.as_tensor(placed_tips(hand, fingers, q.numpy())) - at
+        assert (tips @ closing).min() < 0 < (tips @ closing).max()
+        assert (tips @ torch.as_tensor(hand.palm_normal)).abs().min() < 0.03  # not at the palm
     assert (starts.joints >= torch.as_tensor(hand.lower)).all()
     assert (starts.joints <= torch.as_tensor(hand.upper)).all()
 

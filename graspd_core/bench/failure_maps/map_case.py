@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.methods.plan_config import PlanConfig, load_preset
+from graspd_core.planning.feasibility import kind_of
 from graspd_core.scene.scene import ObjectModel, Scene, object_parts
 from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.world import Protocol, build_world
@@ -115,10 +115,3 @@ def try_grasps(
     if len(grasps) < case.count:
         reasons[NOT_FOUND] = case.count - len(grasps)
     return MapCell(up, sum(hold.passed for hold in holds), dict(reasons))
-
-
-def kind_of(reason: str) -> str:
-    """A reason without its figures and directions, so that like ones can be counted."""
-    for figures in (r"\([^()]*\d[^()]*\)", r"(by )?[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?", r"along [-+][xyz]"):
-        reason = re.sub(figures, " ", reason)
-    return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
