@@ -61,7 +61,7 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
     if not failed:
         return ""
     reasons = Counter(kind_of(grasp.reason) for grasp in failed).most_common(_REASONS_TOLD)
-    told = f"{len(failed)} failed: {', '.join(f'{reason} ({count})' for reason, count in reasons)}"
+    told = f"{len(failed)} grasps failed their trials: {', '.join(f'{reason} ({count})' for reason, count in reasons)}"
     if scene.support is None:
         return told
     heights = scene.object.mesh.vertices @ scene.support.normal - scene.support.offset

@@ -78,8 +78,8 @@ def plan_grasps(
     ahead = trials_ahead(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
     found = run_rounds(run, scene, hand, rounds, ahead, bound.moved(run.origin), measure=measure, **request)
     result = _result(run, scene, replace(found, grasps=_ranked(run, found, config, seed)), config, seed, count)
-    told = "" if run.over() else restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
-    result = replace(result, message=message or told or _too_few(scene, result), support=support)
+    told = "" if run.over() else _why_few(scene, bound, found, result)
+    result = replace(result, message=message or told, support=support)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 
@@ -119,10 +119,10 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
 
 
-def _too_few(scene: Scene, result: GraspResult) -> str:
-    """Why too few grasps passed, where a run was not cut short."""
-    why = why_trials_failed(scene, result.grasps) if result.outcome is Outcome.TOO_FEW else ""
-    return why and f"{result.outcome.value}: {why}"
+def _why_few(scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:
+    """What restrictions refused; without any, what the trials of a run failed of that ended with too few grasps."""
+    told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
+    return told or (why_trials_failed(scene, result.grasps) if result.outcome is Outcome.TOO_FEW else "")
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
