@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -41,9 +42,13 @@ _FROM_ABOVE, _LOW = 0.5, 0.03
 def out_of_reach(scene: Scene, hand: HandModel) -> str:
     """Why the hand can hold the object nowhere, as a sentence; empty where it may."""
     span, opening = reach_of(hand)
+    vertices = scene.object.mesh.vertices
+    # What fits along an axis, as most things do, needs no closer look.
+    if float(np.ptp(vertices, axis=0).min()) <= span:
+        return ""
     points, normals = _surface(scene)
     # A convex body is narrowest along a normal of its surface.
-    narrowest = float(np.ptp(scene.object.mesh.vertices @ normals[:: len(normals) // _DIRECTIONS + 1].T, axis=0).min())
+    narrowest = float(np.ptp(vertices @ normals[:: len(normals) // _DIRECTIONS + 1].T, axis=0).min())
     if narrowest <= span:
         return ""
     angle = np.arctan(min(scene.object.friction, _MOST_FRICTION))
@@ -82,6 +87,8 @@ def kind_of(reason: str) -> str:
     return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
 
 
+# Kept for the last few hands, which are hashed by identity.
+@lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
     """Of the open hand: the greatest distance of two points of it, and the widest gap between two fingertips [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
