@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from graspd_core.config.mapping import from_mapping, read_yaml
 from graspd_core.errors import ConfigError
@@ -86,8 +86,9 @@ class ReconstructionConfig:
         open_share: a surface with a smaller share missing is not completed.
         revolution_share: a body of revolution explains this share of what was seen, at least.
         symmetry_worth: a symmetry of a lower score is chance; the highest score is 2.6.
-        poisson_cell: the finest cells of the Poisson surface are about so wide: twice the camera's noise [m].
-        min_cell: least cell of the grid that the surface is closed on [m].
+        poisson: whose surface goes through the points: of a grid, then of Open3D where that does not fit, or of open3d.
+        poisson_cell: the finest cells of Open3D's are about so wide: twice the camera's noise [m].
+        min_cell: least cell of the grid that the surface is closed on, likewise [m].
         fit_distance: 85 % of the seen points lie this near to the mesh, or it is refused [m].
         max_faces: faces of the mesh, at most.
         seen_distance: surface this near to a seen point has confidence 1 [m].
@@ -102,6 +103,7 @@ class ReconstructionConfig:
     open_share: float = 0.12
     revolution_share: float = 0.8
     symmetry_worth: float = 0.5
+    poisson: Literal["grid", "open3d"] = "grid"
     poisson_cell: float = 0.0022
     min_cell: float = 0.0017
     fit_distance: float = 0.004

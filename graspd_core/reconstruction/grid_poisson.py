@@ -1,7 +1,8 @@
 """Poisson's field of oriented points on a regular grid, by Fourier transforms (Kazhdan 2005).
 
 On grids of few nodes it takes a sixth of the time of Open3D's adaptive one, and spares finding the distance to a mesh.
-As in screened Poisson (Kazhdan and Hoppe 2013), the field is then drawn to zero at the points.
+As in screened Poisson (Kazhdan and Hoppe 2013), the field is then drawn to zero at the points. Points that are of no
+surface, as noise, are so fitted too: whether they are of one is asked before.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ from graspd_core.reconstruction.poisson import BAND_CELLS
 _BLUR, _DENSITY_BLUR = 1.0, 2.0
 # Points count for no more than where they are this much sparser than the median.
 _SPARSEST = 0.2
+# So many cells across, an object has a surface on the grid.
+_LEAST_CELLS = 8
+# Of the points at least this share lies within a cell of the surface before it is drawn to them: of 120 views of shapes
+# and scans 0.82 and more, of noise 0.48 and less.
+_MIN_NEAR = 0.7
 # Steps that draw the field to zero at the points, and how far each reaches, in cells.
 _STEPS, _REACH = 3, 2.0
 # The transforms are of what repeats: so many cells lie between the object and its next image.
@@ -36,10 +42,12 @@ def grid_poisson_field(
         nodes: of the grid, `cell` apart [m].
 
     Raises:
-        CloudError: the normals are not those of one surface.
+        CloudError: the points and normals are not those of one surface, or it is too small for the grid.
     """
     from scipy.fft import next_fast_len
 
+    if np.ptp(surfels.points, axis=0).max() < _LEAST_CELLS * cell:
+        raise CloudError(f"cloud: what it shows is too small for a grid of {cell * 1e3:.1f} mm")
     counts = nodes.shape[:3]
     fast: Any = next_fast_len
     shape = tuple(int(fast(count + _MARGIN, real=True)) for count in counts)
@@ -65,6 +73,9 @@ def grid_poisson_field(
     if not slope > 0:
         raise CloudError(f"cloud: the normals of its {len(surfels.points)} points are of no surface")
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
+    near = float((np.abs(there) < 1.0).mean())
+    if near < _MIN_NEAR:
+        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points ({near:.0%} do)")
     for _ in range(_STEPS):
         push, pushed = at_points(spread(-weights * there) * blur / (square + _REACH**-2))
         # As far along it as leaves least at the points.

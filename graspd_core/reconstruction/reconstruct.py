@@ -1,7 +1,7 @@
 """From one or more views of an object to a closed mesh, saying how it was made and how far each part was seen.
 
-What was seen is surfaced by screened Poisson with normals towards each view's camera; what was not is completed first,
-by the symmetry, revolution or extrusion that the evidence favours; what the cameras saw to be empty is cut away.
+What was seen is surfaced by screened Poisson with normals towards each view's camera, on a grid first and by Open3D
+where that does not fit; what was not is completed before, by the symmetry, revolution or extrusion that the evidence favours; what the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from graspd_core.pointcloud.free_space import FreeSpace, make_view_depths
 from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, measured
 from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.reconstruction.extrusion import MAX_FOOT_HEIGHT_M, stand
+from graspd_core.reconstruction.grid_poisson import grid_poisson_field
 from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, nothing, point_step
 from graspd_core.reconstruction.poisson import GRID_CELLS, Field, close_surface, grid_cell, part_walls, poisson_field
 from graspd_core.reconstruction.shape_completion import Completion, complete_shape
@@ -92,8 +93,7 @@ def reconstruct(
             make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
-    field = partial(poisson_field, finest=settings.poisson_cell)
-    mesh = closed_mesh(seen, guess.surfels, free_space, step, settings, field)
+    mesh = _closed(seen, guess.surfels, free_space, step, settings)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
     hidden = not unposed and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings)
     warnings = (_sentence(len(views), guess.method),) if hidden else ()
@@ -105,6 +105,19 @@ def reconstruct(
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> PointCloud:
     return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
+
+
+def _closed(
+    seen: Surfels, guess: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig
+) -> TriangleMesh:
+    """The closed surface by Poisson on a grid, or by Open3D's where that is asked for or the grid's does not fit."""
+    adaptive = partial(poisson_field, finest=settings.poisson_cell)
+    if settings.poisson == "open3d":
+        return closed_mesh(seen, guess, free_space, step, settings, adaptive)
+    try:
+        return closed_mesh(seen, guess, free_space, step, settings, grid_poisson_field)
+    except CloudError:
+        return closed_mesh(seen, guess, free_space, step, settings, adaptive)
 
 
 def closed_mesh(

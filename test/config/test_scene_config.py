@@ -41,7 +41,8 @@ def test_an_empty_file_holds_the_defaults(tmp_path: Path):
 
 def test_one_file_reaches_every_field(tmp_path: Path):
     def other(name: str, value: Any) -> Any:
-        return [1.0, 1.0, 1.0] if name == "roi_high" else [0.0, 0.0, 0.0] if name == "roi_low" else 2 * value
+        given = {"roi_low": [0.0, 0.0, 0.0], "roi_high": [1.0, 1.0, 1.0], "poisson": "open3d"}
+        return given[name] if name in given else 2 * value
 
     values = {name: {f: other(f, v) for f, v in dataclasses.asdict(part).items()} for name, part in PARTS}
     config = dataclasses.asdict(load_scene_config(written(tmp_path, yaml.safe_dump(values))))
@@ -58,6 +59,7 @@ def test_one_file_reaches_every_field(tmp_path: Path):
         ("reconstruction: {max_points: 10}", ["reconstruction.max_points", "10", "at least 1000"]),
         ("reconstruction: {seen_distance: 0.02}", ["seen_distance", "0.02", "guessed_distance=0.02"]),
         ("segmentation: {roi_low: [0, 0, 0], roi_high: [1, 1, 0]}", ["roi_low", "roi_high=(1.0, 1.0, 0.0)"]),
+        ("reconstruction: {poisson: pcl}", ["reconstruction.poisson", "pcl", "grid, open3d"]),
         ("segmentation: [", ["not valid YAML"]),
     ],
 )
