@@ -1,7 +1,8 @@
 """From one or more views of an object to a closed mesh, saying how it was made and how far each part was seen.
 
-What was seen is surfaced by screened Poisson with normals towards each view's camera, on a grid first and by Open3D
-where that does not fit; what was not is completed before, by the symmetry, revolution or extrusion that the evidence favours; what the cameras saw to be empty is cut away.
+What was seen is surfaced by screened Poisson with normals towards each view's camera: on a grid, and by Open3D where
+that does not fit. What was not is completed first, by the symmetry, revolution or extrusion that the evidence favours;
+what the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
