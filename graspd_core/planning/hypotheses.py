@@ -54,17 +54,25 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """All that else may be true, and under how many of them a verified grasp may fail."""
+    """All that else may be true.
+
+    Attributes:
+        items: in the order in which grasps are tried under them.
+        allowed: under how many of them a verified grasp may fail.
+        failed: called with how many a grasp has failed under, while it may still be verified: it needs others to hold
+            under in their place, which can be begun.
+    """
 
     items: tuple[Hypothesis, ...]
     allowed: int
+    failed: Callable[[int], None] = lambda count: None
 
 
 class OtherWorlds:
     """The worlds of other shapes of the object, made one after another by a thread.
 
-    As many are begun at once as a grasp that holds in all of them must be tried in, one more for each that cannot be
-    made, and others when they are asked for.
+    As many are begun at once as a grasp that holds under all else must be tried in, one more for each that it fails
+    under, or that cannot be made, and others when they are asked for.
     """
 
     def __init__(self, run: Run, scene: Scene, hand: HandModel, protocol: Protocol, rules: Sequence[str], begun: int):
@@ -73,6 +81,7 @@ class OtherWorlds:
         self._make_world = lambda rule: _other_world(scene, hand, protocol, rule)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
         self._made: list[Future[World | None]] = []
+        self._least = begun
         self._begin(begun)
 
     def world(self, index: int, stop: StopHook) -> World | None:
@@ -82,6 +91,11 @@ class OtherWorlds:
             if stop():
                 return None
         return self._made[index].result()
+
+    def begin_after(self, failed: int) -> None:
+        """Begin those that a grasp must be tried in that failed under so many hypotheses."""
+        if self._least:
+            self._begin(self._least + failed)
 
     def _begin(self, count: int) -> None:
         with self._lock:
@@ -122,7 +136,7 @@ def hypotheses_of(
         Hypothesis(f"hidden side by {rule}" if rule else "hidden side closed smoothly", partial(_hold_in, others, k))
         for k, rule in enumerate(others.rules)
     ]
-    return Hypotheses((*places, less, *shapes), _allowed_failures(probability))
+    return Hypotheses((*places, less, *shapes), _allowed_failures(probability), others.begin_after)
 
 
 def _allowed_failures(probability: float) -> int:
@@ -150,6 +164,8 @@ def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tupl
             worst = [max(worst[0], result.displacement), max(worst[1], result.rotation)]
         else:
             failed.append(f"{item.name}: {result.reason}")
+            if len(failed) <= hypotheses.allowed:
+                hypotheses.failed(len(failed))
     passed = len(failed) <= hypotheses.allowed
     reason = "" if passed else f"fails under {len(failed)} of the {tried} hypotheses tried ({'; '.join(failed)})"
     worst_case = min(len(failed) + left if passed else len(HELD_AFTER), len(HELD_AFTER) - 1)

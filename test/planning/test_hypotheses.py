@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 
@@ -16,13 +17,16 @@ from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning.hypotheses import Hypotheses, Hypothesis, try_hypotheses
+from graspd_core.planning import hypotheses
+from graspd_core.planning.hypotheses import Hypotheses, Hypothesis, OtherWorlds, try_hypotheses
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.planning.run_clock import Run
 from graspd_core.pointcloud.point_cloud import PointCloud
 from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import COARSE_CUTS, Scene
+from graspd_core.scene.scene import COARSE_CUTS, Scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.trials.world import PROTOCOLS, build_world
 from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, TrialResult, Verdict
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
@@ -96,6 +100,25 @@ def test_nothing_is_tried_after_the_last_that_is_allowed():
 
     failing = under(False, False)
     try_hypotheses(Hypotheses((*failing.items, Hypothesis("late", never)), 1), GRASP, lambda: False)
+
+
+def test_failures_are_told_as_long_as_the_grasp_may_be_verified():
+    told: list[int] = []
+    try_hypotheses(replace(under(False, True, False, True), failed=told.append), GRASP, lambda: False)
+    assert told == [1]
+
+
+@pytest.mark.parametrize(("begun", "expected"), [(2, ["", "mirror", "extrusion"]), (0, [])])
+def test_each_failure_begins_one_more_shape_where_any_is_needed(begun, expected, monkeypatch):
+    box, hand, protocol = load_scene("shape:box"), load_hand("allegro_right"), PROTOCOLS["standard"]
+    world, made = build_world(hand, box.object, object_parts(box.object), protocol), []
+    monkeypatch.setattr(hypotheses, "_other_world", lambda *given: made.append(given[-1]) or world)
+    run = Run(time.perf_counter(), None, None, None, None)
+    others = OtherWorlds(run, box, hand, protocol, ("", "mirror", "extrusion", "revolution"), begun)
+    others.begin_after(1)
+    for index in range(len(expected)):
+        assert others.world(index, lambda: False) is not None
+    assert made == expected
 
 
 def test_a_grasp_that_was_stopped_is_not_verified():
