@@ -73,9 +73,7 @@ def grid_poisson_field(
     if not slope > 0:
         raise CloudError(f"cloud: the normals of its {len(surfels.points)} points are of no surface")
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
-    near = float((np.abs(there) < 1.0).mean())
-    if near < _MIN_NEAR:
-        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points ({near:.0%} do)")
+    _refuse_far(there)
     for _ in range(_STEPS):
         push, pushed = at_points(spread(-weights * there) * blur / (square + _REACH**-2))
         # As far along it as leaves least at the points.
@@ -83,6 +81,13 @@ def grid_poisson_field(
         field, there = field + share * push, there + share * pushed
     inner = tuple(slice(low, low + count) for low, count in zip(before, counts, strict=True))
     return cell * np.clip(field.reshape(shape)[inner], -BAND_CELLS, BAND_CELLS)
+
+
+def _refuse_far(there: Float[np.ndarray, "points"]) -> None:
+    """Refuse a field that most points do not lie near the zero of; `there` is what it is at them, in cells."""
+    near = float((np.abs(there) < 1.0).mean())
+    if near < _MIN_NEAR:
+        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
 
 
 def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> Any:
