@@ -21,8 +21,6 @@ from graspd_core.reconstruction.poisson import BAND_CELLS
 _BLUR, _DENSITY_BLUR = 1.0, 2.0
 # Points count for no more than where they are this much sparser than the median.
 _SPARSEST = 0.2
-# So many cells across, an object has a surface on the grid.
-_LEAST_CELLS = 8
 # Of the points at least this share lies within a cell of the surface before it is drawn to them: of 120 views of shapes
 # and scans 0.82 and more, of noise 0.48 and less.
 _MIN_NEAR = 0.7
@@ -42,12 +40,10 @@ def grid_poisson_field(
         nodes: of the grid, `cell` apart [m].
 
     Raises:
-        CloudError: the points and normals are not those of one surface, or it is too small for the grid.
+        CloudError: the points and normals are not those of one surface.
     """
     from scipy.fft import next_fast_len
 
-    if np.ptp(surfels.points, axis=0).max() < _LEAST_CELLS * cell:
-        raise CloudError(f"cloud: what it shows is too small for a grid of {cell * 1e3:.1f} mm")
     counts = nodes.shape[:3]
     fast: Any = next_fast_len
     shape = tuple(int(fast(count + _MARGIN, real=True)) for count in counts)

@@ -33,6 +33,8 @@ from graspd_core.types import Plane, TriangleMesh
 
 # Share of the seen points that must lie on the result.
 MIN_FITTED_SHARE = 0.85
+# What is fewer cells across balloons on the grid.
+_LEAST_CELLS = 8
 # A face of the foot looks down by this cosine, at least.
 _DOWN = 0.7
 
@@ -113,7 +115,8 @@ def _closed(
 ) -> TriangleMesh:
     """The closed surface by Poisson on a grid, or by Open3D's where that is asked for or the grid's does not fit."""
     adaptive = partial(poisson_field, finest=settings.poisson_cell)
-    if settings.poisson == "open3d":
+    small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
+    if small or settings.poisson == "open3d":
         return closed_mesh(seen, guess, free_space, step, settings, adaptive)
     try:
         return closed_mesh(seen, guess, free_space, step, settings, grid_poisson_field)

@@ -87,10 +87,3 @@ def test_points_of_no_surface_are_refused_though_a_field_could_be_drawn_to_them(
     points = np.random.default_rng(0).normal(0, 0.02, (3000, 3))
     with pytest.raises(CloudError, match=r"no surface fits its 3000 points \(\d\d% do\)"):
         field_of(Surfels(points, points / np.linalg.norm(points, axis=1, keepdims=True)), axes_about(points))
-
-
-def test_what_is_a_few_cells_across_is_refused():
-    ball = samples("sphere", 2000)
-    small = Surfels(ball.points * 0.2, ball.normals)
-    with pytest.raises(CloudError, match=r"too small for a grid of 2\.5 mm"):
-        field_of(small, axes_about(small.points))
