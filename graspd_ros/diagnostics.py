@@ -26,7 +26,7 @@ class Health:
         accepted, succeeded, partial, failed, cancelled, superseded, refused: requests since the start, by their end.
         verified: grasps since the start that held in the trial.
         rejected: grasps since the start that did not.
-        audited: verified grasps since the start that were tried once more at full length.
+        audited: verified grasps since the start that were tried once more with a pull at full length.
         audits_disagreed: those of them that failed there.
         failed_in_a_row: requests that failed since the last that did not.
         last_latency: seconds from the last answered request to its answer, None before the first.

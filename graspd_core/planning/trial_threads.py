@@ -20,7 +20,11 @@ _POLL = 0.02
 
 
 def results_in_order(
-    run: Run, work: Callable[[Item, StopHook], Result], items: Sequence[Item], threads: int
+    run: Run,
+    work: Callable[[Item, StopHook], Result],
+    items: Sequence[Item],
+    threads: int,
+    needed: Callable[[], int] = lambda: 0,
 ) -> Generator[Result]:
     """The result of each item, in their order, until the run is over.
 
@@ -31,6 +35,7 @@ def results_in_order(
         work: done by the calling thread where there is one thread, else by so many others.
         items: what is worked on.
         threads: at least 1.
+        needed: how many more results will be asked for at least, so that none of these is begun too early.
     """
     if min(threads, len(items)) <= 1:
         for item in items:
@@ -43,8 +48,8 @@ def results_in_order(
     waiting, left = deque[Future[Result]](), iter(items)
     try:
         while not run.over():
-            # As many again as are worked on, so that no thread waits for the first in line.
-            for item in islice(left, 2 * threads - len(waiting)):
+            # As many again as are worked on, and all that are needed: no thread waits for the first in line.
+            for item in islice(left, max(2 * threads, needed()) - len(waiting)):
                 waiting.append(pool.submit(work, item, lambda: closed.is_set() or run.known_over()))
             if not waiting:
                 return

@@ -125,7 +125,7 @@ class TriedGrasps:
     Attributes:
         grasps: those that were tried, verified ones first.
         first: when the first of them had passed, a `time.perf_counter()` value.
-        audits: how many were tried once more at full length.
+        audits: how many were tried once more with a pull at full length.
     """
 
     grasps: tuple[Grasp, ...] = ()
@@ -153,7 +153,8 @@ def run_trials(
     threads = torch.get_num_threads()
     first, audits = None, AuditCount()
     seen = None if run.watch is None else candidates_seen(candidates)
-    trials = results_in_order(run, partial(_all_trials, context), candidates, threads)
+    # No trial gives more than one verified grasp.
+    trials = results_in_order(run, partial(_all_trials, context), candidates, threads, lambda: count - len(verified))
     with closing(trials), ThreadPoolExecutor(threads, thread_name_prefix="graspd-metrics") as pool:
         for index, (tried, audit) in enumerate(trials):
             passed = tried.verdict is Verdict.VERIFIED
@@ -216,7 +217,8 @@ def rank_by_robustness(
     def share_held(grasp: Grasp, stop: StopHook) -> float | None:
         return noisy_share(context.trials.alone, grasp, protocol, errors, stop=stop)
 
-    with closing(results_in_order(run, share_held, verified, torch.get_num_threads())) as shares:
+    shares = results_in_order(run, share_held, verified, torch.get_num_threads(), lambda: len(verified))
+    with closing(shares):
         # None for those that the end of the run leaves over.
         for index, (grasp, share) in enumerate(zip(verified, chain(shares, repeat(None)), strict=False)):
             metrics = GraspMetrics({**(grasp.metrics or {}), "robustness": share})

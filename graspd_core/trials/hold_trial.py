@@ -41,7 +41,7 @@ def hold_trial(
     """Run one hold trial of `protocol`; ends at the first breach.
 
     Returns:
-        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions, until
+        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the pulls, until
         the pulls ended: an object that still creeps when a pull's answer is known would go farther by its full length.
         A simulation that diverges, or has more contacts than memory, is a failure with that reason.
     """
@@ -72,7 +72,7 @@ def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, sto
         mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
         mass = float(world.model.body_mass[world.object_body])
         steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
-        for direction in DIRECTIONS:
+        for direction in DIRECTIONS[list(protocol.pulls)]:
             mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
             data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
             reason = step_until_known(world, data, protocol, worst, steps, stop=stop)

@@ -59,7 +59,8 @@ class Protocol:
         slide_damping: of every prismatic joint, likewise [N·s/m].
         armature: rotor inertia of every joint [kg·m²] or [kg].
         stage_time: duration of pregrasp → grasp and of grasp → squeeze [s].
-        hold_time: duration of each of the six pulls [s].
+        hold_time: duration of each pull [s].
+        pulls: directions of the pulls, one after another, each from the squeeze on: rows of `hold_trial.DIRECTIONS`.
         pull: force per object mass [N/kg].
         max_displacement: allowed travel of the object's centre of mass [m].
         max_rotation: allowed turn of the object [rad].
@@ -78,6 +79,7 @@ class Protocol:
     armature: float = 1e-4
     stage_time: float = 0.4
     hold_time: float = 2.0
+    pulls: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     pull: float = 10.0
     max_displacement: float = 0.05
     max_rotation: float = float(np.deg2rad(15.0))

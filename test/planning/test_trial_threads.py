@@ -60,6 +60,22 @@ def test_the_second_is_worked_on_while_the_first_is_unfinished():
     assert list(results_in_order(a_run(), work, [0, 1], 2)) == [0, 1]
 
 
+def test_all_that_is_needed_is_worked_on_while_the_first_is_unfinished():
+    begun, last_needed = [], threading.Event()
+
+    def work(item: int, stop: StopHook) -> int:
+        begun.append(item)
+        if item == 9:
+            last_needed.set()
+        assert item or last_needed.wait(60)
+        return item
+
+    with closing(results_in_order(a_run(), work, list(range(50)), 2, lambda: 10)) as results:
+        assert next(results) == 0
+        # No more than what is needed was begun until the first was there.
+        assert sorted(begun) == list(range(10))
+
+
 def test_who_has_enough_ends_the_work_that_was_begun_ahead():
     begun, ended = threading.Event(), []
 

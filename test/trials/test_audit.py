@@ -9,9 +9,9 @@ import pytest
 
 from graspd_core.trials import audit, hold_trial
 from graspd_core.trials.audit import audited_trials, is_audited
-from graspd_core.trials.trial_registry import TrialContext
-from graspd_core.trials.world import PROTOCOLS, build_world
-from graspd_core.types import AuditCount, Grasp
+from graspd_core.trials.trial_registry import TrialContext, grasp_trials
+from graspd_core.trials.world import PROTOCOLS, Protocol, build_world
+from graspd_core.types import AuditCount, Grasp, StopHook, TrialResult
 
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
 
@@ -41,6 +41,25 @@ def test_a_planted_disagreement_is_counted_and_the_grasp_fails(context, closing,
     assert count == AuditCount(1, 1)
     assert not hold.passed
     assert hold.reason.startswith("the object moved 5.")
+
+
+def test_an_audit_is_one_pull_at_full_length_and_each_pull_has_its_turn(context, closing, all_audited, monkeypatch):
+    tried: dict[Protocol, int] = {}
+
+    def count(context: TrialContext, grasp: Grasp, stop: StopHook) -> tuple[TrialResult, ...]:
+        world = replace(context.alone, watch=lambda data: steps.append(1))
+        steps: list[int] = []
+        results = grasp_trials(replace(context, alone=world), grasp, stop)
+        tried[context.protocol] = len(steps)
+        return results
+
+    monkeypatch.setattr(audit, "grasp_trials", count)
+    for width in np.linspace(0.0, 0.04, 40):
+        audited_trials(context, closing(0.015, 0.025, (width, 0.04)))
+    del tried[STANDARD]
+    assert {protocol.pulls for protocol in tried} == {(pull,) for pull in range(6)}
+    seconds = 2 * STANDARD.stage_time + STANDARD.hold_time
+    assert set(tried.values()) == {round(seconds / STANDARD.timestep)}
 
 
 def test_an_audit_that_agrees_changes_nothing(context, firm, all_audited):
