@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -50,6 +51,8 @@ class Fingers:
         return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
 
 
+# Kept for the last few hands, which are hashed by identity.
+@lru_cache(maxsize=8)
 def find_fingers(hand: HandModel) -> Fingers:
     """The chains that end in links which move no others, each with the far end of its last solids for a tip."""
     groups = hand.link_group

@@ -100,14 +100,14 @@ def _draw_pool(
     rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -facing)
     rotation = rotation_from_axis_angle(facing, uniform(-np.pi, np.pi, count, generator)) @ rotation
     standoff = uniform(*_PALM_STANDOFF, count, generator)
-    grip = torch.as_tensor(hand.palm_center).expand(count, 3)
+    grip = torch.as_tensor(hand.palm_center).repeat(count, 1)
     joints = open_joints(hand, count, generator)
     if fingertips:
         some = uniform(0.0, 1.0, count, generator) < fingertips
         share = torch.where(some, uniform(*_SHARE_CLOSED, count, generator), 0.0)[:, None]
         joints = joints + share * (torch.as_tensor(hand.closed_posture) - joints)
         standoff = torch.where(some, uniform(*_TIP_STANDOFF, count, generator), standoff)
-        grip = torch.where(some[:, None], between_fingertips(hand, joints), grip)
+        grip[some] = between_fingertips(hand, joints[some])
     middle = torch.as_tensor(points) + standoff[:, None] * outward
     translation = middle - (rotation @ grip[..., None]).squeeze(-1)
     return StartPool(grip, standoff, middle, rotation, translation, joints, torch.zeros(count, dtype=torch.float64))

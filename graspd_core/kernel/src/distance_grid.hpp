@@ -8,6 +8,8 @@
 namespace graspd {
 
 constexpr float LEAST_REACH = 1e-3f, TINY = 1e-24f;
+// The channels of a place far from everything.
+constexpr float FAR[4] = {1e3f, 1, 0, 0};
 
 // How far u lies from [0, most], whose nearest value is b. Exactly zero inside, where a fused u - b may not be.
 INLINE Floats beyond(Floats u, Floats b, float most) { return (u >= 0.f) & (u <= most) ? Floats{} : u - b; }
@@ -49,15 +51,11 @@ static void interpolate(const Grid& grid, int count, Samples& at) {
         auto low = [](Eight v) { return __builtin_shufflevector(v, v, 0, 1, 2, 3); };
         auto high = [](Eight v) { return __builtin_shufflevector(v, v, 4, 5, 6, 7); };
         Four along_z = high(value) - low(value), channels = low(value) + fz * along_z;
-        float* j = at.jacobian + 16 * i;
-        *(Four*)j = channels;
-        *(Four*)(j + 4) = low(along_x) + fz * (high(along_x) - low(along_x));
-        *(Four*)(j + 8) = low(along_y) + fz * (high(along_y) - low(along_y));
-        *(Four*)(j + 12) = along_z;
-        at.phi[i] = channels[0];
-        at.nx[i] = channels[1];
-        at.ny[i] = channels[2];
-        at.nz[i] = channels[3];
+        float* slope = at.slopes + 12 * i;
+        *(Four*)slope = low(along_x) + fz * (high(along_x) - low(along_x));
+        *(Four*)(slope + 4) = low(along_y) + fz * (high(along_y) - low(along_y));
+        *(Four*)(slope + 8) = along_z;
+        for (int c = 0; c < 4; c++) at.channel[c][i] = channels[c];
     }
 }
 
@@ -66,13 +64,11 @@ static void sample(const Grid& grid, int count, Samples& at) {
     const int whole = padded(count);
     find_cells(grid, whole, at);
     interpolate(grid, count, at);
-    for (int i = count; i < whole; i++) {
-        at.phi[i] = 1e3f;
-        at.nx[i] = 1;
-        at.ny[i] = at.nz[i] = 0;
-    }
+    for (int i = count; i < whole; i++)
+        for (int c = 0; c < 4; c++) at.channel[c][i] = FAR[c];
     for (int i = 0; i < whole; i += LANES) {
-        Floats phi = load(at.phi + i), gx = load(at.nx + i), gy = load(at.ny + i), gz = load(at.nz + i);
+        Floats phi = load(at.channel[0] + i), gx = load(at.channel[1] + i), gy = load(at.channel[2] + i),
+               gz = load(at.channel[3] + i);
         Floats reach = greater(phi, all(LEAST_REACH));
         Floats x = load(at.ox + i) + reach * gx, y = load(at.oy + i) + reach * gy, z = load(at.oz + i) + reach * gz;
         Floats squared = x * x + y * y + z * z;
@@ -84,30 +80,43 @@ static void sample(const Grid& grid, int count, Samples& at) {
     }
 }
 
-// Gradients with respect to the points, from the adjoints of their distances and normals.
+// Gradients with respect to the points, from the adjoints of their distances and normals. Those beyond `count` have none.
 static void sample_adjoint(const Grid& grid, int count, Samples& at) {
     const float inverse = 1.f / grid.spacing;
-    for (int i = 0; i < count; i++) {
-        float a = at.a_phi[i], ax = at.a_nx[i], ay = at.a_ny[i], az = at.a_nz[i];
-        if (a == 0 && ax == 0 && ay == 0 && az == 0) {
-            at.gx[i] = at.gy[i] = at.gz[i] = 0;
-            continue;
+    alignas(Floats) float channel[4][LANES], offset[3][LANES];
+    for (int i = 0; i < count; i += LANES) {
+        Floats a = load(at.a_phi + i), ax = load(at.a_nx + i), ay = load(at.a_ny + i), az = load(at.a_nz + i);
+        unsigned some = bits((a != 0.f) | (ax != 0.f) | (ay != 0.f) | (az != 0.f));
+        store(at.gx + i, Floats{});
+        store(at.gy + i, Floats{});
+        store(at.gz + i, Floats{});
+        if (count - i < LANES) some &= (1u << (count - i)) - 1;
+        if (!some) continue;
+        Floats phi = load(at.channel[0] + i), g0 = load(at.channel[1] + i), g1 = load(at.channel[2] + i),
+               g2 = load(at.channel[3] + i), nx = load(at.nx + i), ny = load(at.ny + i), nz = load(at.nz + i);
+        Floats reach = greater(phi, all(LEAST_REACH));
+        Floats x = load(at.ox + i) + reach * g0, y = load(at.oy + i) + reach * g1, z = load(at.oz + i) + reach * g2;
+        Floats shrink = inverse_root(x * x + y * y + z * z + TINY), norm = root(g0 * g0 + g1 * g1 + g2 * g2);
+        Floats along = nx * ax + ny * ay + nz * az;
+        Floats sx = a * nx + (ax - nx * along) * shrink, sy = a * ny + (ay - ny * along) * shrink,
+               sz = a * nz + (az - nz * along) * shrink;
+        Floats a_reach = sx * g0 + sy * g1 + sz * g2 - a * norm, unit = a * reach / (norm + TINY);
+        store(channel[0], a + (phi > LEAST_REACH ? a_reach : Floats{}));
+        store(channel[1], reach * sx - unit * g0);
+        store(channel[2], reach * sy - unit * g1);
+        store(channel[3], reach * sz - unit * g2);
+        store(offset[0], sx);
+        store(offset[1], sy);
+        store(offset[2], sz);
+        for (; some; some &= some - 1) {
+            const int lane = __builtin_ctz(some), point = i + lane;
+            const float* slope = at.slopes + 12 * point;
+            const Four c = {channel[0][lane], channel[1][lane], channel[2][lane], channel[3][lane]};
+            // Beyond the grid along an axis the interpolated channels stay what they are, inside it the offset does.
+            at.gx[point] = at.ox[point] != 0 ? offset[0][lane] : sum_four(c * *(const Four*)slope) * inverse;
+            at.gy[point] = at.oy[point] != 0 ? offset[1][lane] : sum_four(c * *(const Four*)(slope + 4)) * inverse;
+            at.gz[point] = at.oz[point] != 0 ? offset[2][lane] : sum_four(c * *(const Four*)(slope + 8)) * inverse;
         }
-        const float* j = at.jacobian + 16 * i;
-        float phi = j[0], g0 = j[1], g1 = j[2], g2 = j[3], nx = at.nx[i], ny = at.ny[i], nz = at.nz[i];
-        float ox = at.ox[i], oy = at.oy[i], oz = at.oz[i], reach = phi > LEAST_REACH ? phi : LEAST_REACH;
-        float x = ox + reach * g0, y = oy + reach * g1, z = oz + reach * g2;
-        float shrink = 1.f / sqrtf(x * x + y * y + z * z + TINY), norm = sqrtf(g0 * g0 + g1 * g1 + g2 * g2);
-        float along = nx * ax + ny * ay + nz * az;
-        float sx = a * nx + (ax - nx * along) * shrink, sy = a * ny + (ay - ny * along) * shrink,
-              sz = a * nz + (az - nz * along) * shrink;
-        float a_reach = sx * g0 + sy * g1 + sz * g2 - a * norm, unit = a * reach / (norm + TINY);
-        Four channel = {a + (phi > LEAST_REACH ? a_reach : 0.f), reach * sx - unit * g0, reach * sy - unit * g1,
-                        reach * sz - unit * g2};
-        // Beyond the grid along an axis the interpolated channels stay what they are, inside it the offset does.
-        at.gx[i] = ox != 0 ? sx : sum_four(channel * *(const Four*)(j + 4)) * inverse;
-        at.gy[i] = oy != 0 ? sy : sum_four(channel * *(const Four*)(j + 8)) * inverse;
-        at.gz[i] = oz != 0 ? sz : sum_four(channel * *(const Four*)(j + 12)) * inverse;
     }
 }
 

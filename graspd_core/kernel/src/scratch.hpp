@@ -34,13 +34,15 @@ class Array {
 struct Samples {
     explicit Samples(int n)
         : x(n), y(n), z(n), phi(n), nx(n), ny(n), nz(n), fx(n), fy(n), fz(n), ox(n), oy(n), oz(n), cell(n),
-          jacobian(16 * n), a_phi(n), a_nx(n), a_ny(n), a_nz(n), gx(n), gy(n), gz(n) {}
+          channel{Array<float>(n), Array<float>(n), Array<float>(n), Array<float>(n)}, slopes(12 * n),
+          a_phi(n), a_nx(n), a_ny(n), a_nz(n), gx(n), gy(n), gz(n) {}
     Array<float> x, y, z;        // where [m]
     Array<float> phi, nx, ny, nz;
     Array<float> fx, fy, fz;     // place within the cell
     Array<float> ox, oy, oz;     // offset from the grid [m], zero inside
     Array<int32_t> cell;         // index of the cell's first node
-    Array<float> jacobian;       // 16 a point: the channels, then their slopes per cell along x, y, z
+    Array<float> channel[4];     // interpolated there
+    Array<float> slopes;         // 12 a point: of the channels, per cell along x, y, z
     Array<float> a_phi, a_nx, a_ny, a_nz;  // adjoints of distance and normal
     Array<float> gx, gy, gz;     // gradient with respect to the points
 };

@@ -55,7 +55,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
     chosen = [torch.where(members[None], distance[:, None], torch.inf).argmin(-1)]
     spread = torch.full_like(near, torch.inf, dtype=distance.dtype)
     for _ in range(_SPREAD):
-        away = (placed.points[:, None] - placed.points[rows, chosen[-1]][:, :, None]).norm(dim=-1)
+        away = torch.cdist(placed.points[rows, chosen[-1]], placed.points, compute_mode="donot_use_mm_for_euclid_dist")
         spread = torch.minimum(spread, away)
         chosen.append(torch.where(near, spread, -1.0).argmax(-1))
     slots = torch.stack(chosen, -1).flatten(1)
