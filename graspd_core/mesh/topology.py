@@ -66,8 +66,8 @@ def is_oriented(faces: Faces) -> bool:
 
 def is_closed(mesh: TriangleMesh) -> bool:
     """Every edge has an even number of faces."""
-    edges = np.sort(_edges(mesh.faces), axis=1)
-    _, counts = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
+    a, b = _edges(mesh.faces).T
+    _, counts = np.unique(np.minimum(a, b) * len(mesh.vertices) + np.maximum(a, b), return_counts=True)
     return bool((counts % 2 == 0).all())
 
 

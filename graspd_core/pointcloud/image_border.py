@@ -41,7 +41,8 @@ def reaches_image_border(
     except (QhullError, ValueError):
         return False
     ends = plane[hull.simplices]
-    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * np.ptp(plane, axis=0).max()
+    least = MIN_SIDE_SHARE * max(float(np.ptp(column)) for column in plane.T)
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > least
     own, others = plane[mine], plane[~mine]
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
         # The object's few points first: most sides are none of theirs.

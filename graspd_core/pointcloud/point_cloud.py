@@ -47,8 +47,13 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 def measured(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
     """Which points were measured: finite, and not what drivers fill gaps with: zeros, or the camera's place."""
-    filled = (points == 0).all(1) | (np.abs(points - viewpoint) < CAMERA_PLACE_TOLERANCE_M).all(1)
-    return np.isfinite(points).all(1) & ~filled
+    zero = near = finite = np.ones(len(points), dtype=bool)
+    # Column by column: NumPy takes ten times as long for what all of a short row is.
+    for column, place in zip(points.T, viewpoint, strict=True):
+        zero = zero & (column == 0)
+        near = near & (np.abs(column - place) < CAMERA_PLACE_TOLERANCE_M)
+        finite = finite & np.isfinite(column)
+    return finite & ~(zero | near)
 
 
 def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> PointCloud:

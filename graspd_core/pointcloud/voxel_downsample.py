@@ -84,7 +84,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
     voxel, size = _voxels(points, settings.voxel, settings.max_voxels)
     count = np.bincount(voxel)
     mean = np.column_stack([np.bincount(voxel, points[:, axis]) / count for axis in range(3)])
-    if float(np.ptp(mean, axis=0).max()) <= 0:
+    if max(float(np.ptp(column)) for column in mean.T) <= 0:
         within = float(np.ptp(points, axis=0).max())
         unit = f", within {1e3 * within:.2g} mm: are they in metres?" if within else "; no surface is seen"
         raise CloudError(f"cloud: all {len(points)} points are in one place{unit}")

@@ -42,7 +42,7 @@ def grid_poisson_field(
     Raises:
         CloudError: the points and normals are not those of one surface.
     """
-    from scipy.fft import next_fast_len
+    from scipy.fft import irfftn, next_fast_len, rfftn
 
     counts = nodes.shape[:3]
     fast: Any = next_fast_len
@@ -52,11 +52,12 @@ def grid_poisson_field(
     waves = _waves(shape)
     square = sum(wave**2 for wave in waves)
 
+    # In float32, whose last digit is far less than noise: transforms are most of the time, and take a third of it so.
     def spread(values: Float[np.ndarray, "points"]) -> np.ndarray:
-        return np.fft.rfftn((at.T @ values).reshape(shape))
+        return rfftn((at.T @ values).astype(np.float32).reshape(shape))
 
     def at_points(spectrum: np.ndarray) -> tuple[Float[np.ndarray, "nodes"], Float[np.ndarray, "points"]]:
-        field = np.fft.irfftn(spectrum, shape, axes=(0, 1, 2)).ravel()
+        field = irfftn(spectrum, shape).ravel()
         return field, at @ field
 
     _, density = at_points(spread(np.ones(len(surfels.points))) * np.exp(-0.5 * _DENSITY_BLUR**2 * square))
@@ -102,7 +103,8 @@ def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> 
 def _waves(shape: tuple[int, ...]) -> list[np.ndarray]:
     """Wave numbers [rad per cell] of a real field's spectrum along each axis, to be broadcast."""
     turns = [np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), np.fft.rfftfreq(shape[2])]
-    return list(np.meshgrid(*(2 * np.pi * turn for turn in turns), indexing="ij", sparse=True))
+    waves = ((2 * np.pi * turn).astype(np.float32) for turn in turns)
+    return list(np.meshgrid(*waves, indexing="ij", sparse=True))
 
 
 def _slope(field: Float[np.ndarray, "x y z"], at: Any, normals: Float[np.ndarray, "points 3"]) -> float:

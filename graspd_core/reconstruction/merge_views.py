@@ -95,7 +95,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
         total = weights.sum(1, keepdims=True)
         centre = np.einsum("nk,nkd->nd", weights, points[near]) / total
         spread = points[near] - centre[:, None]
-        _, axes = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weights, spread, spread))
+        _, axes = np.linalg.eigh(np.swapaxes(weights[..., None] * spread, 1, 2) @ spread)
         normals = axes[:, :, 0]
         off = np.einsum("nkd,nd->nk", spread, normals)
         weights = np.exp(-np.square(off / (1.5 * step)) - np.square(distance / distance[:, -1:]))

@@ -79,7 +79,7 @@ def extent(points: Float[np.ndarray, "n 3"]) -> float:
     """Length along the longest principal axis [m], however the points are turned."""
     centred = points - points.mean(0)
     _, axes = np.linalg.eigh(centred.T @ centred)
-    return float(np.ptp(centred @ axes, axis=0).max())
+    return max(float(np.ptp(column)) for column in (centred @ axes).T)
 
 
 def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:

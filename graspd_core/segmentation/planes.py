@@ -172,7 +172,7 @@ def _measure(
     rows = np.flatnonzero(inliers)
     flat = points[rows] @ axes
     low = flat.min(0)
-    width = max(RASTER_CELL_M, float(np.ptp(flat, axis=0).max()) / MAX_RASTER_CELLS)
+    width = max(RASTER_CELL_M, max(float(np.ptp(column)) for column in flat.T) / MAX_RASTER_CELLS)
     cell = np.round((flat - low) / width).astype(int) + BRIDGED_CELLS
     raster = np.zeros(cell.max(0) + 2 * BRIDGED_CELLS, dtype=bool)
     raster[tuple(cell.T)] = True
