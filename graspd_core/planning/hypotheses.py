@@ -7,8 +7,9 @@ many hold on the true object was measured (docs/clouds.md).
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
@@ -34,6 +35,12 @@ _PLACES, _PLACES_SEED = 3, 0x706C616365
 _RESOLUTION = 32
 # How often the stop hook is asked while waiting for a world [s].
 _POLL = 0.02
+
+# Of trials under some hypotheses, in their order; None where there was none.
+Results = Generator[TrialResult | None]
+
+# An object of another shape and its convex parts.
+OtherObject = tuple[ObjectModel, tuple[TriangleMesh, ...]]
 
 # Trials run in several threads, and one builds the world that all of them try in.
 _BUILDING = threading.Lock()
@@ -143,29 +150,44 @@ def _allowed_failures(probability: float) -> int:
     return sum(held >= probability for held in HELD_AFTER) - 1
 
 
-def try_hypotheses(hypotheses: Hypotheses, grasp: Grasp, stop: StopHook) -> tuple[TrialResult, float]:
+def one_by_one(items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
+    """The trials of a grasp under each, none begun before its result is asked for."""
+    for item in items:
+        yield item.hold(grasp, stop)
+
+
+def try_hypotheses(
+    hypotheses: Hypotheses,
+    grasp: Grasp,
+    stop: StopHook,
+    hold_under: Callable[[Sequence[Hypothesis], Grasp, StopHook], Results] = one_by_one,
+) -> tuple[TrialResult, float]:
     """Hold trials of a grasp under each in turn, until the answer is known; and how likely it is to hold in truth.
 
     A trial that was not needed counts as failed for that probability. The result tells the greatest travel and turn of
-    the trials that were passed.
+    the trials that were passed. `hold_under` is given all that the grasp has to be tried under if it is to be verified.
     """
     worst, failed, tried, left = [0.0, 0.0], [], 0, len(hypotheses.items)
-    for item in hypotheses.items:
-        if not len(failed) <= hypotheses.allowed < len(failed) + left:
-            break
-        result = item.hold(grasp, stop)
+    while len(failed) <= hypotheses.allowed < len(failed) + left:
+        first = len(hypotheses.items) - left
+        needed = hypotheses.items[first : first + len(failed) + left - hypotheses.allowed]
+        with closing(hold_under(needed, grasp, stop)) as results:
+            for item, result in zip(needed, results, strict=False):
+                if stop():
+                    break
+                left -= 1
+                if result is None:
+                    continue
+                tried += 1
+                if result.passed:
+                    worst = [max(worst[0], result.displacement), max(worst[1], result.rotation)]
+                    continue
+                failed.append(f"{item.name}: {result.reason}")
+                if len(failed) > hypotheses.allowed:
+                    break
+                hypotheses.failed(len(failed))
         if stop():
             return TrialResult(HYPOTHESES, False, worst[0], worst[1], STOPPED), HELD_AFTER[-1]
-        left -= 1
-        if result is None:
-            continue
-        tried += 1
-        if result.passed:
-            worst = [max(worst[0], result.displacement), max(worst[1], result.rotation)]
-        else:
-            failed.append(f"{item.name}: {result.reason}")
-            if len(failed) <= hypotheses.allowed:
-                hypotheses.failed(len(failed))
     passed = len(failed) <= hypotheses.allowed
     reason = "" if passed else f"fails under {len(failed)} of the {tried} hypotheses tried ({'; '.join(failed)})"
     worst_case = min(len(failed) + left if passed else len(HELD_AFTER), len(HELD_AFTER) - 1)
@@ -194,16 +216,36 @@ def _own_world(scene: Scene, hand: HandModel, protocol: Protocol) -> World:
     return build_world(hand, scene.object, object_parts(scene.object), protocol)
 
 
+@lru_cache(maxsize=4)
+def _begun(evidence: Evidence) -> dict[str, Future[OtherObject | None]]:
+    """Objects of other shapes that `begin_other_shape` has begun, by their rules."""
+    return {}
+
+
+def begin_other_shape(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
+    """Begin the first other shape that grasps of a scene to come will be tried on, if any, in a thread beside.
+
+    For `scene_from_views`: it is made while the distance grid of the likeliest shape is built.
+    """
+    from graspd_core.reconstruction.other_shapes import other_rules
+
+    rules, allowed = other_rules(evidence), _allowed_failures(probability)
+    if allowed + 1 < len(HELD_AFTER) and len(rules) > allowed:
+        pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
+        _begun(evidence)[rules[0]] = pool.submit(run_isolated, other_object, evidence, rules[0], likeliest)
+        pool.shutdown(wait=False)
+
+
 @lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
     """The world of another shape of the object's own mass and friction; None where there is no such shape."""
-    made = run_isolated(other_object, scene.evidence, rule, scene.object)
+    assert scene.evidence is not None
+    begun = _begun(scene.evidence).get(rule)
+    made = run_isolated(other_object, scene.evidence, rule, scene.object) if begun is None else begun.result()
     return None if made is None else build_world(hand, *made, protocol)
 
 
-def other_object(
-    evidence: Evidence, rule: str, likeliest: ObjectModel
-) -> tuple[ObjectModel, tuple[TriangleMesh, ...]] | None:
+def other_object(evidence: Evidence, rule: str, likeliest: ObjectModel) -> OtherObject | None:
     """An object of the same mass and friction whose hidden side is guessed by a rule, and its convex parts.
 
     None where there is no such shape.

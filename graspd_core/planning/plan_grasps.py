@@ -26,7 +26,6 @@ from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.planning.run_clock import Run
 from graspd_core.planning.verification import rank_by_robustness, trials_ahead
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.far_objects import moved_grasp
 from graspd_core.scene.scene import Scene
 from graspd_core.types import Grasp, GraspResult, Outcome, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
@@ -181,5 +180,5 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
 
     start_planning_worker()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
-    scene = run_isolated(scene_from_views, [PointCloud(ball, np.zeros(3))], alone=True)
+    scene = scene_from_views([PointCloud(ball, np.zeros(3))], alone=True)
     plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)

@@ -12,7 +12,7 @@ from graspd_core.pointcloud.free_space import FreeSpace
 from graspd_core.reconstruction.merge_views import Surfels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What was seen of an object: other guesses of what was hidden are made of it.
 

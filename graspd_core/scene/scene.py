@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -117,6 +118,7 @@ def build_scene(
     support: Plane | None = None,
     obstacles: tuple[Obstacle, ...] = (),
     confidence: Float[np.ndarray, "vertices"] | None = None,
+    ahead: Callable[[ObjectModel], None] | None = None,
 ) -> Scene:
     """The scene of a mesh already in metres; `scale` is what its file was multiplied by, for the record and for advice.
 
@@ -124,6 +126,7 @@ def build_scene(
         support: what the object stands on.
         obstacles: other things near it.
         confidence: how far each of the mesh's vertices was seen, 1, or guessed, 0; None: all of it is known.
+        ahead: called with the object before its distance grid is built, to begin what does without.
 
     Raises:
         MeshError: see `load_scene`; or there is not one confidence for every vertex.
@@ -139,6 +142,8 @@ def build_scene(
     if bodies > 1:
         found += (f"{source}: {bodies} bodies, {1000 * gap:.0f} mm apart; they are grasped as one rigid thing",)
     model = _object_model(clean, source, mass, friction, scale, warnings + found, confidence is not None)
+    if ahead is not None:
+        ahead(model)
     loaded = time.perf_counter()
     sdf = object_sdf(model, resolution)
     if not is_solid(sdf):

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 
 from graspd_core.config import SceneConfig
 from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.reconstruct import reconstruct
+from graspd_core.reconstruction.evidence import Evidence
+from graspd_core.reconstruction.reconstruct import Reconstruction, reconstruct
+from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.obstacles import make_obstacles
-from graspd_core.scene.scene import Obstacle, Scene, build_scene, refuse_numbers
+from graspd_core.scene.scene import ObjectModel, Obstacle, Scene, build_scene, refuse_numbers
 from graspd_core.segmentation.segment import Segmentation, segment
 from graspd_core.segmentation.target_selection import Target
-from graspd_core.types import TriangleMesh
+from graspd_core.types import Plane, TriangleMesh
 
 
 def scene_from_views(
@@ -29,6 +31,7 @@ def scene_from_views(
     source: str = "cloud",
     resolution: int = 48,
     device: torch.device | str = "cpu",
+    ahead: Callable[[ObjectModel, Evidence], None] | None = None,
 ) -> Scene:
     """The scene that one or several views show, in their common frame; what was guessed is in the object's warnings.
 
@@ -41,6 +44,7 @@ def scene_from_views(
         friction: Coulomb coefficient between hand and object.
         source: name of the views, for messages.
         resolution: the distance grid has at most the cube of it in nodes.
+        ahead: called as soon as the object is known, before its distance grid is built, to begin what does without.
 
     Raises:
         CloudError: the views show no usable object; NoObjectError where what was asked for is not in them.
@@ -49,11 +53,8 @@ def scene_from_views(
     started = time.perf_counter()
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
     settings = settings or SceneConfig()
-    if alone:
-        seen = Segmentation(tuple(views), None, (), ())
-    else:
-        seen = segment(views, target=target, settings=settings.segmentation)
-    whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
+    # The child, where there is one, is free for other work while the distance grid is built here.
+    whole, support, obstacles, warnings = run_isolated(_reconstructed, views, target, alone, settings)
     scene = build_scene(
         whole.mesh,
         source=source,
@@ -61,13 +62,26 @@ def scene_from_views(
         friction=friction,
         resolution=resolution,
         device=device,
-        warnings=seen.warnings + whole.warnings,
+        warnings=warnings + whole.warnings,
         started=started,
-        support=seen.support,
-        obstacles=_obstacles(seen, whole.mesh, settings),
+        support=support,
+        obstacles=obstacles,
         confidence=whole.confidence,
+        ahead=ahead and (lambda model: ahead(model, whole.evidence)),
     )
     return replace(scene, evidence=whole.evidence)
+
+
+def _reconstructed(
+    views: Sequence[PointCloud], target: Target | None, alone: bool, settings: SceneConfig
+) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
+    """The surface of the object, what it stands on, what stands about it, and how surely it was cut out."""
+    if alone:
+        seen = Segmentation(tuple(views), None, (), ())
+    else:
+        seen = segment(views, target=target, settings=settings.segmentation)
+    whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
+    return whole, seen.support, _obstacles(seen, whole.mesh, settings), seen.warnings
 
 
 def _obstacles(seen: Segmentation, mesh: TriangleMesh, settings: SceneConfig) -> tuple[Obstacle, ...]:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from jaxtyping import Bool, Float
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from graspd_core import PointCloud, Scene, Target, cloud_from_depth, scene_from_views
+from graspd_core import PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
 from graspd_core.bags.messages import pixels_from_message, points_from_message
 from graspd_core.config import load_scene_config
+from graspd_core.planning.hypotheses import begin_other_shape
 from graspd_core.pointcloud.camera import camera_rays
 from graspd_core.pointcloud.point_cloud import transform_cloud
-from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.inputs.depth_stream import frame_of
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
@@ -138,14 +139,17 @@ def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Ta
     Raises:
         GraspdError: the clouds show no usable object, or the file of the settings has changed and cannot be used.
     """
-    return run_isolated(
-        scene_from_views,
+    # Beside its distance grid, if grasps will have to hold on it.
+    certainty = load_preset(settings.preset).certainty
+    ahead = None if settings.verify == "none" else partial(begin_other_shape, certainty.probability)
+    return scene_from_views(
         views,
         target=target,
         alone=not settings.segment,
         settings=load_scene_config(settings.scene_config) if settings.scene_config else None,
         mass=settings.mass,
         friction=settings.friction,
+        ahead=ahead,
     )
 
 

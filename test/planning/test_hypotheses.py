@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -17,17 +18,26 @@ from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning import hypotheses
-from graspd_core.planning.hypotheses import Hypotheses, Hypothesis, OtherWorlds, try_hypotheses
+from graspd_core.planning import hypotheses, verification
+from graspd_core.planning.hypotheses import (
+    Hypotheses,
+    Hypothesis,
+    OtherWorlds,
+    begin_other_shape,
+    one_by_one,
+    try_hypotheses,
+)
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.run_clock import Run
 from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core.scene import scene as scene_module
 from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import COARSE_CUTS, Scene, object_parts
+from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
 from graspd_core.trials.world import PROTOCOLS, build_world
-from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, TrialResult, Verdict
+from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 0.0)
@@ -87,6 +97,62 @@ def test_a_grasp_may_fail_under_as_many_as_are_allowed(passed, verified, probabi
 def test_the_verdict_is_the_same_in_every_order(orders):
     passed, turned = (try_hypotheses(under(*order), GRASP, lambda: False)[0].passed for order in orders)
     assert passed == turned == (orders[0].count(False) <= 1)
+
+
+@given(st.lists(st.sampled_from([True, False, None]), max_size=9), st.integers(2, 4))
+def test_several_at_a_time_come_to_the_same(passed, threads):
+    told: dict[bool, list[int]] = {False: [], True: []}
+
+    def tried(together: bool) -> tuple[TrialResult, float]:
+        run, given = Run(time.perf_counter(), None, None, None), replace(under(*passed), failed=told[together].append)
+        hold_under = partial(verification._at_once, run, threads) if together else one_by_one
+        return try_hypotheses(given, GRASP, run.over, hold_under)
+
+    assert tried(True) == tried(False)
+    assert told[True] == told[False]
+
+
+def test_a_run_that_ends_ends_the_trials_of_several_at_a_time():
+    over = threading.Event()
+
+    def hold(grasp: Grasp, stop: StopHook) -> TrialResult:
+        over.set()
+        while not stop():
+            time.sleep(0.001)
+        return TrialResult("hold", True, 0.0, 0.0, "")
+
+    run = Run(time.perf_counter(), None, None, over.is_set)
+    asked = Hypotheses(tuple(Hypothesis(f"number {k}", hold) for k in range(5)), allowed=1)
+    result, likely = try_hypotheses(asked, GRASP, run.over, partial(verification._at_once, run, 2))
+    assert (result.passed, likely) == (False, HELD_AFTER[-1])
+
+
+def test_a_shape_that_was_begun_with_the_scene_is_not_made_again(monkeypatch):
+    made, begun_before_grid = [], []
+    other, grid = hypotheses.other_object, scene_module.object_sdf
+    monkeypatch.setattr(hypotheses, "other_object", lambda *given: made.append(given[1]) or other(*given))
+    monkeypatch.setattr(
+        scene_module, "object_sdf", lambda *given: begun_before_grid.append(bool(begun)) or grid(*given)
+    )
+    begun: list[str] = []
+
+    def ahead(likeliest: ObjectModel, evidence: Evidence) -> None:
+        begin_other_shape(0.9, likeliest, evidence)
+        begun.extend(hypotheses._begun(evidence))
+
+    scene = scene_from_views(views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8)), ahead=ahead)
+    assert begun_before_grid[0]
+    assert begun == [""]
+    assert any(grasp.verdict is Verdict.VERIFIED for grasp in plan(scene, 0.9).grasps)
+    assert made.count("") == 1
+
+
+def test_no_shape_is_begun_where_none_is_needed():
+    evidence = seen_all_round().evidence
+    assert evidence is not None
+    for doubted, probability in ((evidence, 0.9), (replace(evidence, hidden=True), 0.0)):
+        begin_other_shape(probability, seen_all_round().object, doubted)
+        assert not hypotheses._begun(doubted)
 
 
 def test_the_reason_names_what_the_grasp_failed_under():
