@@ -32,7 +32,7 @@ MAX_FACES = 25_000
 DEFAULT_DENSITY = 300.0
 
 # How a surface is cut into convex parts that is known to millimetres only, from cameras or by guess.
-COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 3000}
+COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
 
 
 @dataclass(frozen=True)
