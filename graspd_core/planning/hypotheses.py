@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 
 from graspd_core.config.certainty_config import HELD_AFTER
@@ -36,8 +36,9 @@ _RESOLUTION = 32
 # How often the stop hook is asked while waiting for a world [s].
 _POLL = 0.02
 
-# Of trials under some hypotheses, in their order; None where there was none.
+# Of trials under some hypotheses, in their order; None where there was none. And how a grasp goes through them.
 Results = Generator[TrialResult | None]
+HoldUnder = Callable[[Sequence["Hypothesis"], Grasp, StopHook], Results]
 
 # An object of another shape and its convex parts.
 OtherObject = tuple[ObjectModel, tuple[TriangleMesh, ...]]
@@ -68,11 +69,13 @@ class Hypotheses:
         allowed: under how many of them a verified grasp may fail.
         failed: called with how many a grasp has failed under, while it may still be verified: it needs others to hold
             under in their place, which can be begun.
+        waited_for: set once a trial waits for its world: there is time for other work.
     """
 
     items: tuple[Hypothesis, ...]
     allowed: int
     failed: Callable[[int], None] = lambda count: None
+    waited_for: threading.Event = field(default_factory=threading.Event)
 
 
 class OtherWorlds:
@@ -88,12 +91,15 @@ class OtherWorlds:
         self._make_world = lambda rule: _other_world(scene, hand, protocol, rule)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
         self._made: list[Future[World | None]] = []
+        self.waited_for = threading.Event()
         self._least = begun
         self._begin(begun)
 
     def world(self, index: int, stop: StopHook) -> World | None:
         """One of them; None where it cannot be made, or the hook says to stop."""
         self._begin(index + 1)
+        if not self._made[index].done():
+            self.waited_for.set()
         while not wait([self._made[index]], timeout=_POLL).done:
             if stop():
                 return None
@@ -143,7 +149,7 @@ def hypotheses_of(
         Hypothesis(f"hidden side by {rule}" if rule else "hidden side closed smoothly", partial(_hold_in, others, k))
         for k, rule in enumerate(others.rules)
     ]
-    return Hypotheses((*places, less, *shapes), _allowed_failures(probability), others.begin_after)
+    return Hypotheses((*places, less, *shapes), _allowed_failures(probability), others.begin_after, others.waited_for)
 
 
 def _allowed_failures(probability: float) -> int:
@@ -160,7 +166,7 @@ def try_hypotheses(
     hypotheses: Hypotheses,
     grasp: Grasp,
     stop: StopHook,
-    hold_under: Callable[[Sequence[Hypothesis], Grasp, StopHook], Results] = one_by_one,
+    hold_under: HoldUnder = one_by_one,
 ) -> tuple[TrialResult, float]:
     """Hold trials of a grasp under each in turn, until the answer is known; and how likely it is to hold in truth.
 

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
 from typing import TypeVar
 
-from graspd_core.planning.run_clock import Run
 from graspd_core.types import StopHook
 
 Item = TypeVar("Item")
@@ -20,41 +19,45 @@ _POLL = 0.02
 
 
 def results_in_order(
-    run: Run,
+    over: StopHook,
     work: Callable[[Item, StopHook], Result],
     items: Sequence[Item],
     threads: int,
     needed: Callable[[], int] = lambda: 0,
+    *,
+    known_over: StopHook = lambda: False,
 ) -> Generator[Result]:
-    """The result of each item, in their order, until the run is over.
+    """The result of each item, in their order, until it is over.
 
     Work that is begun ahead and not asked for any more ends by its stop hook when the iterator is closed.
 
     Args:
-        run: the stop hook of `work` is true when it is over; its own hook is asked by the calling thread alone.
+        over: ends it all; asked by the calling thread alone.
         work: done by the calling thread where there is one thread, else by so many others.
         items: what is worked on.
         threads: at least 1.
         needed: how many more results will be asked for at least, so that none of these is begun too early.
+        known_over: ends work too; asked by all threads, also while nobody asks for a result.
     """
     if min(threads, len(items)) <= 1:
         for item in items:
-            if run.over():
+            if over():
                 return
-            yield work(item, run.over)
+            yield work(item, over)
         return
     closed = threading.Event()
     pool = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="graspd-trials")
     waiting, left = deque[Future[Result]](), iter(items)
     try:
-        while not run.over():
+        while not over():
             # As many again as are worked on, and all that are needed: no thread waits for the first in line.
             for item in islice(left, max(2 * threads, needed()) - len(waiting)):
-                waiting.append(pool.submit(work, item, lambda: closed.is_set() or run.known_over()))
+                waiting.append(pool.submit(work, item, lambda: closed.is_set() or known_over()))
             if not waiting:
                 return
             while not wait([waiting[0]], timeout=_POLL).done:
-                run.over()
+                if over():
+                    closed.set()
             yield waiting.popleft().result()
     finally:
         closed.set()

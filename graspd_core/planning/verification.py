@@ -19,6 +19,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.metrics.measure import measure
 from graspd_core.metrics.metrics_context import MetricsContext, make_metrics_context
 from graspd_core.planning.hypotheses import (
+    HoldUnder,
     Hypotheses,
     Hypothesis,
     OtherWorlds,
@@ -163,7 +164,7 @@ def run_trials(
     first, audits = None, AuditCount()
     seen = None if run.watch is None else candidates_seen(candidates)
     # The first answer comes sooner where the best candidate is tried under several hypotheses at a time.
-    alone = 1 if context.hypotheses is not None and not before else 0
+    alone = context.hypotheses is not None and not before
     # No trial gives more than one verified grasp.
     trials = _tried(run, context, candidates, alone, lambda: count - len(verified))
     with closing(trials), ThreadPoolExecutor(threads, thread_name_prefix="graspd-metrics") as pool:
@@ -197,32 +198,46 @@ def run_trials(
 
 
 def _tried(
-    run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], alone: int, needed: Callable[[], int]
+    run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], alone: bool, needed: Callable[[], int]
 ) -> Generator[tuple[Grasp, AuditCount]]:
-    """Candidates with their trials, in their order: the first `alone` one by one, then several at a time."""
-    threads = torch.get_num_threads()
-    yield from results_in_order(run, partial(_all_trials, run, context, threads), candidates[:alone], 1)
-    yield from results_in_order(run, partial(_all_trials, run, context, 1), candidates[alone:], threads, needed)
+    """Candidates with their trials, in their order.
+
+    The first `alone`: under several hypotheses at a time, the others once it waits for the world of one, or has ended.
+    """
+    threads, free = torch.get_num_threads(), threading.Event()
+    if alone and context.hypotheses is not None:
+        free = context.hypotheses.waited_for
+    together = one_by_one if threads == 1 else partial(_at_once, threads)
+
+    def work(grasp: Grasp, stop: StopHook) -> tuple[Grasp, AuditCount]:
+        if not alone:
+            return _all_trials(context, one_by_one, grasp, stop)
+        if grasp is not candidates[0]:
+            while not free.wait(_POLL) and not stop():
+                pass
+            return _all_trials(context, one_by_one, grasp, stop)
+        try:
+            return _all_trials(context, together, grasp, stop)
+        finally:
+            free.set()
+
+    return results_in_order(run.over, work, candidates, threads, needed, known_over=run.known_over)
+
+
+def _at_once(threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
+    """As `one_by_one`, in several threads."""
+    return results_in_order(stop, lambda item, ended: item.hold(grasp, ended), items, threads, lambda: len(items))
 
 
 def _all_trials(
-    run: Run, context: VerificationContext, beside: int, grasp: Grasp, stop: StopHook
+    context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook
 ) -> tuple[Grasp, AuditCount]:
-    """The grasp with the trials of the likeliest scene, and where it passes them those of what else may be true.
-
-    Those by `beside` threads; by more than one only where the calling thread is that of the run.
-    """
+    """The grasp with the trials of the likeliest scene, and where it passes them those of what else may be true."""
     results, audit = audited_trials(context.trials, grasp, stop)
     if not results[-1].passed or context.hypotheses is None:
         return replace(grasp, trials=results), audit
-    hold_under = one_by_one if beside == 1 else partial(_at_once, run, beside)
     under, probability = try_hypotheses(context.hypotheses, grasp, stop, hold_under)
     return replace(grasp, trials=(*results, under), probability=probability), audit
-
-
-def _at_once(run: Run, threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
-    """As `one_by_one`, in several threads."""
-    return results_in_order(run, lambda item, stop: item.hold(grasp, stop), items, threads, lambda: len(items))
 
 
 def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
@@ -248,7 +263,8 @@ def rank_by_robustness(
     def share_held(grasp: Grasp, stop: StopHook) -> float | None:
         return noisy_share(context.trials.alone, grasp, protocol, errors, stop=stop)
 
-    shares = results_in_order(run, share_held, verified, torch.get_num_threads(), lambda: len(verified))
+    threads, needed = torch.get_num_threads(), lambda: len(verified)
+    shares = results_in_order(run.over, share_held, verified, threads, needed, known_over=run.known_over)
     with closing(shares):
         # None for those that the end of the run leaves over.
         for index, (grasp, share) in enumerate(zip(verified, chain(shares, repeat(None)), strict=False)):

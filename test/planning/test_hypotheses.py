@@ -9,6 +9,7 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,8 +37,9 @@ from graspd_core.scene import scene as scene_module
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.trials.trial_registry import TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, build_world
-from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
+from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 0.0)
@@ -104,9 +106,9 @@ def test_several_at_a_time_come_to_the_same(passed, threads):
     told: dict[bool, list[int]] = {False: [], True: []}
 
     def tried(together: bool) -> tuple[TrialResult, float]:
-        run, given = Run(time.perf_counter(), None, None, None), replace(under(*passed), failed=told[together].append)
-        hold_under = partial(verification._at_once, run, threads) if together else one_by_one
-        return try_hypotheses(given, GRASP, run.over, hold_under)
+        given = replace(under(*passed), failed=told[together].append)
+        hold_under = partial(verification._at_once, threads) if together else one_by_one
+        return try_hypotheses(given, GRASP, lambda: False, hold_under)
 
     assert tried(True) == tried(False)
     assert told[True] == told[False]
@@ -121,10 +123,40 @@ def test_a_run_that_ends_ends_the_trials_of_several_at_a_time():
             time.sleep(0.001)
         return TrialResult("hold", True, 0.0, 0.0, "")
 
-    run = Run(time.perf_counter(), None, None, over.is_set)
     asked = Hypotheses(tuple(Hypothesis(f"number {k}", hold) for k in range(5)), allowed=1)
-    result, likely = try_hypotheses(asked, GRASP, run.over, partial(verification._at_once, run, 2))
+    result, likely = try_hypotheses(asked, GRASP, over.is_set, partial(verification._at_once, 2))
     assert (result.passed, likely) == (False, HELD_AFTER[-1])
+
+
+def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
+    grasps = tuple(replace(GRASP, score=score) for score in (2.0, 1.0))
+    second_begun, waited_for = threading.Event(), threading.Event()
+    held = TrialResult("hold", True, 0.0, 0.0, "")
+
+    def likeliest(context: TrialContext, grasp: Grasp, stop: StopHook) -> tuple[tuple[TrialResult], AuditCount]:
+        if grasp is grasps[1]:
+            assert waited_for.is_set()
+            second_begun.set()
+        return (held,), AuditCount()
+
+    def waits(grasp: Grasp, stop: StopHook) -> TrialResult:
+        assert not second_begun.is_set() or grasp is grasps[1]
+        waited_for.set()
+        assert second_begun.wait(60)
+        return held
+
+    monkeypatch.setattr(verification, "audited_trials", likeliest)
+    asked = Hypotheses((Hypothesis("a shape", waits),), 0, waited_for=waited_for)
+    box = load_scene("shape:box")
+    worlds = build_worlds(box, load_hand("allegro_right"), object_parts(box.object), PROTOCOLS["standard"])
+    context = verification.VerificationContext(worlds, None, asked)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        tried = verification.run_trials(Run(time.perf_counter(), None, None, None), context, grasps, 1, 0)
+    finally:
+        torch.set_num_threads(threads)
+    assert [grasp.verdict for grasp in tried.grasps] == [Verdict.VERIFIED]
 
 
 def test_a_shape_that_was_begun_with_the_scene_is_not_made_again(monkeypatch):

@@ -29,8 +29,12 @@ from graspd_core.trials.world import PROTOCOLS
 from graspd_core.types import Grasp, GraspMetrics, Progress, StopHook, Verdict
 
 
-def a_run(stop: StopHook | None = None) -> Run:
-    return Run(time.perf_counter(), None, None, stop)
+def a_run() -> Run:
+    return Run(time.perf_counter(), None, None, None)
+
+
+def never() -> bool:
+    return False
 
 
 @pytest.fixture
@@ -44,8 +48,8 @@ def threads() -> Iterator[None]:
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_results_come_in_the_order_of_the_items(number):
     items = list(range(20))
-    assert list(results_in_order(a_run(), lambda item, stop: item * 2, items, number)) == [2 * item for item in items]
-    assert list(results_in_order(a_run(), lambda item, stop: item, [], number)) == []
+    assert list(results_in_order(never, lambda item, stop: item * 2, items, number)) == [2 * item for item in items]
+    assert list(results_in_order(never, lambda item, stop: item, [], number)) == []
 
 
 def test_the_second_is_worked_on_while_the_first_is_unfinished():
@@ -57,7 +61,7 @@ def test_the_second_is_worked_on_while_the_first_is_unfinished():
         assert second_done.wait(60)
         return item
 
-    assert list(results_in_order(a_run(), work, [0, 1], 2)) == [0, 1]
+    assert list(results_in_order(never, work, [0, 1], 2)) == [0, 1]
 
 
 def test_all_that_is_needed_is_worked_on_while_the_first_is_unfinished():
@@ -70,7 +74,7 @@ def test_all_that_is_needed_is_worked_on_while_the_first_is_unfinished():
         assert item or last_needed.wait(60)
         return item
 
-    with closing(results_in_order(a_run(), work, list(range(50)), 2, lambda: 10)) as results:
+    with closing(results_in_order(never, work, list(range(50)), 2, lambda: 10)) as results:
         assert next(results) == 0
         # No more than what is needed was begun until the first was there.
         assert sorted(begun) == list(range(10))
@@ -87,7 +91,7 @@ def test_who_has_enough_ends_the_work_that_was_begun_ahead():
             ended.append(item)
         return item
 
-    with closing(results_in_order(a_run(), work, list(range(50)), 2)) as results:
+    with closing(results_in_order(never, work, list(range(50)), 2)) as results:
         assert next(results) == 0
         assert begun.wait(60)
     # None is still at work, and none was begun afterwards.
@@ -109,7 +113,7 @@ def test_the_end_of_the_run_ends_the_work_and_its_hook_is_asked_by_one_thread(nu
             time.sleep(0.001)
         return item
 
-    results = list(results_in_order(a_run(hook), work, list(range(50)), number))
+    results = list(results_in_order(hook, work, list(range(50)), number))
     assert results in ([], [0])
     assert askers == {threading.get_ident()}
 
@@ -120,7 +124,7 @@ def test_an_exception_of_the_work_reaches_the_caller(number):
         raise ZeroDivisionError(item)
 
     with pytest.raises(ZeroDivisionError, match="0"):
-        list(results_in_order(a_run(), work, [0, 1, 2], number))
+        list(results_in_order(never, work, [0, 1, 2], number))
 
 
 @pytest.fixture(scope="module")
