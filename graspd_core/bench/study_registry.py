@@ -19,6 +19,7 @@ from graspd_core.bench.studies import (
     seen_objects,
     simulators,
     steered,
+    throughput,
 )
 from graspd_core.bench.study import Study
 
@@ -155,6 +156,16 @@ STUDIES: dict[str, Study] = {
         _PLANS,
         lambda case: 3.0,
         came=arm_reach.came,
+    ),
+    "throughput": Study(
+        "verified grasps a second of a known object, on one thread and two (quiet cores, --processes 1)",
+        throughput.throughput_cases,
+        throughput.run_throughput,
+        throughput.throughput_sections,
+        ("studies/throughput.py", "object_case.py"),
+        _PLANS,
+        lambda case: 3.0 + 0.06 * case.count,
+        usual=False,
     ),
     "imported": Study(
         "somebody else's grasps beside ours on the same objects and hand (--import FOLDER --hand NAME)",

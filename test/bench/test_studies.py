@@ -26,6 +26,7 @@ PAGES = {
     "robust": ("robust", "docs/stress.md"),
     "steered": ("steered", "docs/usage.md"),
     "early": ("early-ends", "docs/bench.md"),
+    "throughput": ("throughput", "docs/bench.md"),
     "reach": ("inverse-kinematics", "docs/arms.md"),
     "simulators": ("simulators", "docs/metrics.md"),
     "stress": ("stress", "docs/stress.md"),
