@@ -59,6 +59,17 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return ByFile(config, log)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def no_child_is_left() -> Iterator[None]:
+    """Ends the child process that a file's tests started: it has none of what the next file puts in modules."""
+    from graspd_core.runtime import worker_process
+
+    yield
+    if worker_process._child is not None:
+        worker_process._child.close()
+        worker_process._child = None
+
+
 @pytest.fixture(scope="session")
 def claim_domain() -> Iterator[Callable[[], int]]:
     """Gives DDS domains that nobody else has: no other worker, and no other run of the tests beside this one."""
