@@ -246,7 +246,8 @@ def begin_other_shape(probability: float, likeliest: ObjectModel, evidence: Evid
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
     """The world of another shape of the object's own mass and friction; None where there is no such shape."""
     assert scene.evidence is not None
-    begun = _begun(scene.evidence).get(rule)
+    # Taken out: if making it failed, as where memory was short, it is made again the next time.
+    begun = _begun(scene.evidence).pop(rule, None)
     made = run_isolated(other_object, scene.evidence, rule, scene.object) if begun is None else begun.result()
     return None if made is None else build_world(hand, *made, protocol)
 

@@ -204,24 +204,25 @@ def _tried(
 
     The first `alone`: under several hypotheses at a time, the others once it waits for the world of one, or has ended.
     """
-    threads, free = torch.get_num_threads(), threading.Event()
-    if alone and context.hypotheses is not None:
-        free = context.hypotheses.waited_for
-    together = one_by_one if threads == 1 else partial(_at_once, threads)
-
-    def work(grasp: Grasp, stop: StopHook) -> tuple[Grasp, AuditCount]:
-        if not alone:
-            return _all_trials(context, one_by_one, grasp, stop)
-        if grasp is not candidates[0]:
-            while not free.wait(_POLL) and not stop():
-                pass
-            return _all_trials(context, one_by_one, grasp, stop)
-        try:
-            return _all_trials(context, together, grasp, stop)
-        finally:
-            free.set()
-
+    threads, hypotheses = torch.get_num_threads(), context.hypotheses
+    work = partial(_all_trials, context, one_by_one)
+    if alone and hypotheses is not None:
+        work = partial(_best_first, context, hypotheses, candidates[0], threads)
     return results_in_order(run.over, work, candidates, threads, needed, known_over=run.known_over)
+
+
+def _best_first(
+    context: VerificationContext, hypotheses: Hypotheses, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
+) -> tuple[Grasp, AuditCount]:
+    """A candidate with its trials; those that are not the best wait until there is time for them."""
+    if grasp is not best:
+        while not hypotheses.waited_for.wait(_POLL) and not stop():
+            pass
+        return _all_trials(context, one_by_one, grasp, stop)
+    try:
+        return _all_trials(context, one_by_one if threads == 1 else partial(_at_once, threads), grasp, stop)
+    finally:
+        hypotheses.waited_for.set()
 
 
 def _at_once(threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_core.pointcloud.free_space import view_frame
-from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.pointcloud.point_cloud import PointCloud, longest_side
 
 # So many points on one side of the hull, of the object and of other things each: an object that stands out alone
 # against nothing makes a hull of its own.
@@ -41,8 +41,7 @@ def reaches_image_border(
     except (QhullError, ValueError):
         return False
     ends = plane[hull.simplices]
-    least = MIN_SIDE_SHARE * max(float(np.ptp(column)) for column in plane.T)
-    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > least
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * longest_side(plane)
     own, others = plane[mine], plane[~mine]
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
         # The object's few points first: most sides are none of theirs.

@@ -56,6 +56,11 @@ def measured(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]
     return finite & ~(zero | near)
 
 
+def longest_side(points: Float[np.ndarray, "n k"]) -> float:
+    """Of the bounding box along the axes; column by column, as above."""
+    return max(float(np.ptp(column)) for column in points.T)
+
+
 def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> PointCloud:
     """Drop points that are not finite, thin to an even density, drop outliers.
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.unique_rows import packed_rows
-from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud, measured
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud, longest_side, measured
 
 # Of more points than this, every second, or third, ... is taken.
 MAX_SCENE_POINTS = 5_000_000
@@ -84,8 +84,8 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
     voxel, size = _voxels(points, settings.voxel, settings.max_voxels)
     count = np.bincount(voxel)
     mean = np.column_stack([np.bincount(voxel, points[:, axis]) / count for axis in range(3)])
-    if max(float(np.ptp(column)) for column in mean.T) <= 0:
-        within = float(np.ptp(points, axis=0).max())
+    if longest_side(mean) <= 0:
+        within = longest_side(points)
         unit = f", within {1e3 * within:.2g} mm: are they in metres?" if within else "; no surface is seen"
         raise CloudError(f"cloud: all {len(points)} points are in one place{unit}")
     return VoxelScene(points, distance, rows, voxel, mean, np.bincount(voxel, distance) / count, count, size)
@@ -139,7 +139,7 @@ def _voxels(points: Float[np.ndarray, "n 3"], size: float, most: int) -> tuple[I
     # Column by column: NumPy takes seven times as long for the least of short rows.
     low = np.array([column.min() for column in points.T])
     # So many cells an axis have room in one number.
-    size = max(size, max(float(np.ptp(column)) for column in points.T) / 2**20)
+    size = max(size, longest_side(points) / 2**20)
     cell, voxel = _distinct(((points - low) / size).astype(np.int64))
     while len(cell) > most:
         growth = max(1.2, (len(cell) / most) ** 0.5)

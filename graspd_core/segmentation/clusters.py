@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from graspd_core.config import SegmentationConfig
+from graspd_core.pointcloud.point_cloud import longest_side
 
 # Flying pixels, which are spread along their lines of sight between two surfaces, have less than this share of the
 # weight around a usual point: it tells them where many views have filled the space around an edge with them.
@@ -79,7 +80,7 @@ def extent(points: Float[np.ndarray, "n 3"]) -> float:
     """Length along the longest principal axis [m], however the points are turned."""
     centred = points - points.mean(0)
     _, axes = np.linalg.eigh(centred.T @ centred)
-    return max(float(np.ptp(column)) for column in (centred @ axes).T)
+    return longest_side(centred @ axes)
 
 
 def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.unique_rows import packed_rows
+from graspd_core.pointcloud.point_cloud import longest_side
 from graspd_core.types import Plane
 
 # So many points, evenly taken, show which plane has most of them.
@@ -172,7 +173,7 @@ def _measure(
     rows = np.flatnonzero(inliers)
     flat = points[rows] @ axes
     low = flat.min(0)
-    width = max(RASTER_CELL_M, max(float(np.ptp(column)) for column in flat.T) / MAX_RASTER_CELLS)
+    width = max(RASTER_CELL_M, longest_side(flat) / MAX_RASTER_CELLS)
     cell = np.round((flat - low) / width).astype(int) + BRIDGED_CELLS
     raster = np.zeros(cell.max(0) + 2 * BRIDGED_CELLS, dtype=bool)
     raster[tuple(cell.T)] = True
