@@ -42,11 +42,11 @@ def grid_poisson_field(
     Raises:
         CloudError: the points and normals are not those of one surface.
     """
-    from scipy.fft import irfftn, next_fast_len, rfftn
+    import scipy.fft
 
     counts = nodes.shape[:3]
-    fast: Any = next_fast_len
-    shape = tuple(int(fast(count + _MARGIN, real=True)) for count in counts)
+    fft: Any = scipy.fft  # of which no types are known: SciPy declares these as what they dispatch by
+    shape = tuple(int(fft.next_fast_len(count + _MARGIN, real=True)) for count in counts)
     before = [(most - count) // 2 for most, count in zip(shape, counts, strict=True)]
     at = _trilinear((surfels.points - nodes[0, 0, 0]) / cell + before, shape)
     waves = _waves(shape)
@@ -54,10 +54,10 @@ def grid_poisson_field(
 
     # In float32, whose last digit is far less than noise: transforms are most of the time, and take a third of it so.
     def spread(values: Float[np.ndarray, "points"]) -> np.ndarray:
-        return rfftn((at.T @ values).astype(np.float32).reshape(shape))
+        return fft.rfftn((at.T @ values).astype(np.float32).reshape(shape))
 
     def at_points(spectrum: np.ndarray) -> tuple[Float[np.ndarray, "nodes"], Float[np.ndarray, "points"]]:
-        field = irfftn(spectrum, shape).ravel()
+        field = fft.irfftn(spectrum, shape).ravel()
         return field, at @ field
 
     _, density = at_points(spread(np.ones(len(surfels.points))) * np.exp(-0.5 * _DENSITY_BLUR**2 * square))
