@@ -61,6 +61,40 @@ def longest_side(points: Float[np.ndarray, "n k"]) -> float:
     return max(float(np.ptp(column)) for column in points.T)
 
 
+def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+    """The unit axis along which points spread the least, of each symmetric matrix of squared spreads.
+
+    In closed form (the eigenvalues are roots of a cubic, by its cosines), in a tenth of `eigh`'s time for thousands.
+    Any axis where all are alike.
+    """
+    xx, yy, zz = (spreads[:, i, i] for i in range(3))
+    xy, xz, yz = spreads[:, 0, 1], spreads[:, 0, 2], spreads[:, 1, 2]
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    size = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    half_determinant = 0.5 * (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz))
+    cosine = np.clip(half_determinant / np.maximum(size**3, 1e-300), -1.0, 1.0)
+    least = 2 * size * np.cos(np.arccos(cosine) / 3 + 2 * np.pi / 3)
+    a, b, c = a - least, b - least, c - least
+    # The rows that are left lie in a plane, whose normal is sought: of two rows that differ the most.
+    normals = np.stack(
+        [
+            np.column_stack([xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy]),
+            np.column_stack([xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz]),
+            np.column_stack([b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz]),
+        ]
+    )
+    lengths = np.sqrt((normals**2).sum(-1))
+    best = lengths.argmax(0)
+    rows = np.arange(len(spreads))
+    longest = lengths[best, rows]
+    found = normals[best, rows] / np.maximum(longest, 1e-300)[:, None]
+    # On a line, or where all are alike, no two rows differ.
+    unclear = longest <= 1e-9 * mean**2
+    found[unclear] = np.linalg.eigh(spreads[unclear])[1][:, :, 0]
+    return found
+
+
 def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> PointCloud:
     """Drop points that are not finite, thin to an even density, drop outliers.
 

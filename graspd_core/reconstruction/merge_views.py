@@ -19,7 +19,7 @@ from jaxtyping import Float
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.unique_rows import packed_rows, voxel_keys
-from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud
+from graspd_core.pointcloud.point_cloud import MIN_POINTS, PointCloud, least_axes
 from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
@@ -95,8 +95,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
         total = weights.sum(1, keepdims=True)
         centre = np.einsum("nk,nkd->nd", weights, points[near]) / total
         spread = points[near] - centre[:, None]
-        _, axes = np.linalg.eigh(np.swapaxes(weights[..., None] * spread, 1, 2) @ spread)
-        normals = axes[:, :, 0]
+        normals = least_axes(np.swapaxes(weights[..., None] * spread, 1, 2) @ spread)
         off = np.einsum("nkd,nd->nk", spread, normals)
         weights = np.exp(-np.square(off / (1.5 * step)) - np.square(distance / distance[:, -1:]))
     normals *= -np.sign(np.einsum("nd,nd->n", normals, view_depth))[:, None]

@@ -10,7 +10,7 @@ from graspd_core.mesh.shapes import make_shape, shape_volume
 from graspd_core.mesh.topology import is_closed
 from graspd_core.pointcloud.camera import PinholeCamera
 from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, transform_cloud
+from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, least_axes, transform_cloud
 from graspd_core.reconstruction.reconstruct import reconstruct
 from graspd_core.rendering.render import look_at, render_depth
 from graspd_core.types import TriangleMesh
@@ -99,3 +99,15 @@ def test_a_cloud_from_all_round_gives_the_volume(name):
     assert is_closed(whole.mesh)
     assert whole.warnings == ()
     assert mass_properties(whole.mesh)[0] == pytest.approx(shape_volume(name), rel=0.05)
+
+
+@pytest.mark.parametrize("scales", [(1, 1, 1), (1, 1, 1e-3), (1, 1, 0), (1, 1e-4, 1e-4), (1, 0, 0), (0, 0, 0)])
+def test_along_the_least_axis_points_spread_as_little_as_along_any(scales):
+    rng = np.random.default_rng(0)
+    points = 0.01 * rng.normal(size=(500, 24, 3)) * scales @ np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
+    spreads = points.transpose(0, 2, 1) @ points
+    axes = least_axes(spreads)
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0)
+    values = np.linalg.eigvalsh(spreads)
+    along = np.einsum("ni,nij,nj->n", axes, spreads, axes)
+    assert (along - values[:, 0] <= 1e-7 * values[:, 2]).all()
