@@ -107,7 +107,7 @@ class ReconstructionConfig:
     poisson_cell: float = 0.0022
     min_cell: float = 0.0017
     fit_distance: float = 0.004
-    max_faces: int = 16_000
+    max_faces: int = 6000
     seen_distance: float = 0.004
     guessed_distance: float = 0.02
 

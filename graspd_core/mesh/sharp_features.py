@@ -15,7 +15,7 @@ from graspd_core.types import TriangleMesh
 
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
-_POOL = 6000
+POOL = 6000
 # Share of thin surface from which an object counts as thin-walled.
 THIN_WALLED = 0.6
 # A finger goes through a wall between points that are far apart: a thin-walled object has at least one point on so much
@@ -23,21 +23,26 @@ THIN_WALLED = 0.6
 _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
-def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "points 3"], float]:
+def sharp_points(
+    mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = POOL
+) -> tuple[Float[np.ndarray, "points 3"], float]:
     """Evenly spread surface points [m] with less than a probe's depth of material below them.
 
     A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
     nearer. At most `count` of them, more where that is too few for thin walls, fewer on a smooth object, possibly
     none. Each is the farthest from all before, so that the first of them are evenly spread too.
 
+    Args:
+        pool: how many places are looked at, of vertices, of edges, and half as many of faces.
+
     Returns:
         The points, and the share of the surface with less than two probe depths of material below it: near one for
         cups and sheets.
     """
     query = make_distance_query(mesh)
-    points, normals = _pool(mesh, seed)
+    points, normals = _pool(mesh, seed, pool)
     sharp = points[_is_thin(query, points, normals, _PROBE)]
-    samples, sample_normals = surface_samples(mesh, _POOL // 6, seed)
+    samples, sample_normals = surface_samples(mesh, pool // 6, seed)
     share = float(_is_thin(query, samples, sample_normals, 2 * _PROBE).mean())
     if share > THIN_WALLED:
         walls = share * 0.5 * float(np.linalg.norm(_scaled_normals(mesh), axis=1).sum())
@@ -85,8 +90,11 @@ def _scaled_normals(mesh: TriangleMesh) -> Float[np.ndarray, "faces 3"]:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _pool(mesh: TriangleMesh, seed: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Vertices, points along edges, and surface samples, with normals: the places where something sharp may be."""
+def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Vertices, points along edges, and surface samples, with normals: the places where something sharp may be.
+
+    At most `size` of each.
+    """
     scaled = _scaled_normals(mesh)
     vertex_normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
@@ -96,15 +104,15 @@ def _pool(mesh: TriangleMesh, seed: int) -> tuple[Float[np.ndarray, "n 3"], Floa
     pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]))
     edges = pairs[np.unique(packed_rows(pairs), return_index=True)[1]]
     lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=-1)
-    along = rng.choice(len(edges), size=_POOL, p=lengths / lengths.sum())
-    a = rng.random((_POOL, 1))
+    along = rng.choice(len(edges), size=size, p=lengths / lengths.sum())
+    a = rng.random((size, 1))
     start, end = edges[along].T
     # An edge point's normal is that of its two ends blended: on a sharp edge the bisector, on a flat one the face's.
     on_edges = (1 - a) * mesh.vertices[start] + a * mesh.vertices[end]
     edge_normals = (1 - a) * vertex_normals[start] + a * vertex_normals[end]
     edge_normals /= np.maximum(np.linalg.norm(edge_normals, axis=-1, keepdims=True), 1e-20)
-    vertices = rng.permutation(len(mesh.vertices))[:_POOL]
-    samples, sample_normals = surface_samples(mesh, _POOL // 2, seed)
+    vertices = rng.permutation(len(mesh.vertices))[:size]
+    samples, sample_normals = surface_samples(mesh, size // 2, seed)
     return (
         np.concatenate([mesh.vertices[vertices], on_edges, samples]),
         np.concatenate([vertex_normals[vertices], edge_normals, sample_normals]),

@@ -36,12 +36,12 @@ from graspd_core.trials.audit import audited_trials
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, Protocol, at_friction
-from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, TriangleMesh, Verdict
+from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
 
-# Objects are cut into convex parts one at a time.
+# Objects are cut into convex parts, and their worlds built, one at a time.
 _CUTTING = threading.Lock()
 
 # Where verified grasps stand whose robustness nobody had the time to measure.
@@ -65,13 +65,11 @@ class TrialsAhead:
     """What the trials of a run need and takes long, made by threads beside the search.
 
     Attributes:
-        protocol: of the trials.
-        parts: the object's convex parts.
+        worlds: of the likeliest scene; None where the run was over before.
         others: the worlds of what else may be true of it; None for a mesh, or where none is needed.
     """
 
-    protocol: Protocol
-    parts: Future[tuple[TriangleMesh, ...]]
+    worlds: Future[TrialContext | None]
     others: OtherWorlds | None
 
 
@@ -82,30 +80,27 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
     turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
     """
 
-    def cut() -> tuple[TriangleMesh, ...]:
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+
+    def build() -> TrialContext | None:
         with _CUTTING:
-            return () if run.known_over() else object_parts(scene.object)
+            return None if run.known_over() else _worlds(scene, hand, protocol)
 
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
-    parts = pool.submit(cut)
+    worlds = pool.submit(build)
     pool.shutdown(wait=False)
-    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-    return TrialsAhead(protocol, parts, other_worlds(run, scene, hand, protocol, certainty.probability))
+    return TrialsAhead(worlds, other_worlds(run, scene, hand, protocol, certainty.probability))
 
 
 def make_trial_context(
     run: Run, scene: Scene, hand: HandModel, ahead: TrialsAhead, certainty: CertaintyConfig, *, measure: bool
 ) -> VerificationContext | None:
-    """The contexts, as soon as the parts are there; None where the run ended first."""
-    while not run.over() and not wait([ahead.parts], timeout=_POLL).done:
+    """The contexts, as soon as the worlds are there; None where the run ended first."""
+    while not run.over() and not wait([ahead.worlds], timeout=_POLL).done:
         pass
-    if run.over():
+    if run.over() or (worlds := ahead.worlds.result()) is None:
         return None
-    ahead.parts.result()
-    worlds = _worlds(scene, hand, ahead.protocol)
-    hypotheses = (
-        None if ahead.others is None else hypotheses_of(ahead.others, scene, hand, worlds, certainty.probability)
-    )
+    hypotheses = None if ahead.others is None else hypotheses_of(ahead.others, worlds, certainty.probability)
     return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
 
 

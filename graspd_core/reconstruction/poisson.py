@@ -74,7 +74,7 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
     # Nearest in place and in opposite normal: the other side of a wall. None is farther away in these six dimensions.
     tree = KDTree(np.hstack([points, thinnest * normals]))
     farthest = np.sqrt(2 + 2 * (1 - OPPOSITE_COSINE)) * thinnest
-    _, other = tree.query(np.hstack([points, -thinnest * normals]), distance_upper_bound=farthest)
+    _, other = tree.query(np.hstack([points, -thinnest * normals]), distance_upper_bound=farthest, workers=-1)
     other = np.minimum(other, len(points) - 1)
     offset = points - points[other]
     thickness = (offset * normals).sum(1)

@@ -33,6 +33,8 @@ DEFAULT_DENSITY = 300.0
 
 # How a surface is cut into convex parts that is known to millimetres only, from cameras or by guess.
 COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
+# How many places of it are looked at for sharp ones.
+_COARSE_POOL = 2000
 
 
 @dataclass(frozen=True)
@@ -180,15 +182,16 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
     """The object's sharp points [m] and its share of thin surface (`sharp_points`), remembered by content."""
     near, far = near_object(model)
+    coarse = {"pool": _COARSE_POOL} if near.reconstructed else {}
 
     def build() -> cache.Arrays:
-        points, thin_share = sharp_points(near.mesh, count)
+        points, thin_share = sharp_points(near.mesh, count, **coarse)
         return {"points": points, "thin_share": np.array(thin_share)}
 
     def valid(arrays: cache.Arrays) -> bool:
         return set(arrays) == {"points", "thin_share"} and arrays["points"].shape[1:] == (3,)
 
-    arrays = cache.remember(f"sharp-{near.sha256}-{count}", build, valid)
+    arrays = cache.remember(f"sharp-{near.sha256}-{count}{'-coarse' if coarse else ''}", build, valid)
     return arrays["points"] + far, float(arrays["thin_share"])
 
 

@@ -37,8 +37,9 @@ from graspd_core.scene import scene as scene_module
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.trials.hold_trial import hold_trial
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
-from graspd_core.trials.world import PROTOCOLS, build_world
+from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
 from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
@@ -270,6 +271,17 @@ def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
     result = plan(seen_from((0.001, 0.0, 0.0)), 0.9)
     assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.grasps)
     assert cut == [COARSE_CUTS]
+
+
+def test_less_friction_is_that_of_a_world_built_with_it():
+    scene, hand = load_scene("shape:cylinder"), load_hand("allegro_right")
+    parts, slippery = object_parts(scene.object), at_friction(PROTOCOLS["standard"], 0.2)
+    usual, built = (build_world(hand, scene.object, parts, each) for each in (PROTOCOLS["standard"], slippery))
+    changed = hypotheses._with_friction(usual, slippery.friction)
+    grasps = plan_grasps(scene, hand, count=4, preset="fast", verify="none", measure=False).grasps
+    results = [[hold_trial(world, grasp, slippery) for grasp in grasps] for world in (built, changed)]
+    assert results[0] == results[1]
+    assert usual.model.geom_friction[0, 0] == PROTOCOLS["standard"].friction[0]
 
 
 @pytest.mark.parametrize(("seen", "hidden"), [(seen_from, True), (seen_all_round, False)])

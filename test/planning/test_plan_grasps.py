@@ -216,7 +216,7 @@ def test_what_held_in_an_earlier_round_stays_told(scene, hand):
 def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
     # They come only once the run has ended; who waited for them would wait for ever.
-    monkeypatch.setattr(verification, "object_parts", lambda _: release.wait())
+    monkeypatch.setattr(verification, "_worlds", lambda *_: release.wait())
     short = replace(load_preset("fast").settings, explore_steps=3, refine_steps=3, polish_steps=3)
     try:
         late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=2.0)
