@@ -15,7 +15,7 @@ from graspd_core.types import TriangleMesh
 
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
-POOL = 6000
+_POOL = 6000
 # Share of thin surface from which an object counts as thin-walled.
 THIN_WALLED = 0.6
 # A finger goes through a wall between points that are far apart: a thin-walled object has at least one point on so much
@@ -24,7 +24,7 @@ _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
 def sharp_points(
-    mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = POOL
+    mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL
 ) -> tuple[Float[np.ndarray, "points 3"], float]:
     """Evenly spread surface points [m] with less than a probe's depth of material below them.
 

@@ -142,7 +142,9 @@ def hypotheses_of(others: OtherWorlds, trials: TrialContext, probability: float)
     ]
     slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
     world = _with_friction(trials.alone, slippery.friction)
-    less = Hypothesis(f"friction {slippery.friction[0]:.2g}", partial(_hold_at, world, slippery))
+    less = Hypothesis(
+        f"friction {slippery.friction[0]:.2g}", lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)
+    )
     shapes = [
         Hypothesis(f"hidden side by {rule}" if rule else "hidden side closed smoothly", partial(_hold_in, others, k))
         for k, rule in enumerate(others.rules)
@@ -204,14 +206,10 @@ def _hold_in(worlds: OtherWorlds, index: int, grasp: Grasp, stop: StopHook) -> T
 
 
 def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
-    """The same world with other coefficients of friction, in a thirtieth of the time of building it."""
+    """The same world with other coefficients of friction, without building it anew."""
     model = copy(world.model)
     model.geom_friction[:] = friction
     return replace(world, model=model, spare=deque())
-
-
-def _hold_at(world: World, protocol: Protocol, grasp: Grasp, stop: StopHook) -> TrialResult:
-    return hold_trial(world, grasp, protocol, stop=stop)
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:

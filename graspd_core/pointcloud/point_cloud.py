@@ -64,7 +64,7 @@ def longest_side(points: Float[np.ndarray, "n k"]) -> float:
 def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
     """The unit axis along which points spread the least, of each symmetric matrix of squared spreads.
 
-    In closed form (the eigenvalues are roots of a cubic, by its cosines), in a tenth of `eigh`'s time for thousands.
+    In closed form (the eigenvalues are roots of a cubic, by its cosines), in a quarter of `eigh`'s time for thousands.
     Any axis where all are alike.
     """
     xx, yy, zz = (spreads[:, i, i] for i in range(3))
