@@ -59,7 +59,6 @@ def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.gravity = [0.0, 0.0, 0.0]
-    spec.option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
     links = [spec.worldbody.add_body(name=f"link:{name}", mocap=True) for name in hand.link_names]
     for index, primitive in enumerate(hand.primitives):
         add_primitive(spec, links[primitive.link], primitive, f"hand:{index}", _PAIR_FRICTION)

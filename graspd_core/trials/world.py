@@ -261,9 +261,6 @@ def set_physics(option: Any, protocol: Protocol) -> None:
     option.impratio = protocol.impratio
     option.noslip_iterations = protocol.noslip_iterations
     option.gravity = [0.0, 0.0, 0.0]
-    # Several contact points between flat faces: on one point each, a box between two plates rolls out. Later versions
-    # of MuJoCo have no such switch, because it is always on.
-    option.enableflags |= int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
 
 
 def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:
@@ -324,16 +321,16 @@ def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, prot
 
     name = f"joint:{mimic.name}"
     body.add_joint(name=name, limited=False, **_joint_physics(hand, mimic.link, protocol))
-    spec.add_equality(
+    equality = spec.add_equality(
         type=mujoco.mjtEq.mjEQ_JOINT,
         objtype=mujoco.mjtObj.mjOBJ_JOINT,
         name1=name,
         name2=f"joint:{hand.joint_names[mimic.joint]}",
-        data=[mimic.offset, mimic.multiplier, *[0.0] * 9],
         # As stiff as gears: two time steps and hardly any softness, or a loaded finger would lag behind its leader.
         solref=[2 * protocol.timestep, 1.0],
         solimp=[0.9999, 0.9999, 1e-3, 0.5, 2.0],
     )
+    equality.data[:5] = mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0
 
 
 def _joint_physics(hand: HandModel, link: int, protocol: Protocol) -> dict[str, Any]:

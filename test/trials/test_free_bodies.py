@@ -64,7 +64,8 @@ def test_a_pile_settles_on_the_table_the_same_way_every_time(block):
     rest = settle([replace(body, pose=pose) for body, pose in zip(pile, poses, strict=True)])
     for body, pose in zip(pile, rest, strict=True):
         lowest = placed(replace(body, pose=pose))[0].mesh.vertices[:, 2].min()
-        assert -0.002 < lowest < 0.05
+        # On the table, on one other or on two.
+        assert -0.002 < lowest < 4 * HALF + 0.002
     # What rests goes on resting.
     again = settle([replace(body, pose=pose) for body, pose in zip(pile, rest, strict=True)])
     assert np.allclose(again, rest, atol=1e-3)

@@ -79,7 +79,7 @@ def test_ranges_that_do_not_hold_limit_nothing(folder: Path, mjcf: str) -> None:
         ('range="-5 60"', 'range="5 -60"', "joint 'j2' has lower 5 above upper -60"),
         ('axis="1 0 1"', 'axis="0 0 0"', "changed.xml:8: .*axis too small in joint Element name 'j2'"),
         ('euler="10 -', 'quat="1 0 0 0" euler="10 -', "changed.xml:7: body 'a': .*multiple orientation specifiers"),
-        ('eulerseq="zyx"', 'eulerseq="zz"', "changed.xml:1: .*euler format must have length 3"),
+        ('eulerseq="zyx"', 'eulerseq="zz"', "changed.xml:1: .*'eulerseq' must have exactly 3 characters"),
         ('childclass="f"', 'childclass="g"', "changed.xml:6: body 'palm': .*unknown default childclass"),
         ('size=".01 .02 .01"', 'size=".01 -.02 .01"', "changed.xml:13: .*size 1 must be positive in geom"),
         ('type="ellipsoid"', 'type="hfield"', "body 'tip': <geom type='hfield'> is not read; known: sphere"),
