@@ -1,7 +1,7 @@
 """What else may be true of an object that cameras saw: less friction, another place, another shape of a hidden side.
 
-A grasp that holds on the likeliest scene is tried on these too, cheapest first. How often grasps that held under so
-many hold on the true object was measured (docs/clouds.md).
+A grasp that holds on the likeliest scene is tried on these too, cheapest first, until one is failed or it is as sure as
+asked for. How often such grasps hold on the true object was measured (docs/clouds.md).
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from contextlib import closing
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from typing import TypeVar
 
-from graspd_core.config.certainty_config import HELD_AFTER
+from graspd_core.config.certainty_config import HELD, HELD_THOUGH_FAILED
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
@@ -27,7 +28,9 @@ from graspd_core.trials.hold_trial import STOPPED, hold_trial
 from graspd_core.trials.noisy_trial import PoseError, displaced, pose_errors
 from graspd_core.trials.trial_registry import TrialContext
 from graspd_core.trials.world import Protocol, World, at_friction, build_world
-from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult, TriangleMesh
+from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
+
+T = TypeVar("T")
 
 # Of the friction that the scene says.
 _LESS_FRICTION = 2 / 3
@@ -41,9 +44,6 @@ _POLL = 0.02
 # Of trials under some hypotheses, in their order; None where there was none. And how a grasp goes through them.
 Results = Generator[TrialResult | None]
 HoldUnder = Callable[[Sequence["Hypothesis"], Grasp, StopHook], Results]
-
-# An object of another shape and its convex parts.
-OtherObject = tuple[ObjectModel, tuple[TriangleMesh, ...]]
 
 
 @dataclass(frozen=True)
@@ -61,81 +61,45 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """All that else may be true.
+    """What else a grasp must hold under.
 
     Attributes:
-        items: in the order in which grasps are tried under them.
-        allowed: under how many of them a verified grasp may fail.
-        failed: called with how many a grasp has failed under, while it may still be verified: it needs others to hold
-            under in their place, which can be begun.
+        stages: cheapest first; what is cheap, then another shape.
+        probability: that a grasp which holds under all of them holds on the true object.
         waited_for: set once a trial waits for its world: there is time for other work.
     """
 
-    items: tuple[Hypothesis, ...]
-    allowed: int
-    failed: Callable[[int], None] = lambda count: None
+    stages: tuple[tuple[Hypothesis, ...], ...]
+    probability: float
     waited_for: threading.Event = field(default_factory=threading.Event)
 
 
-class OtherWorlds:
-    """The worlds of other shapes of the object, made one after another by a thread.
+def begin_other_world(
+    run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float
+) -> Future[World | None] | None:
+    """Begin the world of another shape of the object, in a thread; None where grasps need not be tried in one.
 
-    As many are begun at once as a grasp that holds under all else must be tried in, one more for each that it fails
-    under, or that cannot be made, and others when they are asked for.
+    Its result is None where there is no other shape, or the run was over before.
     """
+    rules = _rules_needed(scene.evidence, probability)
 
-    def __init__(self, run: Run, scene: Scene, hand: HandModel, protocol: Protocol, rules: Sequence[str], begun: int):
-        self.rules, self.protocol = rules, protocol
-        self._run, self._lock = run, threading.Lock()
-        self._make_world = lambda rule: _other_world(scene, hand, protocol, rule)
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
-        self._made: list[Future[World | None]] = []
-        self.waited_for = threading.Event()
-        self._least = begun
-        self._begin(begun)
-
-    def world(self, index: int, stop: StopHook) -> World | None:
-        """One of them; None where it cannot be made, or the hook says to stop."""
-        self._begin(index + 1)
-        if not self._made[index].done():
-            self.waited_for.set()
-        while not wait([self._made[index]], timeout=_POLL).done:
-            if stop():
-                return None
-        return self._made[index].result()
-
-    def begin_after(self, failed: int) -> None:
-        """Begin those that a grasp must be tried in that failed under so many hypotheses."""
-        if self._least:
-            self._begin(self._least + failed)
-
-    def _begin(self, count: int) -> None:
-        with self._lock:
-            for rule in self.rules[len(self._made) : count]:
-                self._made.append(self._pool.submit(self._make, rule))
-
-    def _make(self, rule: str) -> World | None:
-        if self._run.known_over():
-            return None
-        made = self._make_world(rule)
-        if made is None:
-            self._begin(len(self._made) + 1)
-        return made
-
-
-def other_worlds(run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float) -> OtherWorlds | None:
-    """Those that grasps must be tried in to be as sure as asked for; None where none is needed."""
-    allowed = _allowed_failures(probability)
-    if scene.evidence is None or allowed + 1 == len(HELD_AFTER):
+    def make() -> World | None:
+        for rule in rules:
+            if run.known_over():
+                break
+            if (world := _other_world(scene, hand, protocol, rule)) is not None:
+                return world
         return None
-    from graspd_core.reconstruction.other_shapes import other_rules
 
-    rules = other_rules(scene.evidence)
-    return OtherWorlds(run, scene, hand, protocol, rules, max(len(rules) - allowed, 0))
+    return _in_thread(make) if rules else None
 
 
-def hypotheses_of(others: OtherWorlds, trials: TrialContext, probability: float) -> Hypotheses:
-    """All that a grasp is tried under, cheapest first."""
+def hypotheses_of(
+    scene: Scene, other: Future[World | None] | None, trials: TrialContext, probability: float
+) -> Hypotheses | None:
+    """All that a grasp must hold under to be as sure as asked for, `other` from `begin_other_world`; None: nothing."""
+    if scene.evidence is None or probability <= HELD[0]:
+        return None
     places = [
         Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
@@ -145,15 +109,12 @@ def hypotheses_of(others: OtherWorlds, trials: TrialContext, probability: float)
     less = Hypothesis(
         f"friction {slippery.friction[0]:.2g}", lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)
     )
-    shapes = [
-        Hypothesis(f"hidden side by {rule}" if rule else "hidden side closed smoothly", partial(_hold_in, others, k))
-        for k, rule in enumerate(others.rules)
-    ]
-    return Hypotheses((*places, less, *shapes), _allowed_failures(probability), others.begin_after, others.waited_for)
-
-
-def _allowed_failures(probability: float) -> int:
-    return sum(held >= probability for held in HELD_AFTER) - 1
+    if other is None:
+        # Where nothing was hidden no more can be doubted.
+        return Hypotheses(((*places, less),), HELD[1] if scene.evidence.hidden else HELD[-1])
+    waited_for = threading.Event()
+    shape = Hypothesis("another shape of the hidden side", partial(_hold_in, other, trials.protocol, waited_for))
+    return Hypotheses(((*places, less), (shape,)), HELD[-1], waited_for)
 
 
 def one_by_one(items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
@@ -168,41 +129,52 @@ def try_hypotheses(
     stop: StopHook,
     hold_under: HoldUnder = one_by_one,
 ) -> tuple[TrialResult, float]:
-    """Hold trials of a grasp under each in turn, until the answer is known; and how likely it is to hold in truth.
+    """Hold trials of a grasp under each in turn, until one is failed; and how likely it is to hold in truth.
 
-    A trial that was not needed counts as failed for that probability. The result tells the greatest travel and turn of
-    the trials that were passed. `hold_under` is given all that the grasp has to be tried under if it is to be verified.
+    The result tells the greatest travel and turn of the trials that were passed. `hold_under` is given a stage at a
+    time.
     """
-    worst, failed, tried, left = [0.0, 0.0], [], 0, len(hypotheses.items)
-    while len(failed) <= hypotheses.allowed < len(failed) + left:
-        first = len(hypotheses.items) - left
-        needed = hypotheses.items[first : first + len(failed) + left - hypotheses.allowed]
-        with closing(hold_under(needed, grasp, stop)) as results:
-            for item, result in zip(needed, results, strict=False):
-                if stop():
-                    break
-                left -= 1
-                if result is None:
+    travel = turn = 0.0
+    for items, though_failed in zip(hypotheses.stages, HELD_THOUGH_FAILED, strict=False):
+        with closing(hold_under(items, grasp, stop)) as results:
+            for item, result in zip(items, results, strict=False):
+                if stop() or result is None:
                     continue
-                tried += 1
-                if result.passed:
-                    worst = [max(worst[0], result.displacement), max(worst[1], result.rotation)]
-                    continue
-                failed.append(f"{item.name}: {result.reason}")
-                if len(failed) > hypotheses.allowed:
-                    break
-                hypotheses.failed(len(failed))
+                if not result.passed:
+                    reason = f"fails under {item.name}: {result.reason}"
+                    return TrialResult(HYPOTHESES, False, travel, turn, reason), though_failed
+                travel, turn = max(travel, result.displacement), max(turn, result.rotation)
         if stop():
-            return TrialResult(HYPOTHESES, False, worst[0], worst[1], STOPPED), HELD_AFTER[-1]
-    passed = len(failed) <= hypotheses.allowed
-    reason = "" if passed else f"fails under {len(failed)} of the {tried} hypotheses tried ({'; '.join(failed)})"
-    worst_case = min(len(failed) + left if passed else len(HELD_AFTER), len(HELD_AFTER) - 1)
-    return TrialResult(HYPOTHESES, passed, worst[0], worst[1], reason), HELD_AFTER[worst_case]
+            return TrialResult(HYPOTHESES, False, travel, turn, STOPPED), though_failed
+    return TrialResult(HYPOTHESES, True, travel, turn, ""), hypotheses.probability
 
 
-def _hold_in(worlds: OtherWorlds, index: int, grasp: Grasp, stop: StopHook) -> TrialResult | None:
-    world = worlds.world(index, stop)
-    return None if world is None else hold_trial(world, grasp, worlds.protocol, stop=stop)
+def _rules_needed(evidence: Evidence | None, probability: float) -> tuple[str, ...]:
+    """The rules of other shapes, of which grasps are tried on the first that there is; none where none is needed."""
+    if evidence is None or probability <= HELD[1]:
+        return ()
+    from graspd_core.reconstruction.other_shapes import other_rules
+
+    return other_rules(evidence)
+
+
+def _in_thread(work: Callable[[], T]) -> Future[T]:
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
+    begun = pool.submit(work)
+    pool.shutdown(wait=False)
+    return begun
+
+
+def _hold_in(
+    other: Future[World | None], protocol: Protocol, waited_for: threading.Event, grasp: Grasp, stop: StopHook
+) -> TrialResult | None:
+    if not other.done():
+        waited_for.set()
+    while not wait([other], timeout=_POLL).done:
+        if stop():
+            return None
+    world = other.result()
+    return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
 
 
 def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
@@ -218,40 +190,36 @@ def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: 
 
 
 @lru_cache(maxsize=4)
-def _begun(evidence: Evidence) -> dict[str, Future[OtherObject | None]]:
-    """Objects of other shapes that `begin_other_shape` has begun, by their rules."""
+def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
+    """Scenes of other shapes that `begin_other_shape` has begun, by their rules."""
     return {}
 
 
 def begin_other_shape(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
-    """Begin the first other shape that grasps of a scene to come will be tried on, if any, in a thread beside.
+    """Begin the other shape that grasps of a scene to come will be tried on, if any, in a thread beside.
 
     For `scene_from_views`: it is made while the distance grid of the likeliest shape is built.
     """
-    from graspd_core.reconstruction.other_shapes import other_rules
-
-    rules, allowed = other_rules(evidence), _allowed_failures(probability)
-    if allowed + 1 < len(HELD_AFTER) and len(rules) > allowed:
-        pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
-        _begun(evidence)[rules[0]] = pool.submit(run_isolated, other_object, evidence, rules[0], likeliest)
-        pool.shutdown(wait=False)
+    for rule in _rules_needed(evidence, probability)[:1]:
+        _begun(evidence)[rule] = _in_thread(partial(run_isolated, other_scene, evidence, rule, likeliest))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=4)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
     """The world of another shape of the object's own mass and friction; None where there is no such shape."""
     assert scene.evidence is not None
     # Taken out: if making it failed, as where memory was short, it is made again the next time.
     begun = _begun(scene.evidence).pop(rule, None)
-    made = run_isolated(other_object, scene.evidence, rule, scene.object) if begun is None else begun.result()
-    return None if made is None else build_world(hand, *made, protocol)
+    other = run_isolated(other_scene, scene.evidence, rule, scene.object) if begun is None else begun.result()
+    if other is None:
+        return None
+    # A call of its own: the likeliest shape, which every grasp is tried on first, may be cut before.
+    parts = run_isolated(convex_parts, other.object.mesh, other.sdf, **COARSE_CUTS)
+    return build_world(hand, other.object, parts, protocol)
 
 
-def other_object(evidence: Evidence, rule: str, likeliest: ObjectModel) -> OtherObject | None:
-    """An object of the same mass and friction whose hidden side is guessed by a rule, and its convex parts.
-
-    None where there is no such shape.
-    """
+def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
+    """An object of the same mass and friction whose hidden side is guessed by a rule; None where there is none."""
     from graspd_core.reconstruction.other_shapes import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)
@@ -259,7 +227,6 @@ def other_object(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Other
         return None
     named = {"source": likeliest.source, "mass": likeliest.mass, "friction": likeliest.friction}
     try:
-        scene = build_scene(mesh, resolution=_RESOLUTION, **named)
+        return build_scene(mesh, resolution=_RESOLUTION, **named)
     except GraspdError:
         return None
-    return scene.object, convex_parts(scene.object.mesh, scene.sdf, **COARSE_CUTS)

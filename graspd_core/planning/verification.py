@@ -22,11 +22,10 @@ from graspd_core.planning.hypotheses import (
     HoldUnder,
     Hypotheses,
     Hypothesis,
-    OtherWorlds,
     Results,
+    begin_other_world,
     hypotheses_of,
     one_by_one,
-    other_worlds,
     try_hypotheses,
 )
 from graspd_core.planning.run_clock import Run
@@ -35,7 +34,7 @@ from graspd_core.scene.scene import Scene, object_parts
 from graspd_core.trials.audit import audited_trials
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
-from graspd_core.trials.world import PROTOCOLS, Protocol, at_friction
+from graspd_core.trials.world import PROTOCOLS, Protocol, World, at_friction
 from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
@@ -66,11 +65,11 @@ class TrialsAhead:
 
     Attributes:
         worlds: of the likeliest scene; None where the run was over before.
-        others: the worlds of what else may be true of it; None for a mesh, or where none is needed.
+        other: the world of another shape of the object; None where no grasp is tried in one.
     """
 
     worlds: Future[TrialContext | None]
-    others: OtherWorlds | None
+    other: Future[World | None] | None
 
 
 def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
@@ -89,7 +88,7 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
     worlds = pool.submit(build)
     pool.shutdown(wait=False)
-    return TrialsAhead(worlds, other_worlds(run, scene, hand, protocol, certainty.probability))
+    return TrialsAhead(worlds, begin_other_world(run, scene, hand, protocol, certainty.probability))
 
 
 def make_trial_context(
@@ -100,7 +99,7 @@ def make_trial_context(
         pass
     if run.over() or (worlds := ahead.worlds.result()) is None:
         return None
-    hypotheses = None if ahead.others is None else hypotheses_of(ahead.others, worlds, certainty.probability)
+    hypotheses = hypotheses_of(scene, ahead.other, worlds, certainty.probability)
     return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
 
 

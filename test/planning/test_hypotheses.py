@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -14,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.config import CertaintyConfig
-from graspd_core.config.certainty_config import HELD_AFTER
+from graspd_core.config.certainty_config import HELD, HELD_THOUGH_FAILED
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
@@ -23,9 +24,9 @@ from graspd_core.planning import hypotheses, verification
 from graspd_core.planning.hypotheses import (
     Hypotheses,
     Hypothesis,
-    OtherWorlds,
     begin_other_shape,
-    one_by_one,
+    begin_other_world,
+    hypotheses_of,
     try_hypotheses,
 )
 from graspd_core.planning.plan_grasps import plan_grasps
@@ -37,13 +38,15 @@ from graspd_core.scene import scene as scene_module
 from graspd_core.scene.load_scene import load_scene
 from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
 from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.trials.hold_trial import hold_trial
+from graspd_core.trials.hold_trial import STOPPED, hold_trial
 from graspd_core.trials.trial_registry import TrialContext, build_worlds
 from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
 from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 0.0)
+# As presets ask for.
+SURE = CertaintyConfig().probability
 
 
 @cache
@@ -65,54 +68,45 @@ def plan(scene: Scene, probability: float, rounds: int = 3) -> GraspResult:
     return plan_grasps(scene, load_hand("allegro_right"), count=3, preset=config, measure=False)
 
 
-def under(*passed: bool | None) -> Hypotheses:
+def under(*stages: Sequence[bool | None]) -> Hypotheses:
     """Hypotheses that a grasp passes, fails, or that cannot be tried."""
 
-    def hypothesis(number: int, held: bool | None) -> Hypothesis:
+    def hypothesis(number: str, held: bool | None) -> Hypothesis:
         result = None
         if held is not None:
-            result = TrialResult("hold", held, 0.01 * number, 0.0, "" if held else "the object moved")
+            result = TrialResult("hold", held, 0.01 * int(number[-1]), 0.0, "" if held else "the object moved")
         return Hypothesis(f"number {number}", lambda grasp, stop: result)
 
-    return Hypotheses(tuple(hypothesis(number, held) for number, held in enumerate(passed)), allowed=1)
+    made = (tuple(hypothesis(f"{i}.{j}", held) for j, held in enumerate(stage)) for i, stage in enumerate(stages))
+    return Hypotheses(tuple(made), HELD[len(stages)])
 
 
 @pytest.mark.parametrize(
-    ("passed", "verified", "probability", "travel"),
+    ("passed", "verified", "probability", "travel", "reason"),
     [
-        ((True, True, True), True, HELD_AFTER[1], 0.01),  # the last was not needed
-        ((True, False, True), True, HELD_AFTER[1], 0.02),
-        ((False, True, False), False, HELD_AFTER[-1], 0.01),
+        (((True, True),), True, HELD[1], 0.01, ""),
+        (((True, True, True), (True,)), True, HELD[2], 0.02, ""),
+        (((True, None, True), (None,)), True, HELD[2], 0.02, ""),
+        (((True, False, True), (True,)), False, HELD_THOUGH_FAILED[0], 0.0, "number 0.1: the object moved"),
+        (((True, True, True), (False,)), False, HELD_THOUGH_FAILED[1], 0.02, "number 1.0: the object moved"),
     ],
 )
-def test_a_grasp_may_fail_under_as_many_as_are_allowed(passed, verified, probability, travel):
+def test_a_grasp_must_hold_under_all_that_can_be_tried(passed, verified, probability, travel, reason):
     result, likely = try_hypotheses(under(*passed), GRASP, lambda: False)
     assert (result.name, result.passed, likely) == (HYPOTHESES, verified, probability)
-    assert bool(result.reason) is not verified
+    assert result.reason == (f"fails under {reason}" if reason else "")
     assert result.displacement == travel
 
 
-@given(
-    st.lists(st.sampled_from([True, False, None]), max_size=9).flatmap(
-        lambda p: st.tuples(st.just(p), st.permutations(p))
-    )
-)
-def test_the_verdict_is_the_same_in_every_order(orders):
-    passed, turned = (try_hypotheses(under(*order), GRASP, lambda: False)[0].passed for order in orders)
-    assert passed == turned == (orders[0].count(False) <= 1)
+_STAGE = st.lists(st.sampled_from([True, True, True, False, None]), max_size=5)
 
 
-@given(st.lists(st.sampled_from([True, False, None]), max_size=9), st.integers(2, 4))
+@given(st.lists(_STAGE, min_size=1, max_size=2), st.integers(2, 4))
 def test_several_at_a_time_come_to_the_same(passed, threads):
-    told: dict[bool, list[int]] = {False: [], True: []}
-
-    def tried(together: bool) -> tuple[TrialResult, float]:
-        given = replace(under(*passed), failed=told[together].append)
-        hold_under = partial(verification._at_once, threads) if together else one_by_one
-        return try_hypotheses(given, GRASP, lambda: False, hold_under)
-
-    assert tried(True) == tried(False)
-    assert told[True] == told[False]
+    asked, together = under(*passed), partial(verification._at_once, threads)
+    one = try_hypotheses(asked, GRASP, lambda: False)
+    assert one == try_hypotheses(asked, GRASP, lambda: False, together)
+    assert one[0].passed == all(held is not False for stage in passed for held in stage)
 
 
 def test_a_run_that_ends_ends_the_trials_of_several_at_a_time():
@@ -124,9 +118,9 @@ def test_a_run_that_ends_ends_the_trials_of_several_at_a_time():
             time.sleep(0.001)
         return TrialResult("hold", True, 0.0, 0.0, "")
 
-    asked = Hypotheses(tuple(Hypothesis(f"number {k}", hold) for k in range(5)), allowed=1)
+    asked = Hypotheses((tuple(Hypothesis(f"number {k}", hold) for k in range(5)),), HELD[1])
     result, likely = try_hypotheses(asked, GRASP, over.is_set, partial(verification._at_once, 2))
-    assert (result.passed, likely) == (False, HELD_AFTER[-1])
+    assert (result.passed, result.reason, likely) == (False, STOPPED, HELD_THOUGH_FAILED[0])
 
 
 def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
@@ -147,7 +141,7 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
         return held
 
     monkeypatch.setattr(verification, "audited_trials", likeliest)
-    asked = Hypotheses((Hypothesis("a shape", waits),), 0, waited_for=waited_for)
+    asked = Hypotheses(((Hypothesis("a shape", waits),),), HELD[1], waited_for)
     box = load_scene("shape:box")
     worlds = build_worlds(box, load_hand("allegro_right"), object_parts(box.object), PROTOCOLS["standard"])
     context = verification.VerificationContext(worlds, None, asked)
@@ -162,81 +156,86 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
 
 def test_a_shape_that_was_begun_with_the_scene_is_not_made_again(monkeypatch):
     made, begun_before_grid = [], []
-    other, grid = hypotheses.other_object, scene_module.object_sdf
-    monkeypatch.setattr(hypotheses, "other_object", lambda *given: made.append(given[1]) or other(*given))
+    other, grid = hypotheses.other_scene, scene_module.object_sdf
+    monkeypatch.setattr(hypotheses, "other_scene", lambda *given: made.append(given[1]) or other(*given))
     monkeypatch.setattr(
         scene_module, "object_sdf", lambda *given: begun_before_grid.append(bool(begun)) or grid(*given)
     )
     begun: list[str] = []
 
     def ahead(likeliest: ObjectModel, evidence: Evidence) -> None:
-        begin_other_shape(0.9, likeliest, evidence)
+        begin_other_shape(SURE, likeliest, evidence)
         begun.extend(hypotheses._begun(evidence))
 
     scene = scene_from_views(views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8)), ahead=ahead)
     assert begun_before_grid[0]
     assert begun == [""]
-    assert any(grasp.verdict is Verdict.VERIFIED for grasp in plan(scene, 0.9).grasps)
+    assert any(grasp.verdict is Verdict.VERIFIED for grasp in plan(scene, SURE).grasps)
     assert made.count("") == 1
 
 
 def test_no_shape_is_begun_where_none_is_needed():
     evidence = seen_all_round().evidence
     assert evidence is not None
-    for doubted, probability in ((evidence, 0.9), (replace(evidence, hidden=True), 0.0)):
+    for doubted, probability in ((evidence, SURE), (replace(evidence, hidden=True), HELD[1])):
         begin_other_shape(probability, seen_all_round().object, doubted)
         assert not hypotheses._begun(doubted)
 
 
-def test_the_reason_names_what_the_grasp_failed_under():
-    result, _ = try_hypotheses(under(False, True, False), GRASP, lambda: False)
-    assert "number 0: the object moved; number 2: the object moved" in result.reason
-
-
-def test_nothing_is_tried_after_the_last_that_is_allowed():
+def test_nothing_is_tried_after_a_failure():
     def never(grasp, stop):
         raise AssertionError("tried")
 
-    failing = under(False, False)
-    try_hypotheses(Hypotheses((*failing.items, Hypothesis("late", never)), 1), GRASP, lambda: False)
+    late = Hypothesis("late", never)
+    failing = under((True, False), (True,))
+    asked = replace(failing, stages=((*failing.stages[0], late), (late,)))
+    assert not try_hypotheses(asked, GRASP, lambda: False)[0].passed
 
 
-def test_failures_are_told_as_long_as_the_grasp_may_be_verified():
-    told: list[int] = []
-    try_hypotheses(replace(under(False, True, False, True), failed=told.append), GRASP, lambda: False)
-    assert told == [1]
-
-
-@pytest.mark.parametrize(("begun", "expected"), [(2, ["", "mirror", "extrusion"]), (0, [])])
-def test_each_failure_begins_one_more_shape_where_any_is_needed(begun, expected, monkeypatch):
-    box, hand, protocol = load_scene("shape:box"), load_hand("allegro_right"), PROTOCOLS["standard"]
-    world, made = build_world(hand, box.object, object_parts(box.object), protocol), []
-    monkeypatch.setattr(hypotheses, "_other_world", lambda *given: made.append(given[-1]) or world)
+@pytest.mark.parametrize(("missing", "expected"), [(0, [""]), (1, ["", "mirror"]), (3, ["", "mirror", "extrusion"])])
+def test_the_first_shape_that_there_is_is_taken(missing, expected, monkeypatch):
+    seen, hand, protocol = seen_from(), load_hand("allegro_right"), PROTOCOLS["standard"]
+    world, made = build_world(hand, seen.object, object_parts(seen.object), protocol), []
+    monkeypatch.setattr("graspd_core.reconstruction.other_shapes.other_rules", lambda _: ("", "mirror", "extrusion"))
+    monkeypatch.setattr(
+        hypotheses, "_other_world", lambda *given: made.append(given[-1]) or (None if len(made) <= missing else world)
+    )
     run = Run(time.perf_counter(), None, None, None, None)
-    others = OtherWorlds(run, box, hand, protocol, ("", "mirror", "extrusion", "revolution"), begun)
-    others.begin_after(1)
-    # Nobody asks for a world here: that would begin it.
-    others._pool.shutdown(wait=True)
+    begun = begin_other_world(run, seen, hand, protocol, SURE)
+    assert begun is not None
+    assert begun.result() is (None if missing == 3 else world)
     assert made == expected
 
 
+@pytest.mark.parametrize(("probability", "stages"), [(0.0, None), (0.91, None), (0.94, 1), (0.95, 2), (0.97, 2)])
+def test_no_more_is_in_doubt_than_the_probability_asks_for(probability, stages):
+    seen, hand, protocol = seen_from(), load_hand("allegro_right"), PROTOCOLS["standard"]
+    worlds = build_worlds(seen, hand, object_parts(seen.object), protocol)
+    other = begin_other_world(Run(time.perf_counter(), None, None, None), seen, hand, protocol, probability)
+    asked = hypotheses_of(seen, other, worlds, probability)
+    assert (None if asked is None else len(asked.stages)) == stages
+    assert (other is None) == (stages != 2)
+    if asked is not None:
+        assert asked.probability >= probability
+
+
 def test_a_grasp_that_was_stopped_is_not_verified():
-    assert not try_hypotheses(under(True, True, True), GRASP, lambda: True)[0].passed
+    assert not try_hypotheses(under((True, True, True)), GRASP, lambda: True)[0].passed
 
 
 def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
-    result = plan(seen_from(), 0.9)
+    result = plan(seen_from(), SURE)
     verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
         assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
         assert grasp.probability is not None
-        assert grasp.probability >= 0.9
+        assert grasp.probability >= SURE
     for grasp in result.grasps:
         if grasp.verdict is Verdict.UNVERIFIED:
             assert not grasp.usable
             assert grasp.probability is not None
-            assert grasp.probability < 0.9
+            assert grasp.probability < SURE
     order = [grasp.verdict for grasp in result.grasps]
     assert order == sorted(order, key=[Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED].index)
 
@@ -248,17 +247,17 @@ def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape():
 
 
 def test_a_mesh_is_not_doubted():
-    result = plan(load_scene("shape:cylinder"), 0.9)
+    result = plan(load_scene("shape:cylinder"), SURE)
     assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.grasps)
 
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     monkeypatch.delattr("graspd_core.planning.hypotheses._other_world")
-    verified = [grasp for grasp in plan(seen_all_round(), 0.98).grasps if grasp.verdict is Verdict.VERIFIED]
+    verified = [grasp for grasp in plan(seen_all_round(), HELD[-1]).grasps if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
         assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
-        assert grasp.probability == 0.98
+        assert grasp.probability == HELD[-1]
 
 
 def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
@@ -268,7 +267,7 @@ def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
         "graspd_core.scene.scene.convex_parts",
         lambda *given, **cuts: cut.append(cuts) or convex_parts(*given, **cuts),
     )
-    result = plan(seen_from((0.001, 0.0, 0.0)), 0.9)
+    result = plan(seen_from((0.001, 0.0, 0.0)), SURE)
     assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.grasps)
     assert cut == [COARSE_CUTS]
 
@@ -290,7 +289,7 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
     monkeypatch.setattr(
         "graspd_core.planning.hypotheses.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
     )
-    result = plan(seen(), 0.98, rounds=1)
+    result = plan(seen(), HELD[-1], rounds=1)
     assert result.grasps
     assert not any(grasp.usable for grasp in result.grasps)
     assert result.grasps[0].verdict is Verdict.UNVERIFIED
@@ -299,7 +298,7 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
 
 
 def test_far_from_the_origin_the_other_shapes_are_where_the_object_is():
-    near, far = plan(seen_from(), 0.9), plan(seen_from((300.0, -200.0, 100.0)), 0.9)
+    near, far = plan(seen_from(), SURE), plan(seen_from((300.0, -200.0, 100.0)), SURE)
     assert sum(grasp.usable for grasp in far.grasps) == sum(grasp.usable for grasp in near.grasps) == 3
 
 
