@@ -123,15 +123,19 @@ def check_mesh(
     return clean, (*_doubted_size(clean, source, scale), *warnings)
 
 
-def simplify(mesh: TriangleMesh, faces: int) -> TriangleMesh:
-    """At most about `faces` triangles, by quadric edge collapse; a smaller mesh is returned as it is."""
+def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
+    """At most about `faces` triangles, by quadric edge collapse; a smaller mesh is returned as it is.
+
+    Another `aggressiveness` takes the edges in another order.
+    """
     import fast_simplification
 
     if len(mesh.faces) <= faces:
         return mesh
     centre = mesh.vertices.mean(0)
     points, triangles = (mesh.vertices - centre).astype(np.float32), mesh.faces.astype(np.int32)
-    vertices, triangles = fast_simplification.simplify(points, triangles, target_count=int(faces))[:2]
+    named = {"target_count": int(faces), "agg": aggressiveness}
+    vertices, triangles = fast_simplification.simplify(points, triangles, **named)[:2]
     return TriangleMesh(vertices.astype(float) + centre, triangles.astype(np.int64))
 
 

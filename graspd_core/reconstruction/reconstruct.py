@@ -219,12 +219,13 @@ def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig)
 
 
 def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
-    """At most so many faces; the slower of two simplifiers where the quicker one tears the surface."""
+    """At most so many faces; the slower of two simplifiers where the quicker one tears the surface each time."""
     import open3d as o3d
 
-    quick, _ = check_mesh(simplify(mesh, most), "reconstruction")
-    if is_closed(quick):
-        return quick
+    for aggressiveness in (7, 5, 3):
+        quick, _ = check_mesh(simplify(mesh, most, aggressiveness=aggressiveness), "reconstruction")
+        if is_closed(quick):
+            return quick
     whole = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
     ).simplify_quadric_decimation(most)
