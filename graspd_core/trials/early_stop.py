@@ -43,8 +43,8 @@ class StopRule:
 
 FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
 SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
-# Objects begin to slip as late as 1.9 s.
-CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.002, spin=math.radians(2.0))
+# Objects begin to slip as late as 1.9 s; what moves at 1 mm/s until then may let go at once.
+CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
 # Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
 _FEWEST_FINGERS = 3
 # The least impedance ratio and sliding friction of each, CREEPING below them all; measured at 0.6 and 0.3.

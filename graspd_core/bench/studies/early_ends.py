@@ -124,7 +124,8 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
             for name in names:
                 groups.setdefault(name, []).append(row)
             if row["early"].get("passed") != row["late"].get("passed"):
-                told.append(f"* {record['label']}, grasp {row['index']}, {row['group']}: {row['early']}, {row['late']}")
+                early, late = (row[way]["reason"] or "holds" for way in ("early", "late"))
+                told.append(f"* {record['label']}, grasp {row['index']}, {row['group']}: early {early}; in full {late}")
     headings = ["group", "trials", "passed", "wrongly verified", "at most (95 %)", "wrongly failed"]
     headings += ["CPU ms, all: full, early", "passing: full, early"]
     body = [[name, str(len(rows)), *_figures(rows)] for name, rows in groups.items()]
