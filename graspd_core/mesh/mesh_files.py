@@ -134,8 +134,8 @@ def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> Tria
         return mesh
     centre = mesh.vertices.mean(0)
     points, triangles = (mesh.vertices - centre).astype(np.float32), mesh.faces.astype(np.int32)
-    named = {"target_count": int(faces), "agg": aggressiveness}
-    vertices, triangles = fast_simplification.simplify(points, triangles, **named)[:2]
+    fewer = fast_simplification.simplify(points, triangles, target_count=int(faces), agg=aggressiveness)
+    vertices, triangles = fewer[:2]
     return TriangleMesh(vertices.astype(float) + centre, triangles.astype(np.int64))
 
 
