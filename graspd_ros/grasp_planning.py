@@ -44,8 +44,8 @@ class PlanningMessages:
         return GraspPlanning.Feedback(grasps=list(self._found))
 
     def result(self, message: GraspArray) -> GraspPlanning.Result:
-        """Those that did not fail, best first."""
-        good = [grasp for grasp in message.grasps if grasp.verdict != Grasp.FAILED]
+        """Those that failed no trial, best first: MoveIt's message cannot say that one is doubted."""
+        good = [grasp for grasp in message.grasps if all(trial.passed for trial in grasp.trials)]
         return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good])
 
     def _grasp(self, message: Grasp) -> Any:

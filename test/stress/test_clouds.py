@@ -86,7 +86,7 @@ def test_of_two_touching_objects_the_masked_one_is_taken(hand):
     ((depth, label),) = depth_views(stage, CAMERA, pose, DEFAULT)
     (view,) = views_of(stage, CAMERA, pose, DEFAULT)
     # A seed of which few candidates have to be tried.
-    scene, _ = grasp_of([view], hand, seed=3, target=Target(mask=label[depth > 0] == 0))
+    scene, _ = grasp_of([view], hand, seed=6, target=Target(mask=label[depth > 0] == 0))
     assert stray(scene, stage) < 0.02
     # The other is in the way: a neighbour covers what the camera saw of it.
     other = view.points[label[depth > 0] == 1]
