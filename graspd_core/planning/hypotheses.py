@@ -9,18 +9,18 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from contextlib import closing
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import TypeVar
 
 from graspd_core.config.certainty_config import HELD, HELD_THOUGH_FAILED
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.planning.run_clock import Run
+from graspd_core.planning.trial_threads import begin_in_thread
 from graspd_core.reconstruction.evidence import Evidence
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, build_scene
@@ -30,8 +30,6 @@ from graspd_core.trials.trial_registry import TrialContext
 from graspd_core.trials.world import Protocol, World, at_friction, build_world
 from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
 
-T = TypeVar("T")
-
 # Of the friction that the scene says.
 _LESS_FRICTION = 2 / 3
 # Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
@@ -40,6 +38,8 @@ _PLACES, _PLACES_SEED = 3, 0x706C616365
 _RESOLUTION = 24
 # How often the stop hook is asked while waiting for a world [s].
 _POLL = 0.02
+# Name of the threads that make other shapes.
+_SHAPES = "graspd-shapes"
 
 # Of trials under some hypotheses, in their order; None where there was none. And how a grasp goes through them.
 Results = Generator[TrialResult | None]
@@ -64,7 +64,7 @@ class Hypotheses:
     """What else a grasp must hold under.
 
     Attributes:
-        stages: cheapest first; what is cheap, then another shape.
+        stages: place and friction, which are cheap to try, then another shape.
         probability: that a grasp which holds under all of them holds on the true object.
         waited_for: set once a trial waits for its world: there is time for other work.
     """
@@ -91,7 +91,7 @@ def begin_other_world(
                 return world
         return None
 
-    return _in_thread(make) if rules else None
+    return begin_in_thread(_SHAPES, make) if rules else None
 
 
 def hypotheses_of(
@@ -158,13 +158,6 @@ def _rules_needed(evidence: Evidence | None, probability: float) -> tuple[str, .
     return other_rules(evidence)
 
 
-def _in_thread(work: Callable[[], T]) -> Future[T]:
-    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-shapes")
-    begun = pool.submit(work)
-    pool.shutdown(wait=False)
-    return begun
-
-
 def _hold_in(
     other: Future[World | None], protocol: Protocol, waited_for: threading.Event, grasp: Grasp, stop: StopHook
 ) -> TrialResult | None:
@@ -201,7 +194,8 @@ def begin_other_shape(probability: float, likeliest: ObjectModel, evidence: Evid
     For `scene_from_views`: it is made while the distance grid of the likeliest shape is built.
     """
     for rule in _rules_needed(evidence, probability)[:1]:
-        _begun(evidence)[rule] = _in_thread(partial(run_isolated, other_scene, evidence, rule, likeliest))
+        work = partial(run_isolated, other_scene, evidence, rule, likeliest)
+        _begun(evidence)[rule] = begin_in_thread(_SHAPES, work)
 
 
 @lru_cache(maxsize=4)

@@ -18,6 +18,14 @@ Result = TypeVar("Result")
 _POLL = 0.02
 
 
+def begin_in_thread(name: str, work: Callable[[], Result]) -> Future[Result]:
+    """Begin work in a thread that only who asks for its result, and the process's end, waits for."""
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+    begun = pool.submit(work)
+    pool.shutdown(wait=False)
+    return begun
+
+
 def results_in_order(
     over: StopHook,
     work: Callable[[Item, StopHook], Result],

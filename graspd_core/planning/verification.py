@@ -29,7 +29,7 @@ from graspd_core.planning.hypotheses import (
     try_hypotheses,
 )
 from graspd_core.planning.run_clock import Run
-from graspd_core.planning.trial_threads import results_in_order
+from graspd_core.planning.trial_threads import begin_in_thread, results_in_order
 from graspd_core.scene.scene import Scene, object_parts
 from graspd_core.trials.audit import audited_trials
 from graspd_core.trials.noisy_trial import noisy_share, pose_errors
@@ -73,7 +73,7 @@ class TrialsAhead:
 
 
 def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
-    """Begin what the trials need, in threads that only who asks for a result, and the process's end, waits for.
+    """Begin what the trials need, in threads beside (`begin_in_thread`).
 
     It takes about as long as the optimiser does. One object is cut at a time, and none whose run is over before its
     turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
@@ -85,9 +85,7 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
         with _CUTTING:
             return None if run.known_over() else _worlds(scene, hand, protocol)
 
-    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspd-parts")
-    worlds = pool.submit(build)
-    pool.shutdown(wait=False)
+    worlds = begin_in_thread("graspd-parts", build)
     return TrialsAhead(worlds, begin_other_world(run, scene, hand, protocol, certainty.probability))
 
 

@@ -17,12 +17,14 @@ from grasping_msgs.action import GraspPlanning
 from grasping_msgs.msg import Object
 from rclpy.action.client import ActionClient
 from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_core.errors import GraspdError
+from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.pointcloud.depth_image import cloud_from_depth
 from graspd_core.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
-from graspd_ros.grasp_planning import request_from_goal
+from graspd_ros.grasp_planning import PlanningMessages, request_from_goal
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.outputs.error_codes import code_of
 from graspd_ros.parameters import Settings
@@ -91,6 +93,27 @@ def test_each_kind_of_object_gets_grasps_and_feedback_before(client, planning, m
     assert len(best.grasp_posture.points[0].effort) == len(best.grasp_posture.joint_names)
     assert best.pre_grasp_approach.desired_distance > 0
     assert best.post_grasp_retreat.direction.header.frame_id == best.grasp_pose.header.frame_id
+
+
+def test_the_result_holds_no_grasp_that_failed_a_trial():
+    from graspd_msgs.msg import Grasp, GraspArray, TrialResult
+
+    def grasp(name: str, verdict: int, **trials: bool) -> Grasp:
+        tried = [TrialResult(name=trial, passed=passed) for trial, passed in trials.items()]
+        point = JointTrajectoryPoint()
+        way = JointTrajectory(points=[point, point, point])
+        return Grasp(id=name, verdict=verdict, trials=tried, trajectory=way)
+
+    message = GraspArray(
+        grasps=[
+            grasp("sure", Grasp.VERIFIED, hold=True, hypotheses=True),
+            grasp("doubted", Grasp.UNVERIFIED, hold=True, hypotheses=False),
+            grasp("untried", Grasp.UNVERIFIED),
+            grasp("failed", Grasp.FAILED, hold=False),
+        ]
+    )
+    answer = PlanningMessages(load_hand("allegro_right")).result(message)
+    assert [theirs.id for theirs in answer.grasps] == ["sure", "untried"]
 
 
 def test_a_group_that_is_no_hand_and_an_object_without_shape_are_aborted_and_told_on_status(client, planning):
