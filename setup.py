@@ -8,7 +8,7 @@ from setuptools import Extension, setup
 ROOT = Path(__file__).parent
 SHARE = Path("share")
 KERNEL = "graspd_core/kernel"
-# Builds of the kernel: one of them is chosen when it is loaded (graspd_core/kernel/builds.py).
+# Builds of the kernel: one of them is chosen when it is loaded (graspd_core/optimize/kernel/builds.py).
 TARGETS = {"baseline": []}
 if platform.machine() in ("x86_64", "AMD64"):
     TARGETS |= {"v3": ["-march=x86-64-v3"], "v4": ["-march=x86-64-v4"]}

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.bags.reader import jazzy_types
-from graspd_core.pointcloud.camera import PinholeCamera
+from graspd_core.io.bags import jazzy_types
+from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 
 # The most that a pixel of 16 bits can hold [mm].

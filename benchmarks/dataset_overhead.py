@@ -16,14 +16,14 @@ from tempfile import TemporaryDirectory
 import psutil
 import torch
 
+from graspd_bench.tables import markdown_table
 from graspd_core import load_hand, load_scene, plan_grasps
-from graspd_core.bench.report import markdown_table
-from graspd_core.dataset.blocks import Block, DatasetRequest, blocks_of
-from graspd_core.dataset.dataset_store import DatasetStore
-from graspd_core.dataset.guarded_calls import Limits
-from graspd_core.dataset.ray_engine import RayEngine, ray_running
-from graspd_core.dataset.run_dataset import run_blocks
 from graspd_core.runtime.worker_process import resident_mb
+from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
+from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.guarded_calls import Limits
+from graspd_dataset.ray_engine import RayEngine, ray_running
+from graspd_dataset.run_dataset import run_blocks
 
 
 def loop(blocks: Sequence[Block]) -> tuple[float, float, int]:

@@ -163,7 +163,7 @@ def layouts() -> list[bytes]:
 def _messages() -> list[Any]:
     from bag_writer import camera_info_message, cloud_message, depth_message, transforms_message
 
-    from graspd_core.pointcloud.camera import PinholeCamera
+    from graspd_core.perception.cloud.camera import PinholeCamera
 
     camera = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0, (0.1, -0.2, 0.001, -0.001, 0.05))
     depth = np.full((3, 4), 0.5)
@@ -178,7 +178,7 @@ def _messages() -> list[Any]:
 
 def messages() -> list[bytes]:
     """One message of each type, its type's number in front."""
-    from graspd_core.bags.reader import jazzy_types
+    from graspd_core.io.bags import jazzy_types
 
     numbers = (0, 1, 2, 3, 1)
     return [

@@ -124,13 +124,13 @@ def _description(path: Path) -> Any:
 
 
 def _preset(path: Path) -> Any:
-    from graspd_core.methods.plan_config import load_preset
+    from graspd_core.optimize.plan_config import load_preset
 
     return load_preset(str(path))
 
 
 def _document(path: Path) -> Any:
-    from graspd_core.formats.read_grasps import grasps_of, load_document
+    from graspd_core.io.grasps_json import grasps_of, load_document
 
     grasps = grasps_of(load_document(path))
     for grasp in grasps:
@@ -157,7 +157,7 @@ def _dae(path: Path) -> Any:
 
 
 def _cloud(path: Path) -> Any:
-    from graspd_core.pointcloud.cloud_files import is_cloud_file, load_views
+    from graspd_core.perception.cloud.cloud_files import is_cloud_file, load_views
 
     data = path.read_bytes()
     ending = next((e for mark, e in ((b"PK", "npz"), (b"ply", "ply"), (b"#", "pcd")) if data.startswith(mark)), "npy")
@@ -173,7 +173,7 @@ def _cloud(path: Path) -> Any:
 
 def _layout(path: Path) -> Any:
     """Width, height, step of a point and of a row, byte order and three fields, then the data."""
-    from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
+    from graspd_core.perception.cloud.point_cloud import CloudLayout, points_from_layout
 
     data = path.read_bytes().ljust(LAYOUT_HEAD.size, b"\0")
     width, height, point, row, big, *places = LAYOUT_HEAD.unpack_from(data)
@@ -185,8 +185,8 @@ def _layout(path: Path) -> Any:
 
 
 def _bag(path: Path) -> Any:
-    from graspd_core.bags.reader import bag_topics, read_frames, read_transforms
     from graspd_core.errors import BagError, CloudError, TransformError
+    from graspd_core.io.bags import bag_topics, read_frames, read_transforms
 
     named = path.rename(path.with_suffix(".db3" if path.read_bytes().startswith(b"SQLite") else ".mcap"))
     made: list[Any] = []
@@ -204,10 +204,19 @@ def _message(path: Path) -> Any:
     """A message of one of four types, named by the first byte, as CDR."""
     from bag_writer import camera_info_message
 
-    from graspd_core.bags.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
-    from graspd_core.bags.reader import CLOUD, IMAGE, INFO, TRANSFORMS, jazzy_types
     from graspd_core.errors import FormatError
-    from graspd_core.pointcloud.camera import PinholeCamera
+    from graspd_core.io.bags import (
+        CLOUD,
+        IMAGE,
+        INFO,
+        TRANSFORMS,
+        add_transforms,
+        cloud_from_depth_message,
+        cloud_from_message,
+        jazzy_types,
+        stamp_of,
+    )
+    from graspd_core.perception.cloud.camera import PinholeCamera
     from graspd_core.transforms import TransformBuffer
 
     data = path.read_bytes() or b"\0"

@@ -25,9 +25,8 @@ os.environ.update(OMP_NUM_THREADS="1")
 import numpy as np
 
 from graspd_core import GraspLibrary, Scene, load_hand, load_preset, load_scene, plan_grasps
-from graspd_core.library.find_entry import Physics, entry_by_name
-from graspd_core.library.known_grasps import library_result
-from graspd_core.library.library_entry import entry_of
+from graspd_core.library.grasp_library import entry_of
+from graspd_core.library.known_grasps import Physics, entry_by_name, library_result
 from graspd_core.mesh.shapes import SHAPES
 
 PHYSICS = Physics(mass=0.1, friction=0.6)

@@ -3,7 +3,7 @@
     python benchmarks/pictures.py [--figures docs/figures] [--pages results/bench]
 
 grasps.png of README.md, and view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and view_failed.png of
-docs/viewer.md: rays against the meshes of `graspd_core.viewer.drawing`, so that no browser and no screen is needed.
+docs/viewer.md: rays against the meshes of `graspd_viewer.drawing`, so that no browser and no screen is needed.
 With --pages instead the screenshots of docs/viewer.md, one of them of that benchmark: these need playwright and
 Chromium, and differ a little each time.
 """
@@ -28,23 +28,33 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
+from graspd_bench.rendering.depth_noise import DepthNoise
+from graspd_bench.rendering.render import camera_of_view, look_at, render_scene, render_shaded, save_png
+from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core import HandModel, PlanConfig, hand_names, load_hand, load_preset, load_scene, plan_grasps
-from graspd_core.rendering.depth_noise import DepthNoise
-from graspd_core.rendering.render import camera_of_view, look_at, render_scene, render_shaded, save_png
-from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
-from graspd_core.scene.scene import Scene, object_parts
-from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
-from graspd_core.trials.trial_recording import record_trial
-from graspd_core.trials.trial_registry import build_worlds
-from graspd_core.trials.world import PROTOCOLS
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
-from graspd_core.viewer.bench_page import bench_page
-from graspd_core.viewer.drawing import SEEN, Part, contact_parts, force_parts, hand_parts, scene_parts, weakest_parts
-from graspd_core.viewer.mechanics import Mechanics
-from graspd_core.viewer.motion import STAGES, placed_links, posture_at
-from graspd_core.viewer.session import Session, make_session
-from graspd_core.viewer.viewer import Viewer
+from graspd_core.verify.trial_registry import build_worlds
+from graspd_core.verify.world import PROTOCOLS
+from graspd_viewer.bench_page import bench_page
+from graspd_viewer.drawing import (
+    SEEN,
+    STAGES,
+    Mechanics,
+    Part,
+    contact_parts,
+    force_parts,
+    hand_parts,
+    placed_links,
+    posture_at,
+    scene_parts,
+    weakest_parts,
+)
+from graspd_viewer.session import Session, make_session
+from graspd_viewer.trial_controls import record_trial
+from graspd_viewer.viewer import Viewer
 
 # What is grasped on the README's picture, and by which hand.
 PAIRS = (("shape:mug", "allegro_right"), ("shape:torus", "barrett_like"), ("shape:hammer", "leap_right"))

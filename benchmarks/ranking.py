@@ -1,4 +1,4 @@
-"""Fit the score that candidates are tried in order of: `graspd_core/methods/stages/ranking.npz`.
+"""Fit the score that candidates are tried in order of: `graspd_core/optimize/ranking.npz`.
 
     ranking.py try [--objects shape:mug PATH ...] [--hands allegro_right ...] [--out results/ranking]
     ranking.py fit [--out results/ranking] [--held-out results/ranking-scans]
@@ -23,20 +23,18 @@ import torch
 import trimesh
 from torch import nn
 
+from graspd_bench.study import all_shapes
+from graspd_bench.tables import markdown_table
 from graspd_core import load_hand, load_scene
-from graspd_core.bench.report import markdown_table
-from graspd_core.bench.study import all_shapes
-from graspd_core.methods.candidates import finished, staged
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.method_registry import METHODS
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.methods.planner import PlannerInput
-from graspd_core.methods.stages import ranking
-from graspd_core.methods.stages.ranking import FARTHEST, log_odds, ranking_figures
-from graspd_core.scene.scene import Scene, object_parts
-from graspd_core.trials.hold_trial import hold_trial
-from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
+from graspd_core.optimize import ranking
+from graspd_core.optimize.candidates import PlannerInput, finished, staged
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.plan_config import METHODS, load_preset
+from graspd_core.optimize.ranking import FARTHEST, log_odds, ranking_figures
+from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.types import TriangleMesh
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
 SHIPS = Path(ranking.__file__).with_suffix(".npz")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")

@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.bench.report import fill, markdown_table, sourced, written
-from graspd_core.bench.result_store import code_version, write_record
-from graspd_core.bench.run_cases import Job, run_job
-from graspd_core.bench.study import Case, Record, Sections
+from graspd_bench.result_store import code_version, write_record
+from graspd_bench.run_studies import Job, run_job
+from graspd_bench.study import Case, Record, Sections
+from graspd_bench.tables import fill, markdown_table, sourced, written
 
 PARTS = Path(__file__).with_name("soak_parts.py")
 SAMPLE_PERIOD = 5.0  # seconds between two looks at the node's memory

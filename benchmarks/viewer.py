@@ -33,8 +33,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
 from conftest import FLAGS  # pyright: ignore[reportMissingImports]
 
 from graspd_core import load_hand, load_preset, load_scene, plan_grasps, save_result
-from graspd_core.viewer.session import make_session, open_grasps
-from graspd_core.viewer.viewer import Viewer
+from graspd_viewer.session import make_session, open_grasps
+from graspd_viewer.viewer import Viewer
 
 # What three.js says of itself, by way of viser: frames that were really drawn.
 FRAMES = """() => {

@@ -27,9 +27,9 @@ from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import String
 
+from graspd_bench.rendering.render import camera_of_view, look_at, render_depth, render_shaded, save_png
 from graspd_core import Posture, TriangleMesh, cloud_from_depth, load_hand, make_shape, save_mesh
-from graspd_core.formats.grasp_page import placed_hand
-from graspd_core.rendering.render import camera_of_view, look_at, render_depth, render_shaded, save_png
+from graspd_viewer.grasp_page import placed_hand
 
 GRASPS = 8
 TIMEOUT = 180.0  # seconds; each step takes a few on a quiet machine

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core import (
     GraspdError,
     PinholeCamera,
@@ -23,7 +24,6 @@ from graspd_core import (
     plan_grasps,
     scene_from_views,
 )
-from graspd_core.rendering.tabletop import depth_views, ring_poses, tabletop
 
 
 def rendered_view() -> tuple[np.ndarray, PinholeCamera, np.ndarray]:

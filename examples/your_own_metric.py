@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from graspd_core import METRICS, Metric, Verdict, load_hand, load_preset, load_scene, plan_grasps, save_result
-from graspd_core.metrics.prepared_grasp import PreparedGrasp
+from graspd_core.verify.prepared_grasp import PreparedGrasp
 
 TOUCHING = 0.002  # distance to the object that counts as contact [m]
 

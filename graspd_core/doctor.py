@@ -54,7 +54,7 @@ else:
     print(version("pybullet"))
 """
 _KERNEL = """
-from graspd_core.kernel.builds import kernel
+from graspd_core.optimize.kernel.builds import kernel
 found = kernel()
 assert found.library, found.reason
 print(f"{found.name}, {found.library.graspd_lanes()} floats at once")

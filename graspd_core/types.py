@@ -88,7 +88,7 @@ HYPOTHESES = "hypotheses"
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What one trial of one grasp measured; `graspd_core.trials.trial_registry` lists the trials that planning runs.
+    """What one trial of one grasp measured; `graspd_core.verify.trial_registry` lists the trials that planning runs.
 
     Attributes:
         name: of the trial.
@@ -110,7 +110,7 @@ class TrialResult:
 class GraspMetrics(Mapping[str, float | None]):
     """Static quality of one grasp by metric name, in SI units; None where a metric was not measured.
 
-    `graspd_core.metrics.metric_registry` lists the metrics, docs/metrics.md defines them.
+    `graspd_core.verify.metrics` lists the metrics, docs/metrics.md defines them.
     """
 
     values_si: Mapping[str, float | None]

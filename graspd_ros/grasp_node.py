@@ -33,7 +33,7 @@ from std_srvs.srv import Trigger
 from graspd_core import hand_names, load_hand, warm_up
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.model import all_joint_names
-from graspd_core.runtime.heap import trim_heap
+from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action_server import GoalServer, SynthesizeMessages
 from graspd_ros.diagnostics import health_message, resident_memory

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 
 from graspd_core import HandModel, Reach, Scene, Steering, load_scene
-from graspd_core.library.find_entry import Physics, entry_by_file, entry_by_name
-from graspd_core.library.grasp_library import GraspLibrary
-from graspd_core.library.known_grasps import known_or_planned, library_result
-from graspd_core.library.library_entry import LibraryEntry, hand_hash
+from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, hand_hash
+from graspd_core.library.known_grasps import Physics, entry_by_file, entry_by_name, known_or_planned, library_result
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import GraspResult
 from graspd_ros.inputs.requests import KnownObject, Request

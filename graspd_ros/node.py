@@ -44,8 +44,7 @@ def main(args: list[str] | None = None) -> int:
     _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
-    from graspd_core.planning.planning_worker import start_planning_worker
-    from graspd_core.runtime.heap import limit_malloc_arenas
+    from graspd_core.runtime.worker_process import limit_malloc_arenas, start_planning_worker
 
     # First, so that the child's imports, two seconds of them, go on beside this process's own.
     start_planning_worker()

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from graspd_core import load_arm, load_preset
-from graspd_core.arms.arm_file import from_robot_description, read_arm_file
+from graspd_core.arms.arm import from_robot_description, read_arm_file
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, FormatError
 from graspd_ros.outputs.markers import GEOMETRIES, PARTS, USUAL_PARTS

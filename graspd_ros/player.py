@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from graspd_core.bags.reader import BagTopic, bag_topics, read_raw
 from graspd_core.errors import BagError, ConfigError
+from graspd_core.io.bags import BagTopic, bag_topics, read_raw
 from graspd_core.transforms import SECOND
 from graspd_ros.ros_command import Parser, run_command
 

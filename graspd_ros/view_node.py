@@ -37,7 +37,7 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
     import rclpy
 
     from graspd_core import load_hand, load_scene
-    from graspd_core.viewer.viewer import Viewer
+    from graspd_viewer.viewer import Viewer
 
     scene = load_scene(options.object) if options.object else None
     if options.hand:
@@ -86,7 +86,7 @@ class Follower:
 
     def _on_answer(self, message: Any) -> None:
         from graspd_core import PlanConfig
-        from graspd_core.viewer.session import Session, make_session
+        from graspd_viewer.session import Session, make_session
 
         ending = message.message or f"{len(message.grasps)} grasps"
         self._viewer.do("progress", lambda: self._viewer.tell(ending, 1.0))
@@ -107,7 +107,7 @@ class Follower:
 
     def _seen(self, frame: str) -> np.ndarray:
         """The points of the newest cloud, where it is in the frame of the answer [m]."""
-        from graspd_core.bags.messages import points_from_message
+        from graspd_core.io.bags import points_from_message
 
         if self._cloud is None or self._cloud.header.frame_id != frame:
             return np.zeros((0, 3))

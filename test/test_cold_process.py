@@ -19,8 +19,16 @@ UNUSED = [
     "vhacdx",
     "pybullet",
 ]
-UNUSED += ["rclpy", "networkx", "pandas", "dash", "sympy", "torch._dynamo", "graspd_core.reconstruction.reconstruct"]
-UNUSED += ["graspd_core.segmentation.segment", "graspd_core.bench.suites"]
+UNUSED += [
+    "rclpy",
+    "networkx",
+    "pandas",
+    "dash",
+    "sympy",
+    "torch._dynamo",
+    "graspd_core.perception.reconstruct.reconstruct",
+]
+UNUSED += ["graspd_core.perception.segment.segment", "graspd_bench.suites"]
 
 LIBRARY = """
 from graspd_core import load_hand, load_scene, plan_grasps

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from graspd_core.cli import build_parser
-from graspd_core.formats.grasps_json import FORMAT, VERSION
-from graspd_core.methods.plan_config import load_preset
+from graspd_core.io.grasps_json import FORMAT, VERSION
+from graspd_core.optimize.plan_config import load_preset
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

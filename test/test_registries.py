@@ -11,18 +11,16 @@ import numpy as np
 import pytest
 from std_msgs.msg import Header
 
-from graspd_core.bench import tables
-from graspd_core.formats.grasps_json import result_document
-from graspd_core.formats.read_grasps import grasps_of
+from graspd_bench import tables
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.metrics.measure import measure
-from graspd_core.metrics.metric_registry import METRICS, Metric
-from graspd_core.metrics.metrics_context import make_metrics_context
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.trials.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
-from graspd_core.trials.world import PROTOCOLS, build_world
+from graspd_core.io.grasps_json import grasps_of, result_document
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
+from graspd_core.verify.metrics import METRICS, Metric, measure
+from graspd_core.verify.prepared_grasp import make_metrics_context
+from graspd_core.verify.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
+from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_ros.outputs.messages import grasp_message
 from graspd_ros.outputs.status_json import result_event
 from graspd_ros.outputs.trajectory import Pace

@@ -15,12 +15,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from graspd_core.arms.arm import Arm, arm_links, tip_hand
-from graspd_core.arms.capsules import Capsules, capsules_about, placed, segment_distance
+from graspd_core.arms.arm import Arm, Capsules, arm_links, capsules_about, placed, segment_distance, tip_hand
 from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
-from graspd_core.scene.scene import Scene
+from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3
 
 

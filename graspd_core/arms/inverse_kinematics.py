@@ -1,22 +1,118 @@
-"""Inverse kinematics of many poses at once: damped least squares within the joint limits.
+"""The tip of an arm and its Jacobian, in as few operations as can be: inverse kinematics is little else.
+
+The links between two joints are one constant, and the transform of a joint is that constant times Rodrigues' formula
+(`hands.kinematics`): a sum of matrices weighted with 1, sin q, cos q and, for slides, q. All joints of all postures are
+one product of matrices; what is left is one product a joint.
+
+Inverse kinematics of many poses at once: damped least squares within the joint limits.
 
 The damping follows the error's own square (T. Sugihara, Solvability-unconcerned inverse kinematics by the
 Levenberg-Marquardt method, IEEE T-RO 2011): strong far away and near singular postures, none at the end, where steps
 are Newton's. A joint at its limit that the step would push beyond is held there and the step is found without it.
+
+Postures of an arm all over its limits, and where its tip is in each: where to start, and what may be in reach.
+
+Near a pose that the arm can reach, some posture has its tip: inverse kinematics starts from the nearest ones. And no
+pose is in reach whose tip, or a point fixed to the tip, is nearer to the shoulder or farther from it than in any
+posture. Of hands drawn around objects at 0.3 to 0.95 m this keeps 99.3 and 99.7 % of those that the shipped arms reach,
+and 18 and 4 % of the others.
+
+Why a pose is out of reach: the joint whose limit is in the way, or that no posture gets there at all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from graspd_core.arms.arm import Arm
-from graspd_core.arms.tip_chain import tip_and_jacobian, tip_chain
+from graspd_core.arms.arm import Arm, arm_links, placed
+from graspd_core.arms.arm_collision import hits_of_self
 from graspd_core.se3 import SE3
+
+
+@dataclass(frozen=True)
+class TipChain:
+    """An arm's constants.
+
+    Attributes:
+        weighted: what 1, sin q, cos q and q of each joint are multiplied by: 4x4 transforms, flat.
+        axis: unit axis of each joint in the frame of the link that it moves.
+        slides: which joints are prismatic, as a column; None where none is.
+        tip: from the last joint's link to the tip.
+    """
+
+    weighted: Float[Tensor, "joints 4 16"]
+    axis: Float[Tensor, "joints 1 3 1"]
+    slides: Bool[Tensor, "joints 1 1"] | None
+    tip: Float[Tensor, "4 4"]
+
+
+# Arms are hashed by identity.
+@lru_cache(maxsize=8)
+def tip_chain(arm: Arm, dtype: torch.dtype = torch.float32) -> TipChain:
+    """The constants of an arm; made once."""
+    weighted, behind, chain = [], 0, arm.chain
+    for link in arm.moved_link.tolist():
+        offset = _welded(arm, behind, link)
+        weighted.append([offset @ part for part in _joint_parts(chain.joint_axis[link], chain.joint_kind[link])])
+        behind = link
+    # The tip is behind the last joint, its own offset included.
+    tip = np.eye(4) if behind == arm.tip else _welded(arm, behind, arm.tip)
+    slides = torch.as_tensor(chain.slides)[:, None, None] if chain.slides.any() else None
+    axis = torch.as_tensor(chain.joint_axis[arm.moved_link], dtype=dtype)[:, None, :, None]
+    parts = torch.as_tensor(np.array(weighted), dtype=dtype).flatten(2)
+    return TipChain(parts, axis, slides, torch.as_tensor(tip, dtype=dtype))
+
+
+def _welded(arm: Arm, above: int, link: int) -> Float[np.ndarray, "4 4"]:
+    """The constant part of the transform from one link to another below it, whose own joint is at zero."""
+    matrix = np.eye(4)
+    while link != above:
+        offset = np.eye(4)
+        offset[:3, :3] = arm.chain.link_offset_rotation[link]
+        offset[:3, 3] = arm.chain.link_offset_translation[link]
+        matrix, link = offset @ matrix, int(arm.chain.link_parent[link])
+    return matrix
+
+
+def _joint_parts(axis: Float[np.ndarray, "3"], kind: str) -> list[Float[np.ndarray, "4 4"]]:
+    """What 1, sin q, cos q and q are multiplied by in a joint's own transform."""
+    one, sine, cosine, slide = np.eye(4), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
+    if kind == "prismatic":
+        slide[:3, 3] = axis
+    else:
+        cross = np.cross(np.eye(3), axis).T * -1.0
+        sine[:3, :3], cosine[:3, :3] = cross, -cross @ cross
+        one[:3, :3] += cross @ cross
+    return [one, sine, cosine, slide]
+
+
+def tip_and_jacobian(chain: TipChain, q: Float[Tensor, "batch joints"]) -> tuple[SE3, Float[Tensor, "batch 6 joints"]]:
+    """`T_base_tip` at joint values q [rad] or [m], and the geometric Jacobian: velocity, then turning, base frame.
+
+    A revolute joint with axis a through o moves the tip x by `a × (x − o)` and turns it about a; a prismatic one moves
+    it by a.
+    """
+    values = q.T
+    weights = torch.stack([torch.ones_like(values), values.sin(), values.cos(), values], -1)
+    local = torch.bmm(weights, chain.weighted).unflatten(-1, (4, 4))
+    frames = [local[0]]
+    for joint in range(1, len(local)):
+        frames.append(torch.bmm(frames[-1], local[joint]))
+    tip = frames[-1] @ chain.tip
+    links = torch.stack(frames)
+    axis = (links[..., :3, :3] @ chain.axis).squeeze(-1)
+    velocity, turning = torch.linalg.cross(axis, tip[:, :3, 3] - links[..., :3, 3]), axis
+    if chain.slides is not None:
+        velocity, turning = torch.where(chain.slides, axis, velocity), torch.where(chain.slides, 0.0, axis)
+    return SE3(tip[:, :3, :3], tip[:, :3, 3]), torch.cat([velocity, turning], -1).permute(1, 2, 0)
+
 
 # A pose is reached when it is this near [m], [rad].
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
@@ -119,3 +215,135 @@ def _step(
     solved = torch.linalg.solve_ex(matrix, wrong)[0]
     change = (jacobian * solved[..., None]).sum(1)
     return change / (change.abs().amax(-1, keepdim=True) / _LONGEST_STEP).clamp_min(1.0)
+
+
+# Entries, of which those are dropped that would hit themselves.
+_ENTRIES = 4000
+# Points fixed to the tip whose distance from the shoulder is looked at, tip frame [m].
+_POINTS = [[0, 0, 0], [0, 0, -0.1], [0, 0, -0.2], [0.1, 0, -0.1], [-0.1, 0, -0.1], [0, 0.1, -0.1], [0, -0.1, -0.1]]
+# Metres that count as much as a change of one in an entry of the rotation matrix: 0.28 m a radian.
+_PER_ENTRY = 0.2
+
+
+@dataclass(frozen=True)
+class StartTable:
+    """Postures by the pose of the tip.
+
+    Attributes:
+        q: joint values [rad] or [m].
+        features: position and scaled rotation of the tip, base frame.
+        shoulder: the point of the first joint's axis that the second joint is nearest to, base frame [m].
+        away: distances of points fixed to the tip from the shoulder [m].
+        start, end: the ends of the arm's capsules, base frame [m].
+    """
+
+    q: Float[Tensor, "entries joints"]
+    features: Float[Tensor, "entries 12"]
+    shoulder: Float[Tensor, "3"]
+    away: Float[Tensor, "entries points"]
+    start: Float[Tensor, "entries capsules 3"]
+    end: Float[Tensor, "entries capsules 3"]
+
+
+# Arms are hashed by identity.
+@lru_cache(maxsize=8)
+def start_table(arm: Arm) -> StartTable:
+    """The table of an arm, made once; the same every time."""
+    q = _clear_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
+    links, shoulder = arm_links(arm, q), _shoulder(arm)
+    tip, (start, end, _) = links[:, arm.tip], placed(arm.capsules, links)
+    return StartTable(q, tip_features(tip), shoulder, _away(tip, shoulder), start, end)
+
+
+def _shoulder(arm: Arm) -> Float[Tensor, "3"]:
+    """See `StartTable`; of an arm with one joint the joint itself."""
+    links = arm_links(arm, torch.as_tensor(arm.seed)[None])[0]
+    first, second = arm.moved_link[0], arm.moved_link[min(1, len(arm.moved_link) - 1)]
+    axis = links.rotation[first] @ torch.as_tensor(arm.chain.joint_axis[first])
+    return links.translation[first] + axis * (axis @ (links.translation[second] - links.translation[first]))
+
+
+def _away(tip: SE3, shoulder: Float[Tensor, "3"]) -> Float[Tensor, "batch points"]:
+    return (tip.apply(torch.tensor(_POINTS, dtype=torch.float64)) - shoulder).norm(dim=-1)
+
+
+def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[Tensor, "count joints"]:
+    """Joint values drawn evenly within the limits, and within half a turn of the middle where those are wider."""
+    middle = 0.5 * (arm.lower + arm.upper)
+    half = np.where(arm.chain.slides, 0.5 * (arm.upper - arm.lower), np.minimum(0.5 * (arm.upper - arm.lower), np.pi))
+    drawn = 2.0 * torch.rand(count, len(middle), generator=generator, dtype=torch.float64) - 1.0
+    return torch.as_tensor(middle) + torch.as_tensor(half) * drawn
+
+
+def _clear_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[Tensor, "clear joints"]:
+    q = random_postures(arm, count, generator)
+    hits = hits_of_self(arm, arm_links(arm, q))
+    return q[(hits.depth <= 0).all(-1)] if hits.what else q
+
+
+def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
+    """Poses as vectors whose distance is that of position and rotation together [m]."""
+    return torch.cat([tip.translation, _PER_ENTRY * tip.rotation.flatten(-2)], -1).float()
+
+
+def nearest_postures(
+    table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
+) -> Float[Tensor, "batch count joints"]:
+    """Joint values of the entries nearest to poses `T_base_tip`, nearest first; of usable ones, where there are any."""
+    q, features = table.q, table.features
+    if usable is not None and usable.any():
+        q, features = q[usable], features[usable]
+    return q[torch.cdist(tip_features(tip), features).topk(min(count, len(q)), largest=False).indices]
+
+
+def reach_bounds(table: StartTable, usable: Bool[Tensor, "entries"]) -> Float[Tensor, "2 points"]:
+    """How far from the shoulder points fixed to the tip are at least and at most in usable postures [m]."""
+    away = table.away[usable] if usable.any() else table.away.new_full((1, len(_POINTS)), torch.nan)
+    return torch.stack([away.amin(0), away.amax(0)])
+
+
+def within_reach(table: StartTable, bounds: Float[Tensor, "2 points"], tip: SE3) -> Bool[Tensor, "batch"]:
+    """Which poses `T_base_tip` are within the bounds; none where no posture is usable."""
+    away = _away(tip, table.shoulder)
+    return ((away >= bounds[0]) & (away <= bounds[1])).all(-1)
+
+
+# Starts of each pose, and steps of each.
+_STARTS, _STEPS = 3, 10
+_TOO_FAR, _NOWHERE = "farther than the arm reaches", "that no posture of the arm reaches"
+
+
+def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -> list[str]:
+    """Why each of the poses `T_base_tip` is not reached; found without limits, from `start` and from near postures.
+
+    Of the postures that would get there the one counts that breaks its limits least, and of its joints the one that
+    breaks its own most. Empty where a posture within the limits gets there after all.
+    """
+    if not len(start):
+        return []
+    table = start_table(arm)
+    starts = torch.cat([start[:, None], nearest_postures(table, target, _STARTS - 1)], 1)
+    count = starts.shape[1]
+    solved = solve(
+        arm, target[torch.arange(len(start)).repeat_interleave(count)], starts.flatten(0, 1), _STEPS, limited=False
+    )
+    beyond = _beyond(arm, solved.q).unflatten(0, (-1, count))
+    total = torch.where(solved.reached.unflatten(0, (-1, count)), beyond.sum(-1), torch.inf)
+    longest = table.features[:, :3].norm(dim=-1).max()
+    reasons: list[str] = []
+    for row, which in enumerate(total.argmin(1).tolist()):
+        if total[row, which] == 0:
+            reasons.append("")
+        elif torch.isfinite(total[row, which]):
+            reasons.append(f"beyond {arm.joint_names[int(beyond[row, which].argmax())]}'s limit")
+        else:
+            reasons.append(_TOO_FAR if target.translation[row].norm() > longest else _NOWHERE)
+    return reasons
+
+
+def _beyond(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
+    """How far each joint is beyond its limits [rad] or [m], turned by full turns to where that is least."""
+    lower, upper = torch.as_tensor(arm.lower), torch.as_tensor(arm.upper)
+    turns = ((0.5 * (lower + upper) - q) / (2 * np.pi)).round() * (2 * np.pi)
+    q = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
+    return torch.maximum(q - upper, lower - q).clamp_min(0.0)

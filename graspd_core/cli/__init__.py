@@ -12,18 +12,17 @@ import time
 from collections.abc import Sequence
 from typing import NoReturn
 
-from graspd_core.cli import bench_command as bench
-from graspd_core.cli import dataset_command as dataset
+from graspd_bench import bench_command as bench
 from graspd_core.cli import hands_command as hands
-from graspd_core.cli import import_command as imports
 from graspd_core.cli import library_command as library
 from graspd_core.cli import reconstruct_command as reconstruct
 from graspd_core.cli import replay_command as replay
 from graspd_core.cli import synthesize_command as synthesize
-from graspd_core.cli import view_command as view
-from graspd_core.cli.deadline import process_began
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, process_began
 from graspd_core.errors import ConfigError, GraspdError
+from graspd_dataset import dataset_command as dataset
+from graspd_dataset import import_command as imports
+from graspd_viewer import view_command as view
 
 # New objects between two looks for garbage, by default 700. What libraries make when they are imported stays, and
 # looking through it takes a tenth of the time.

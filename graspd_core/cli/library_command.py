@@ -7,13 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graspd_core.cli.planning_options import add_planning_options, planning_options
+from graspd_core.cli.options import add_planning_options, planning_options
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.errors import ConfigError, MeshError
 
 if TYPE_CHECKING:
-    from graspd_core.library.grasp_library import GraspLibrary
-    from graspd_core.library.library_entry import LibraryEntry
+    from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry
 
 
 def add_command(commands: Any) -> None:
@@ -33,7 +32,7 @@ def add_command(commands: Any) -> None:
 
 def _build(options: argparse.Namespace) -> int:
     """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 after Ctrl-C."""
-    from graspd_core.bench.study import object_sources
+    from graspd_bench.study import object_sources
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
 
@@ -60,10 +59,10 @@ def _build(options: argparse.Namespace) -> int:
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
     """Plan what an object lacks and add it; how many grasps it has then."""
+    from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
-    from graspd_core.library.library_entry import entry_of
+    from graspd_core.perception.load_scene import load_scene
     from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.scene.load_scene import load_scene
 
     hand, config, request, stop = rest
     scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)

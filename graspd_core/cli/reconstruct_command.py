@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from graspd_core.cli.cloud_options import (
+from graspd_core.cli.options import (
     add_bag_options,
     add_object_options,
     check_bag_options,
@@ -30,10 +30,10 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Returns the exit status."""
-    from graspd_core.formats.grasps_json import check_writable
+    from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
-    from graspd_core.reconstruction.reconstruct import reconstruct
-    from graspd_core.segmentation.segment import segment
+    from graspd_core.perception.reconstruct.reconstruct import reconstruct
+    from graspd_core.perception.segment.segment import segment
 
     check_bag_options(options)
     check_writable(options.out)

@@ -10,29 +10,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graspd_core.cli.cloud_options import (
+from graspd_core.cli.options import (
     add_bag_options,
     add_object_options,
+    add_planning_options,
     bag_views,
     check_bag_options,
+    exit_status,
+    good_grasps,
     merged_views,
+    not_loaded,
+    planning_options,
     scene_config_of,
     target_of,
 )
-from graspd_core.cli.deadline import Deadline, DeadlinePassed
-from graspd_core.cli.planning_options import (
-    add_planning_options,
-    exit_status,
-    good_grasps,
-    not_loaded,
-    planning_options,
+from graspd_core.cli.running import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    EXIT_TOO_FEW,
+    Deadline,
+    DeadlinePassed,
+    Interrupt,
+    Reporter,
 )
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt, Reporter
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.transforms import SECOND
 from graspd_core.types import GraspResult
 
@@ -61,8 +67,8 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Returns the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no cloud of any use."""
-    from graspd_core.formats.grasps_json import check_writable
     from graspd_core.hands.library import load_hand
+    from graspd_core.io.grasps_json import check_writable
 
     config, request = planning_options(options)
     check_bag_options(options)
@@ -111,7 +117,7 @@ def _planned(
     job: _Job, options: argparse.Namespace, hand: HandModel, config: PlanConfig, request: dict[str, Any]
 ) -> GraspResult:
     """Grasps on what a job shows, written where that was asked for. Raises a GraspdError: it shows no usable object."""
-    from graspd_core.formats.grasps_json import save_result
+    from graspd_core.io.grasps_json import save_result
     from graspd_core.planning.plan_grasps import plan_grasps
 
     began = time.perf_counter()
@@ -148,7 +154,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
 
 def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
     """What the views of a job show. Raises a GraspdError: they show no usable object."""
-    from graspd_core.scene.scene_from_views import scene_from_views
+    from graspd_core.perception.load_scene import scene_from_views
 
     if job.refusal:
         raise CloudError(job.refusal)

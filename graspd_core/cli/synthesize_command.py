@@ -8,25 +8,27 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graspd_core.cli.cloud_options import add_object_options, scene_config_of, target_of
-from graspd_core.cli.deadline import Deadline, DeadlinePassed
-from graspd_core.cli.planning_options import (
+from graspd_core.cli.options import (
+    add_object_options,
     add_planning_options,
+    add_restriction_options,
     exit_status,
     good_grasps,
     not_loaded,
     planning_options,
+    restrictions_of,
+    scene_config_of,
     summary,
+    target_of,
 )
-from graspd_core.cli.restriction_options import add_restriction_options, restrictions_of
-from graspd_core.cli.running import Interrupt, Reporter
-from graspd_core.cli.view_command import add_address, watched
+from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Reporter
 from graspd_core.types import GraspResult
+from graspd_viewer.view_command import add_address, watched
 
 if TYPE_CHECKING:
     from graspd_core.hands.model import HandModel
-    from graspd_core.methods.plan_config import PlanConfig
-    from graspd_core.scene.scene import Scene
+    from graspd_core.optimize.plan_config import PlanConfig
+    from graspd_core.perception.scene import Scene
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 
@@ -50,10 +52,10 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Returns the exit status."""
-    from graspd_core.formats.grasps_json import check_writable
     from graspd_core.hands.library import load_hand
+    from graspd_core.io.grasps_json import check_writable
+    from graspd_core.perception.load_scene import load_scene
     from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.scene.load_scene import load_scene
 
     config, request = planning_options(options)
     request["restrictions"] = restrictions_of(options)
@@ -94,13 +96,13 @@ def _report(
     options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
 ) -> None:
     """Write what was found where that was asked for, and say it."""
-    from graspd_core.formats.grasps_json import save_result
-    from graspd_core.metrics.diversity import distinct
+    from graspd_core.io.grasps_json import save_result
+    from graspd_core.verify.metrics import distinct
 
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html:
-        from graspd_core.formats.grasp_page import save_view
+        from graspd_viewer.grasp_page import save_view
 
         save_view(options.html, scene.object.mesh, hand, result.grasps, name=Path(options.object).name)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))

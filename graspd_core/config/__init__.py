@@ -5,9 +5,14 @@ from __future__ import annotations
 import typing
 from typing import Literal
 
-from graspd_core.config.certainty_config import CertaintyConfig
 from graspd_core.config.mapping import from_mapping
-from graspd_core.config.planning_config import GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
+from graspd_core.config.planning_config import (
+    CertaintyConfig,
+    GraspStagesConfig,
+    ProblemConfig,
+    RobustConfig,
+    RoundsConfig,
+)
 from graspd_core.config.scene_config import (
     ObstacleConfig,
     ReconstructionConfig,

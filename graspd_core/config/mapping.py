@@ -1,4 +1,7 @@
-"""Config dataclasses from nested mappings, with errors that name the key."""
+"""Config dataclasses from nested mappings, with errors that name the key.
+
+YAML that a user wrote: what a page of it can stand for is bounded.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
+
+import yaml
 
 from graspd_core.errors import ConfigError, shown
 
@@ -45,7 +50,6 @@ def coerced(
 
 def read_yaml(path: Path) -> Any:
     """Read the values of a YAML file, an empty mapping for an empty one. Raises ConfigError: missing or malformed."""
-    from graspd_core.config.yaml_text import YamlError, parse_yaml
 
     try:
         _, values = parse_yaml(path.read_text(encoding="utf-8"))
@@ -87,3 +91,42 @@ def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
         raise ConfigError(f"{where}: expected {len(hints)} values, got {shown(value)}")
     pairs = enumerate(zip(hints, value, strict=True))
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
+
+
+# Entries of a mapping once what it merges is in it; each `<<` may take in all of another mapping, twice and again.
+_MOST_MERGED = 10_000
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, with an end to merging."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        super().flatten_mapping(node)
+        if len(node.value) > _MOST_MERGED:
+            problem = f"a mapping of more than {_MOST_MERGED} entries"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+
+
+def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
+    """The tree of a YAML text, which knows its lines, and the value that it stands for; both None where it is empty.
+
+    Raises:
+        ValueError: it is not well-formed, or has something in it that only looks like a value: one line says what, and
+            its attribute `line` where.
+    """
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)
+    # Beside its own errors the library lets through whatever a value brings about that is not what its tag or its looks
+    # say: a date of a thirteenth month, a number without end, `!!timestamp x`.
+    except Exception as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or getattr(error, "reason", None) or type(error).__name__
+        raise YamlError(mark.line + 1 if mark else 1, " ".join(str(problem).split())[:200]) from error
+
+
+class YamlError(ValueError):
+    """What is wrong with a YAML text, and in which line of it."""
+
+    def __init__(self, line: int, problem: str) -> None:
+        super().__init__(f"line {line}: {problem}")
+        self.line, self.problem = line, problem

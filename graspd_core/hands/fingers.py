@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.hands.kinematics import in_base, link_poses, point_jacobian
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.primitive_surface import surface_points
+from graspd_core.hands.surface_points import surface_points
 
 # Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
 # the fourth leave a half, three around a circle or two against one leave a third or less.

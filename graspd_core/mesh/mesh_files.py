@@ -1,8 +1,15 @@
-"""Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres."""
+"""Sizes that a hand's object can have, and guesses at the unit of a file: offered in messages, never applied.
+
+Files that hold no mesh, or half of one: a pointer, a picture, an archive, what a transfer cut off.
+
+Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import os
+from math import ceil, log, log10
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +18,9 @@ from jaxtyping import Float
 from torch.quasirandom import SobolEngine
 
 from graspd_core.errors import MeshError
-from graspd_core.mesh.broken_files import refuse_broken
 from graspd_core.mesh.collada import read_dae
-from graspd_core.mesh.small_components import drop_small_components, face_components
+from graspd_core.mesh.components import drop_small_components, face_components
+from graspd_core.mesh.surface_queries import winding_inside
 from graspd_core.mesh.topology import (
     drop_degenerate,
     drop_repeated,
@@ -25,9 +32,114 @@ from graspd_core.mesh.topology import (
     moved_mesh,
     orient,
 )
-from graspd_core.mesh.units import LARGE, LARGEST, SMALL, SMALLEST, unit_advice
-from graspd_core.mesh.winding_number import winding_inside
 from graspd_core.types import TriangleMesh
+
+# The largest extent that a mesh may have [m]: what lies outside is a mistake of units, not a thing to grasp.
+SMALLEST, LARGEST = 0.002, 2.0
+# Outside this [m] a size is allowed, and doubted aloud.
+SMALL, LARGE = 0.008, 0.5
+# A graspable thing is about this large [m], and within this ratio of it.
+USUAL, SPREAD = 0.12, 6.0
+
+# What would turn a file's coordinates into metres: the number that library, command line and node take, the option that
+# says the same, and the factor.
+REMEDIES = {
+    "scale 0.001 (--units mm)": 1e-3,
+    "scale 0.01 (--units cm)": 1e-2,
+    "scale 0.0254 (--units inch)": 0.0254,
+    "scale 0.1": 0.1,
+}
+
+
+def unit_advice(size: float, scale: float = 1.0) -> str:
+    """What to pass so that a thing of `size` [m] across becomes one that a hand can grasp, the likeliest first.
+
+    Args:
+        scale: what was passed already; the advice is to pass something else in its stead.
+    """
+    # Of absurd numbers, whose ratio overflows, too.
+    given = min(max(size / scale, 1e-200), 1e200)
+    remedies = REMEDIES if scale == 1 else {"scale 1": 1.0} | REMEDIES
+    likely = sorted(remedies, key=lambda option: _strangeness(given * remedies[option]))
+    kept = {option: remedies[option] for option in likely if _strangeness(given * remedies[option]) < log(SPREAD)}
+    if not kept:
+        # No unit that files come in: scaled once too often, or for another purpose.
+        factor = 10.0 ** ceil(log10(USUAL / given) - 0.5)
+        kept = {f"scale {factor:g}": factor}
+    return ", ".join(f"{option} makes it {_length(given * factor)}" for option, factor in kept.items())
+
+
+def _strangeness(size: float) -> float:
+    return abs(log(size / USUAL))
+
+
+def _length(size: float) -> str:
+    return f"{1000 * size:.3g} mm" if size < 1 else f"{size:.3g} m"
+
+
+# How other things begin that come under a mesh's name.
+_OTHERS = (
+    (b"version https://git-lfs", "a git-LFS pointer to the mesh, not the mesh; `git lfs pull` fetches it"),
+    (b"\x89PNG", "a PNG picture, not a mesh"),
+    (b"\xff\xd8\xff", "a JPEG picture, not a mesh"),
+    (b"GIF8", "a GIF picture, not a mesh"),
+    (b"%PDF", "a PDF document, not a mesh"),
+    (b"PK\x03\x04", "a ZIP archive, not a mesh; unpack it first"),
+    (b"\x1f\x8b", "a gzip archive, not a mesh; unpack it first"),
+    (b"<!doctype html", "a page of HTML, not a mesh"),
+    (b"<html", "a page of HTML, not a mesh"),
+)
+# What is looked at of either end [bytes].
+_LOOK = 4096
+# A binary STL: its header with the number of triangles, and each triangle [bytes]; more of them nobody writes.
+_HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
+
+
+def refuse_broken(path: Path) -> None:
+    """Raise MeshError for a file that is something else than a mesh, or an STL or OBJ that was cut off."""
+    with path.open("rb") as file:
+        head = file.read(_LOOK)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _LOOK))
+        tail = file.read()
+    if size == 0:
+        raise MeshError(f"{path}: an empty file")
+    for begins, what in _OTHERS:
+        if head.lstrip()[: len(begins)].lower() == begins.lower():
+            raise MeshError(f"{path}: {what}")
+    ending = path.suffix.lower()
+    cut = _cut_stl(head, tail, size) if ending == ".stl" else _cut_obj(tail) if ending == ".obj" else ""
+    if cut:
+        raise MeshError(f"{path}: cut off: {cut}")
+
+
+def _cut_stl(head: bytes, tail: bytes, size: int) -> str:
+    if head.lstrip().lower().startswith(b"solid") and (b"facet" in head or size < _HEADER):
+        return "" if b"endsolid" in tail.lower() else "it has no endsolid"
+    if size < _HEADER:
+        return f"{size} bytes, less than the header of an STL"
+    triangles = int.from_bytes(head[_HEADER - 4 : _HEADER], "little")
+    there = (size - _HEADER) // _TRIANGLE
+    return f"{there} of {triangles} triangles are there" if there < triangles <= _MOST_TRIANGLES else ""
+
+
+def _cut_obj(tail: bytes) -> str:
+    """What of its last line is missing, where it has no end; a file may leave out the last line's end alone."""
+    line = tail.replace(b"\r", b"\n").rpartition(b"\n")[2].decode("utf-8", errors="replace")
+    words = line.split()
+    if not words or words[0] not in ("v", "vn", "f"):
+        return ""
+    whole = len(words) >= 4 and (words[0] == "f" or all(map(_is_number, words[1:])))
+    return "" if whole else f"it ends in the middle of a line, {line.strip()[:60]!r}"
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
 
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
 

@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from graspd_core.mesh.surface_queries import Surface, closest_points, make_surface
+from graspd_core.mesh.surface_queries import Surface, closest_points, make_surface, winding_inside
 from graspd_core.mesh.topology import is_closed
-from graspd_core.mesh.winding_number import winding_inside
 from graspd_core.se3 import EPSILON, safe_norm
 from graspd_core.types import TriangleMesh
 

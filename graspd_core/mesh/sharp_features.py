@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.mesh.mesh_distance import DistanceQuery, make_distance_query, signed_distance
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.unique_rows import packed_rows
+from graspd_core.mesh.surface_queries import DistanceQuery, make_distance_query, signed_distance
+from graspd_core.mesh.topology import packed_rows
 from graspd_core.types import TriangleMesh
 
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.

@@ -20,8 +20,8 @@ from jaxtyping import Float
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.unique_rows import packed_rows
-from graspd_core.scene.scene import Scene
+from graspd_core.mesh.topology import packed_rows
+from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Verdict
 
 # The roughest surface that a trial believes in; see `trials.world.at_friction`.

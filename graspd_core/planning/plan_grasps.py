@@ -1,4 +1,7 @@
-"""Plan grasps: a scene and a hand in, ranked and verified grasps out."""
+"""The scene that a run plans on: about its object, on the grid that the settings ask for.
+
+Plan grasps: a scene and a hand in, ranked and verified grasps out.
+"""
 
 from __future__ import annotations
 
@@ -10,25 +13,67 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import GridSDF, grid_layout
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.plan_config import PlanConfig, load_preset
-from graspd_core.methods.restrictions import BoundRestrictions, Restriction, restrictions_in_words
+from graspd_core.optimize.plan_config import PlanConfig, load_preset
+from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.scene import (
+    Scene,
+    moved_grasp,
+    moved_obstacle,
+    moved_plane,
+    moved_sdf,
+    near_object,
+    object_sdf,
+    sample_confidence,
+)
 from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
-from graspd_core.planning.planning_scene import planning_scene
-from graspd_core.planning.planning_worker import start_planning_worker
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
-from graspd_core.planning.run_clock import Run
-from graspd_core.planning.verification import rank_by_robustness, trials_ahead
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.scene.far_objects import moved_grasp
-from graspd_core.scene.scene import Scene
+from graspd_core.runtime.worker_process import start_planning_worker
 from graspd_core.types import Grasp, GraspResult, Outcome, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
+from graspd_core.verify.run_clock import Run
+from graspd_core.verify.verification import rank_by_robustness, trials_ahead
+
+
+def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
+    """The scene as it is planned on, and where its origin lies in the scene given [m].
+
+    The origin is another one for an object farther from it than a hundred times its size: float32 could not tell a
+    contact there from a gap. A distance grid of another resolution is built anew. Where neither is so, this is the
+    scene itself.
+
+    Raises:
+        ConfigError: no such resolution.
+    """
+    if not 8 <= resolution <= 256:
+        raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
+    model, far = near_object(scene.object)
+    as_asked = tuple(scene.sdf.field.shape[1:]) == grid_layout(model.mesh, resolution).counts
+    if as_asked and not far.any():
+        return scene, far
+    sdf = object_sdf(model, resolution).to(scene.sdf.field.device, scene.sdf.field.dtype)
+    confidence = scene.confidence
+    if confidence is not None and not as_asked:
+        confidence = sample_confidence(confidence, moved_sdf(scene.sdf, -far), _nodes(sdf)).reshape(sdf.field.shape[1:])
+    support = scene.support and moved_plane(scene.support, -far)
+    obstacles = tuple(moved_obstacle(obstacle, -far) for obstacle in scene.obstacles)
+    evidence = scene.evidence and replace(scene.evidence, origin=scene.evidence.origin - far)
+    changed = {"support": support, "obstacles": obstacles, "confidence": confidence, "evidence": evidence}
+    return replace(scene, object=model, sdf=sdf, **changed), far
+
+
+def _nodes(sdf: GridSDF) -> Float[Tensor, "x yz 3"]:
+    x, y, z = sdf.field.shape[1:]
+    index = torch.cartesian_prod(*(torch.arange(n) for n in (x, y, z))).to(sdf.field)
+    return (sdf.origin + sdf.spacing * index).reshape(x, y * z, 3)
 
 
 def plan_grasps(
@@ -131,7 +176,7 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
         return result
     told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None
     if scene.evidence.hidden:
-        from graspd_core.reconstruction.next_view import next_view
+        from graspd_core.perception.reconstruct.hidden_side import next_view
 
         told += ", since a part of the object was guessed"
         view = next_view(scene.evidence, scene.object.mesh, far)
@@ -176,7 +221,7 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
     done in a child process, since threads beside would stand still meanwhile.
     """
-    from graspd_core.scene.scene_from_views import scene_from_views
+    from graspd_core.perception.load_scene import scene_from_views
 
     start_planning_worker()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])

@@ -1,21 +1,26 @@
-"""Rounds of optimiser and trials: how much effort each takes, and what they find."""
+"""Too little memory is a named failure, whichever library meets it.
+
+Rounds of optimiser and trials: how much effort each takes, and what they find.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+from graspd_core.errors import ResourceError
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.restrictions import UNRESTRICTED, BoundRestrictions
-from graspd_core.planning.memory_errors import enough_memory
-from graspd_core.planning.run_clock import Run
-from graspd_core.planning.verification import (
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.loop import Hooks, Poses
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
+from graspd_core.perception.scene import Scene
+from graspd_core.types import AuditCount, Grasp, Snapshot, Stage
+from graspd_core.verify.run_clock import Run
+from graspd_core.verify.verification import (
     TrialsAhead,
     TriedGrasps,
     VerificationContext,
@@ -24,8 +29,22 @@ from graspd_core.planning.verification import (
     run_trials,
     surest_first,
 )
-from graspd_core.scene.scene import Scene
-from graspd_core.types import AuditCount, Grasp, Snapshot, Stage
+
+# What torch says where it finds no memory, on the processor and on CUDA; it raises a RuntimeError for both.
+_TORCH_SAYS = ("can't allocate memory", "not enough memory", "out of memory")
+
+
+@contextmanager
+def enough_memory(asked: str) -> Iterator[None]:
+    """Raise ResourceError for `asked` where the work inside runs out of memory."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError) or any(words in str(error) for words in _TORCH_SAYS):
+            raise ResourceError(
+                f"{asked}: not enough memory; ask for fewer grasps, or a preset of less effort"
+            ) from None
+        raise
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:

@@ -3,6 +3,8 @@
 Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`); `GRASPD_CACHE=off` keeps everything in memory. A file
 that cannot be read back whole is built again, and a disk that cannot be written is done without. Clouds are never the
 same twice, so that a node that sees them would fill the disk: the files not used for longest give way.
+
+Files that appear whole or not at all.
 """
 
 from __future__ import annotations
@@ -137,3 +139,17 @@ def _prune(directory: Path) -> None:
             break
         path.unlink(missing_ok=True)
         total -= size
+
+
+def save_bytes(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all; makes missing directories."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise

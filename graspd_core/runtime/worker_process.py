@@ -1,8 +1,12 @@
-"""Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
+"""Memory that was freed, back to the system: for processes that serve for days.
+
+Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
 
 A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child.
 All others, the command line among them, do it themselves. The child is a bare interpreter, not one of
 multiprocessing's, which would import the user's main module again: a script without a guard, or none, as in a notebook.
+
+The child process of a process that serves: cheap to import, so that it can be started before all else.
 """
 
 from __future__ import annotations
@@ -24,7 +28,31 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, TypeVar
 
-from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
+# glibc's mallopt: how many arenas there may be.
+_M_ARENA_MAX, _ARENAS = -8, 2
+
+
+def trim_heap() -> None:
+    """Let the C library return what was freed (glibc keeps it, scattered, for later); others do so by themselves."""
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (OSError, AttributeError, TypeError):  # no glibc
+        return
+    trim(ctypes.c_size_t(0))
+
+
+def limit_malloc_arenas() -> None:
+    """Let all threads allocate from two arenas, from now on; glibc only.
+
+    Else every thread that ever allocated holds freed memory of its own that no other thread can use, and a process with
+    many threads grows for as long as they come upon their largest work by turns.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    mallopt(_M_ARENA_MAX, _ARENAS)
+
 
 T = TypeVar("T")
 
@@ -214,3 +242,12 @@ def _answer(call: bytes) -> bytes:
         except Exception:  # an error that cannot travel
             answer = pickle.dumps((True, RuntimeError(f"{type(error).__name__}: {error}")))
         return answer
+
+
+# What the child's work imports: all of a scene from clouds and of other shapes, and the library behind them.
+_MODULES = ("graspd_core.perception.load_scene", "graspd_core.verify.robustness", "open3d")
+
+
+def start_planning_worker() -> None:
+    """Start the child process, if there is none yet; it imports what it needs beside what this process does."""
+    start_worker_process(*_MODULES)

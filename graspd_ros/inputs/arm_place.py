@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from graspd_core import Arm, Reach, load_arm
-from graspd_core.arms.arm_file import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
+from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
 from graspd_core.errors import ConfigError
 from graspd_ros.inputs.frames import pose_of_matrix
 from graspd_ros.inputs.requests import Request

@@ -16,7 +16,7 @@ from jaxtyping import Bool
 from sensor_msgs.msg import Image
 
 from graspd_core import PointCloud
-from graspd_core.pointcloud.viewpoint_check import check_viewpoint
+from graspd_core.perception.cloud.viewpoint_check import check_viewpoint
 from graspd_ros.inputs.sensor_frames import CLOUD, SensorFrame
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings

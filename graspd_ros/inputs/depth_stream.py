@@ -11,8 +11,8 @@ from jaxtyping import Float
 from sensor_msgs.msg import CameraInfo, Image
 
 from graspd_core import PinholeCamera
-from graspd_core.bags import messages
 from graspd_core.errors import CloudError
+from graspd_core.io import bags as messages
 
 SECOND = 1_000_000_000
 

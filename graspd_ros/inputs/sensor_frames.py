@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core import PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
-from graspd_core.bags.messages import pixels_from_message, points_from_message
 from graspd_core.config import load_scene_config
-from graspd_core.planning.hypotheses import begin_other_shape
-from graspd_core.pointcloud.camera import camera_rays
-from graspd_core.pointcloud.point_cloud import transform_cloud
+from graspd_core.io.bags import pixels_from_message, points_from_message
+from graspd_core.perception.cloud.camera import camera_rays
+from graspd_core.perception.cloud.point_cloud import transform_cloud
+from graspd_core.verify.robustness import begin_other_shape
 from graspd_ros.inputs.depth_stream import frame_of
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from shape_msgs.msg import SolidPrimitive
 
 from graspd_core import Box, NearPoints, Sphere, Steering
-from graspd_core.planning.steering.steering import zero_of_roll
+from graspd_core.planning.steering import zero_of_roll
 from graspd_ros.inputs.frames import pose_of_matrix
 from graspd_ros.inputs.requests import pose_matrix
 from graspd_ros.outputs.error_codes import ErrorCode, RequestError

@@ -16,8 +16,8 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from graspd_core.formats.grasps_json import grasp_figures
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
+from graspd_core.io.grasps_json import grasp_figures
 from graspd_core.types import Grasp, GraspResult, Posture, Progress, Verdict
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from graspd_core.arms.arm import Arm
-from graspd_core.arms.arm_file import arm_names, load_arm
+from graspd_core.arms.arm import Arm, arm_names, load_arm
 
 
 @pytest.fixture(scope="session", params=arm_names())

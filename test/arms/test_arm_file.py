@@ -10,10 +10,9 @@ import torch
 import yaml
 
 from graspd_core import load_hand
-from graspd_core.arms.arm import Arm, arm_links, tip_hand
+from graspd_core.arms.arm import Arm, arm_links, arm_names, load_arm, tip_hand
 from graspd_core.arms.arm_collision import hits_of_self
-from graspd_core.arms.arm_file import arm_names, load_arm
-from graspd_core.arms.start_table import start_table
+from graspd_core.arms.inverse_kinematics import start_table
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.paths import config_dir
 

@@ -10,18 +10,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.arms.arm import Arm, arm_links
-from graspd_core.arms.arm_file import load_arm
-from graspd_core.arms.capsules import capsules_about
+from graspd_core.arms.arm import Arm, arm_links, capsules_about, load_arm
 from graspd_core.arms.inverse_kinematics import (
     POSITION_TOLERANCE,
     ROTATION_TOLERANCE,
+    nearest_postures,
     pose_error,
+    random_postures,
     rotation_vector,
     solve,
+    start_table,
+    tip_and_jacobian,
+    tip_chain,
 )
-from graspd_core.arms.start_table import nearest_postures, random_postures, start_table
-from graspd_core.arms.tip_chain import tip_and_jacobian, tip_chain
 from graspd_core.hands.readers.build_model import LinkSpec, assemble
 from graspd_core.hands.readers.joint_limits import JointSpec
 from graspd_core.se3 import SE3, axis_rotation, random_rotations

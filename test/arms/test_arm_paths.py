@@ -10,18 +10,16 @@ import pytest
 import torch
 
 from graspd_core import load_hand, load_scene, make_shape
-from graspd_core.arms.arm import Arm, arm_links, tip_hand
+from graspd_core.arms.arm import Arm, arm_links, placed, tip_hand
 from graspd_core.arms.arm_collision import hits_of_hand, hits_of_scene, hits_of_self, hits_of_support
-from graspd_core.arms.arm_paths import LARGEST_JUMP, ArmTask, arm_paths, make_task
-from graspd_core.arms.capsules import placed
-from graspd_core.arms.hand_way import LIFT, RETREAT, STAGE_ROWS, hand_ways
-from graspd_core.arms.start_table import random_postures
+from graspd_core.arms.arm_paths import LARGEST_JUMP, LIFT, RETREAT, STAGE_ROWS, ArmTask, arm_paths, hand_ways, make_task
+from graspd_core.arms.inverse_kinematics import random_postures
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf
-from graspd_core.methods import obstacle_distance
-from graspd_core.scene.scene import Obstacle, Scene
+from graspd_core.optimize import obstacle_distance
+from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, quaternion_from_rotation
 from graspd_core.types import ARM_STAGES, ArmPath, Grasp, Plane, Posture, TriangleMesh
 

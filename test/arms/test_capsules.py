@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from graspd_core.arms.capsules import capsules_about, segment_distance
+from graspd_core.arms.arm import capsules_about, segment_distance
 from graspd_core.hands.model import Primitive, PrimitiveKind
 from graspd_core.se3 import axis_rotation
 

@@ -17,12 +17,19 @@ from bag_writer import (
     write_bag,
 )
 
-from graspd_core.bags.messages import camera_from_message, points_from_message
-from graspd_core.bags.reader import bag_topics, is_bag, read_frames, read_raw, read_transforms
+from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import BagError, CloudError, TransformError
+from graspd_core.io.bags import (
+    bag_topics,
+    camera_from_message,
+    is_bag,
+    points_from_message,
+    read_frames,
+    read_raw,
+    read_transforms,
+)
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.rendering.render import look_at, render_depth
+from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5, (0.1, -0.2, 0.001, -0.001, 0.05))

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from graspd_core.bench import run_studies
-from graspd_core.bench.result_store import read_results
-from graspd_core.bench.run_cases import Job
+from graspd_bench import run_studies
+from graspd_bench.result_store import read_results
+from graspd_bench.run_studies import Job
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 

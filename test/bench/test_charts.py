@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from graspd_core.bench.charts import chart_style as charts_style
-from graspd_core.bench.charts import speed_chart as charts
-from graspd_core.bench.figures import by_name, rows
-from graspd_core.bench.studies.robust_ranking import draw_robust
+from graspd_bench import charts
+from graspd_bench import charts as charts_style
+from graspd_bench.figures import by_name, rows
+from graspd_bench.studies.robust_ranking import draw_robust
 
 ENDS = ("_short", "_planned", "_ladder")
 

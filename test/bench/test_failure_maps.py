@@ -11,25 +11,31 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.bench.charts.failure_map_chart import Shares, draw_map, map_sections, reasons, shares
-from graspd_core.bench.failure_maps import map_runs
-from graspd_core.bench.failure_maps.map_case import MapCase, hand_for, run_on
-from graspd_core.bench.failure_maps.map_registry import (
+from graspd_bench import failure_maps as map_runs
+from graspd_bench.failure_maps import (
     COUNT,
     MAPS,
     METHODS,
     SEEDS,
     MapAxis,
+    MapCase,
+    Shares,
     cases_of,
+    draw_map,
+    hand_for,
     map_cases,
+    map_sections,
+    reasons,
     run_map,
+    run_on,
+    shares,
 )
-from graspd_core.bench.study import Request
+from graspd_bench.rendering.depth_noise import DEFAULT, NONE
+from graspd_bench.study import Request
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import BOX_HALF, make_shape
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.feasibility import kind_of
-from graspd_core.rendering.depth_noise import DEFAULT, NONE
-from graspd_core.scene.load_scene import load_scene
 
 TINY = MapCase("size", "random_closure", "sphere", 0.2, ("sphere",), 1, 0)
 

@@ -10,12 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from graspd_core.bench import report, tables
-from graspd_core.bench.comparison import comparison, moves
-from graspd_core.bench.figures import by_name, pareto_front, per_verified, rows, spread
-from graspd_core.bench.names import parent_of, short_name
+from graspd_bench import tables
+from graspd_bench import tables as report
+from graspd_bench.figures import (
+    by_name,
+    comparison,
+    moves,
+    parent_of,
+    pareto_front,
+    per_verified,
+    rows,
+    short_name,
+    spread,
+)
 from graspd_core.errors import ConfigError
-from graspd_core.metrics.metric_registry import METRICS, Metric
+from graspd_core.verify.metrics import METRICS, Metric
 
 # Small whole numbers, so that points are often equal on an axis.
 POINTS = arrays(np.float64, st.tuples(st.integers(1, 12), st.integers(1, 3)), elements=st.integers(0, 5).map(float))

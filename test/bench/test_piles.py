@@ -9,18 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.bench.piles.clear_pile import BLOCKED, CLEARED, DROPPED, NO_GRASP, run_pile
-from graspd_core.bench.piles.pile_case import (
+from graspd_bench.rendering.tabletop import TABLE_HALF
+from graspd_bench.studies.piles import (
+    BLOCKED,
+    CLEARED,
+    DROPPED,
+    NO_GRASP,
     PileCase,
     drawn_things,
     dropped_pile,
+    film_strip,
     pile_cases,
+    pile_sections,
+    run_pile,
     seen_pile,
 )
-from graspd_core.bench.piles.pile_report import film_strip, pile_sections
-from graspd_core.bench.study import Request
+from graspd_bench.study import Request
 from graspd_core.errors import ConfigError
-from graspd_core.rendering.tabletop import TABLE_HALF
 
 SHAPES = ("shape:box", "shape:cylinder", "shape:l_block")
 

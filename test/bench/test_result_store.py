@@ -12,15 +12,14 @@ from typing import Any
 
 import pytest
 
-from graspd_core.bench import result_store as store
-from graspd_core.bench.measurements.measurement import Cell, run_cell
-from graspd_core.bench.run_cases import ENVIRONMENT, Job, run_cases, run_job
-from graspd_core.bench.study import Case, find_objects
+from graspd_bench import result_store as store
+from graspd_bench.measurement import Cell, run_cell
+from graspd_bench.run_studies import ENVIRONMENT, Job, run_cases, run_job
+from graspd_bench.study import Case, find_objects
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.method_registry import METHODS
-from graspd_core.methods.plan_config import PlanConfig, load_preset, override, to_mapping
+from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, to_mapping
 from graspd_core.types import TriangleMesh
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "allegro_right", 0, 4, ("standard", "hard"))
@@ -30,8 +29,8 @@ CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "allegro_right", 0, 4,
 ERRANDS = """
 import os, time
 from dataclasses import dataclass
-from graspd_core.bench.run_cases import ENVIRONMENT
-from graspd_core.bench.study import Case
+from graspd_bench.run_studies import ENVIRONMENT
+from graspd_bench.study import Case
 
 @dataclass(frozen=True)
 class Errand(Case):

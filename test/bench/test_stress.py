@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from graspd_core.bench.result_store import head, write_record
-from graspd_core.bench.run_cases import Job, run_cases
-from graspd_core.bench.stress.run_stress_case import GRASP, StressEnding, faults, run_case
-from graspd_core.bench.stress.stress_cases import (
+from graspd_bench.result_store import head, write_record
+from graspd_bench.run_studies import Job, run_cases
+from graspd_bench.stress.run_stress_case import GRASP, StressEnding, faults, run_case
+from graspd_bench.stress.stress_cases import (
     CASES,
     StressRun,
     ending_of,
@@ -22,7 +22,7 @@ from graspd_core.bench.stress.stress_cases import (
     stress_table,
     summary,
 )
-from graspd_core.bench.study import Request
+from graspd_bench.study import Request
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
 from graspd_core.errors import ConfigError

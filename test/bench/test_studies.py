@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.bench.report import sourced, written
-from graspd_core.bench.result_store import case_file, case_key, code_version
-from graspd_core.bench.run_cases import Job, run_job
-from graspd_core.bench.run_studies import make_plan, studies_of
-from graspd_core.bench.studies.human_hand import SOFTNESS
-from graspd_core.bench.study import Request
-from graspd_core.bench.study_registry import STUDIES
+from graspd_bench.result_store import case_file, case_key, code_version
+from graspd_bench.run_studies import Job, make_plan, run_job, studies_of
+from graspd_bench.studies.human_hand import SOFTNESS
+from graspd_bench.study import Request
+from graspd_bench.study_registry import STUDIES
+from graspd_bench.tables import sourced, written
 from graspd_core.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from graspd_core.cli import main
-from graspd_core.cli.planning_options import summary
+from graspd_core.cli.options import summary
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
-from graspd_core.formats.read_grasps import load_document, load_grasps
+from graspd_core.io.grasps_json import load_document, load_grasps
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.plan_config import preset_names
+from graspd_core.optimize.plan_config import preset_names
 from graspd_core.planning import plan_grasps as pipeline
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, TriangleMesh
 

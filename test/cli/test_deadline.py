@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.cli.deadline import Deadline, DeadlinePassed, process_began
-from graspd_core.cli.running import EXIT_TOO_FEW
+from graspd_core.cli.running import EXIT_TOO_FEW, Deadline, DeadlinePassed, process_began
 
 LATE = "0 of 2 grasps (verified, 0 tried): the deadline passed"
 
@@ -117,9 +116,7 @@ def test_no_time_left_is_still_a_time():
 
 
 def test_a_process_knows_when_it_began():
-    age = (
-        "import time; from graspd_core.cli.deadline import process_began; print(time.perf_counter() - process_began())"
-    )
+    age = "import time; from graspd_core.cli.running import process_began; print(time.perf_counter() - process_began())"
     begun = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-c", f"import time; time.sleep(1); {age}"], capture_output=True, text=True, check=True

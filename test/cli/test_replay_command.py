@@ -17,14 +17,14 @@ from bag_writer import (
     write_bag,
 )
 
-from graspd_core.cli import cloud_options as clouds
+from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.cli import main
+from graspd_core.cli import options as clouds
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
-from graspd_core.formats.read_grasps import load_document
+from graspd_core.io.grasps_json import load_document
 from graspd_core.mesh.mesh_files import load_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.rendering.render import look_at, render_depth
+from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 
 CAMERA = PinholeCamera(160, 120, 190.0, 190.0, 79.5, 59.5, (0.05, -0.1))

@@ -9,8 +9,8 @@ import pytest
 
 from graspd_core.config import SegmentationConfig, from_mapping
 from graspd_core.errors import ConfigError
-from graspd_core.methods.closed_form.closed_form_config import LossWeights
-from graspd_core.methods.plan_config import PlanConfig, load_preset, plan_config, preset_names, to_mapping
+from graspd_core.optimize.closed_form.closed_form_config import LossWeights
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, plan_config, preset_names, to_mapping
 
 
 @pytest.mark.parametrize("name", preset_names())

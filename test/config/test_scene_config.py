@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import yaml
 
+from graspd_bench.rendering.depth_noise import NONE
+from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core.config import SceneConfig, load_scene_config
 from graspd_core.errors import ConfigError
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.reconstruct import reconstruct
-from graspd_core.rendering.depth_noise import NONE
-from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
-from graspd_core.scene.obstacles import make_obstacles
-from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.segmentation.segment import segment
-from graspd_core.segmentation.target_selection import Target
+from graspd_core.perception.cloud.camera import PinholeCamera
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.obstacles import make_obstacles
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.target_selection import Target
 
 PAGE = Path(__file__).parents[2] / "docs" / "clouds.md"
 PARTS = [(part.name, getattr(SceneConfig(), part.name)) for part in dataclasses.fields(SceneConfig)]

@@ -10,8 +10,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.contact.free_body import FreeBody, euler_step, make_body, net_wrench, speed_left
-from graspd_core.contact.penalty_forces import contact_forces
+from graspd_core.optimize.graspd2022.contact_dynamics import (
+    FreeBody,
+    contact_forces,
+    euler_step,
+    make_body,
+    net_wrench,
+    speed_left,
+)
 
 MASS, RADIUS, STEP = 0.1, 0.03, 1e-5
 INERTIA = 0.4 * MASS * RADIUS**2

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.contact.penalty_forces import contact_forces, leaky_min
+from graspd_core.optimize.graspd2022.contact_dynamics import contact_forces, leaky_min
 from graspd_core.se3 import random_rotations
 
 PUBLISHED = {"stiffness": 1e6, "friction_stiffness": 1e8, "friction": 0.8}

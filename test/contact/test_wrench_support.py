@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
+from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.se3 import random_rotations
 
 FRICTION = 0.6

@@ -15,11 +15,11 @@ os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "token", "RAY_AU
 
 from ray.cluster_utils import Cluster
 
-from graspd_core.dataset.blocks import DatasetRequest, blocks_of
-from graspd_core.dataset.dataset_store import DatasetStore
-from graspd_core.dataset.guarded_calls import Limits
-from graspd_core.dataset.ray_engine import RayEngine, ray_running
-from graspd_core.dataset.run_dataset import missing_blocks, run_blocks
+from graspd_dataset.blocks import DatasetRequest, blocks_of
+from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.guarded_calls import Limits
+from graspd_dataset.ray_engine import RayEngine, ray_running
+from graspd_dataset.run_dataset import missing_blocks, run_blocks
 
 
 def main(out: str) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.dataset.blocks import Block, blocks_of
-from graspd_core.dataset.dataset_store import DatasetStore
+from graspd_dataset.blocks import Block, blocks_of
+from graspd_dataset.dataset_store import DatasetStore
 
 sys.path.insert(0, str(Path(__file__).parent))
 from small_dataset import REQUEST, make_here

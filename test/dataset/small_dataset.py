@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from graspd_core.dataset import block_rows
-from graspd_core.dataset.blocks import Block, DatasetRequest
-from graspd_core.dataset.dataset_store import DatasetStore, block_path
-from graspd_core.dataset.ray_engine import pickled_hand
+from graspd_dataset import block_rows
+from graspd_dataset.blocks import Block, DatasetRequest
+from graspd_dataset.dataset_store import DatasetStore, block_path
+from graspd_dataset.ray_engine import pickled_hand
 
 REQUEST = DatasetRequest(
     ("shape:sphere",), hands=("parallel_gripper",), per_object=4, block=2, preset="fast", measure="none"

@@ -10,14 +10,12 @@ from pathlib import Path
 import pytest
 from small_dataset import make_here
 
-from graspd_core.dataset.blocks import Block, DatasetRequest, blocks_of
-from graspd_core.dataset.dataset_stats import stats_of, tables_of
-from graspd_core.dataset.dataset_store import DatasetStore, key_of
-from graspd_core.dataset.merge_datasets import merge, sample
-from graspd_core.dataset.parquet_files import parquet_bytes, read_parquet
-from graspd_core.dataset.run_dataset import missing_blocks
-from graspd_core.dataset.validate_dataset import count_by_content, faults_of_dataset
 from graspd_core.errors import FormatError
+from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
+from graspd_dataset.dataset_store import DatasetStore, key_of, parquet_bytes, read_parquet
+from graspd_dataset.inspect_dataset import count_by_content, faults_of_dataset, stats_of, tables_of
+from graspd_dataset.merge_datasets import merge, sample
+from graspd_dataset.run_dataset import missing_blocks
 
 Run = Callable[..., int]
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 from s3_server import Server, s3_server
 
-from graspd_core.dataset import dataset_store
-from graspd_core.dataset.dataset_stats import stats_of
-from graspd_core.dataset.dataset_store import DatasetStore, StorageError
-from graspd_core.dataset.merge_datasets import merge
-from graspd_core.dataset.validate_dataset import count_by_content, faults_of_dataset
+from graspd_dataset import dataset_store
+from graspd_dataset.dataset_store import DatasetStore, StorageError
+from graspd_dataset.inspect_dataset import count_by_content, faults_of_dataset, stats_of
+from graspd_dataset.merge_datasets import merge
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ import yaml
 from small_dataset import make_here
 
 from graspd_core import load_hand, load_mesh
-from graspd_core.dataset.blocks import DatasetRequest, blocks_of
-from graspd_core.dataset.dataset_stats import tables_of
-from graspd_core.dataset.dataset_store import DatasetStore
-from graspd_core.formats.foreign.read_foreign import read_foreign
 from graspd_core.hands.kinematics import link_poses
+from graspd_dataset.blocks import DatasetRequest, blocks_of
+from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.foreign_grasps import read_foreign
+from graspd_dataset.inspect_dataset import tables_of
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.dataset import guarded_calls
-from graspd_core.dataset.blocks import Block
-from graspd_core.dataset.dataset_store import DatasetStore
-from graspd_core.dataset.guarded_calls import Limits, prepare_object, run_block
-from graspd_core.dataset.ray_engine import block_job, object_job
 from graspd_core.runtime.worker_process import WorkerProcess, resident_mb
+from graspd_dataset import guarded_calls
+from graspd_dataset.blocks import Block
+from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.guarded_calls import Limits, prepare_object, run_block
+from graspd_dataset.ray_engine import block_job, object_job
 
 FILL = "x = [bytearray(b'1' * 2**20) for _ in range(4000)]"
 
@@ -119,8 +119,8 @@ def test_a_mesh_that_came_along_is_the_object(store: DatasetStore, blocks: tuple
 
 def test_a_worker_loads_neither_torch_nor_mujoco(tmp_path: Path):
     program = (
-        "import sys\nfrom graspd_core.dataset.guarded_calls import Job, Limits, run_block\n"
-        "from graspd_core.dataset.dataset_store import DatasetStore\n"
+        "import sys\nfrom graspd_dataset.guarded_calls import Job, Limits, run_block\n"
+        "from graspd_dataset.dataset_store import DatasetStore\n"
         "DatasetStore(sys.argv[1]).write('a', b'x')\n"
         "print([name for name in ('torch', 'mujoco', 'scipy', 'open3d', 'pyarrow') if name in sys.modules])"
     )

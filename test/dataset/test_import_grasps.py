@@ -17,15 +17,14 @@ from scipy.spatial.transform import Rotation
 from small_dataset import make_here
 
 from graspd_core import load_grasps, load_hand
-from graspd_core.dataset.blocks import DatasetRequest, blocks_of
-from graspd_core.dataset.dataset_stats import tables_of
-from graspd_core.dataset.dataset_store import DatasetStore
 from graspd_core.errors import FormatError
-from graspd_core.formats.foreign.dexgraspbench_npy import STAGES, npy_dictionary
-from graspd_core.formats.foreign.read_foreign import read_foreign
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
 from graspd_core.types import Posture, Verdict
+from graspd_dataset.blocks import DatasetRequest, blocks_of
+from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign
+from graspd_dataset.inspect_dataset import tables_of
 
 HAND = load_hand("allegro_right")
 
@@ -281,8 +280,8 @@ def test_an_order_that_is_not_known_or_does_not_fit_is_refused(exported, tmp_pat
 
 
 def test_coupled_joints_may_be_named_and_must_follow():
-    from graspd_core.formats.foreign.imported_grasp import joints_by_name
     from graspd_core.hands.model import all_joint_positions
+    from graspd_dataset.foreign_grasps import joints_by_name
 
     hand = load_hand("barrett_like")
     joints = 0.5 * (hand.lower + hand.upper)

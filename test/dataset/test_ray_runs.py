@@ -23,9 +23,9 @@ import pytest
 from s3_server import s3_server
 from small_dataset import REQUEST, make_here
 
-from graspd_core.dataset.blocks import blocks_of
-from graspd_core.dataset.dataset_store import DatasetStore, key_of
-from graspd_core.dataset.validate_dataset import count_by_content, faults_of_dataset
+from graspd_dataset.blocks import blocks_of
+from graspd_dataset.dataset_store import DatasetStore, key_of
+from graspd_dataset.inspect_dataset import count_by_content, faults_of_dataset
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 WORDS = ["shape:sphere", "--hands", "parallel_gripper", "--block", "2", "--preset", "fast", "--measure", "none"]
@@ -101,7 +101,7 @@ def test_a_run_on_this_machine_makes_what_blocks_make_alone(start: Start, made: 
 
 def test_ray_may_run_twice_in_a_process(start: Start):
     program = (
-        "from graspd_core.dataset.ray_engine import ray_running\n"
+        "from graspd_dataset.ray_engine import ray_running\n"
         "for _ in range(2):\n with ray_running(None, 1) as ray: print(ray.get(ray.remote(lambda: 3).remote()))\n"
     )
     output, errors = start("-c", program).communicate()

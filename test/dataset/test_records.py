@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 
 from graspd_core import load_hand, load_scene, plan_grasps
-from graspd_core.dataset import block_rows
-from graspd_core.dataset.block_rows import kind_of_reason
-from graspd_core.dataset.blocks import Block, DatasetRequest, blocks_of, by_object
-from graspd_core.dataset.dataset_stats import tables_of
-from graspd_core.dataset.dataset_store import DatasetStore, key_of
-from graspd_core.dataset.parquet_files import parquet_bytes, read_parquet
-from graspd_core.dataset.ray_engine import pickled_hand
-from graspd_core.dataset.record_schema import arrow_schema, columns, schema_table
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.model import all_joint_names, all_joint_positions
-from graspd_core.metrics.metric_registry import METRICS
 from graspd_core.runtime.worker_process import WorkerProcess
+from graspd_core.verify.metrics import METRICS
+from graspd_dataset import block_rows
+from graspd_dataset.block_rows import kind_of_reason
+from graspd_dataset.blocks import Block, DatasetRequest, blocks_of, by_object
+from graspd_dataset.dataset_store import DatasetStore, key_of, parquet_bytes, read_parquet
+from graspd_dataset.inspect_dataset import tables_of
+from graspd_dataset.ray_engine import pickled_hand
+from graspd_dataset.record_schema import arrow_schema, columns, schema_table
 
 ROOT = Path(__file__).parents[2]
 

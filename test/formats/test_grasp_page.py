@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd_core.formats.grasp_page import placed_hand, save_view
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.types import Grasp, Posture, TrialResult, Verdict
+from graspd_viewer.grasp_page import placed_hand, save_view
 
 # Half a turn about z: x and y change sign.
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])

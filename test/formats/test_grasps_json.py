@@ -14,13 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.formats.grasps_json import check_writable, result_document, save_result
-from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mount
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.metrics.metric_registry import METRICS
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.io.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import (
     Contact,
     Grasp,
@@ -33,6 +31,7 @@ from graspd_core.types import (
     TrialResult,
     Verdict,
 )
+from graspd_core.verify.metrics import METRICS
 
 # The keys of docs/format.md, one set per object.
 TOP = {

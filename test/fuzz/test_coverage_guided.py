@@ -15,7 +15,7 @@ PLANTED = """
 import sys
 sys.path.insert(0, {folder!r})
 import fuzz_targets
-from graspd_core.methods import plan_config
+from graspd_core.optimize import plan_config
 
 def eager(values, where):
     if "method" in values:

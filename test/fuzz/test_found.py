@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.bags.reader import CLOUD, read_frames
 from graspd_core.errors import BagError, shown
-from graspd_core.pointcloud.cloud_files import load_views
+from graspd_core.io.bags import CLOUD, read_frames
+from graspd_core.perception.cloud.cloud_files import load_views
 
 
 def npy(header: str, data: bytes = b"") -> bytes:

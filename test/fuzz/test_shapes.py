@@ -15,10 +15,9 @@ from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import check_mesh
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Scene
-from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.scene import Scene
 from graspd_core.types import TriangleMesh
 
 # GRASPD_FUZZ=50 tries fifty times as many examples, others each time; without it they are the same on every machine.

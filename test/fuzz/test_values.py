@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.errors import CloudError, ConfigError, FormatError
-from graspd_core.formats.read_grasps import grasps_of
-from graspd_core.methods.plan_config import PlanConfig, plan_config, to_mapping
-from graspd_core.pointcloud.cloud_files import load_views
-from graspd_core.pointcloud.pointcloud2 import CloudLayout, points_from_layout
+from graspd_core.io.grasps_json import grasps_of
+from graspd_core.optimize.plan_config import PlanConfig, plan_config, to_mapping
+from graspd_core.perception.cloud.cloud_files import load_views
+from graspd_core.perception.cloud.point_cloud import CloudLayout, points_from_layout
 
 # GRASPD_FUZZ=50 tries fifty times as many examples, others each time; without it they are the same on every machine.
 LONGER = int(os.environ.get("GRASPD_FUZZ", "1"))

@@ -12,10 +12,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.hands.collision_tensors import CollisionTensors, make_collision_tensors, pair_distance, solid_distance
 from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.link_distance import primitive_sdf
+from graspd_core.hands.link_distance import (
+    CollisionTensors,
+    make_collision_tensors,
+    pair_distance,
+    primitive_sdf,
+    solid_distance,
+)
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.se3 import SE3
 

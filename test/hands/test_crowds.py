@@ -15,14 +15,13 @@ import pytest
 import torch
 import trimesh
 
-from graspd_core.hands.collision_spheres import MOST_OF_GROUP, MOST_OF_HAND, collision_spheres
-from graspd_core.hands.collision_tensors import make_collision_tensors, solid_distance
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand, read_hand_file
-from graspd_core.hands.link_distance import bounds
+from graspd_core.hands.link_distance import bounds, make_collision_tensors, solid_distance
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.primitive_surface import surface_points
 from graspd_core.hands.readers.xml_io import rotation_from_rpy
+from graspd_core.hands.self_collision import MOST_OF_GROUP, MOST_OF_HAND, collision_spheres
+from graspd_core.hands.surface_points import surface_points
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3
 
@@ -216,8 +215,8 @@ def test_distances_to_very_many_solids_are_those_to_each(tmp_path: Path) -> None
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("make", [lambda folder: fine_leap(folder, 4), lambda folder: cut_up(folder, (5, 5, 4))])
 def test_a_crowded_hand_holds_a_box(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    from graspd_core.perception.load_scene import load_scene
     from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.scene.load_scene import load_scene
     from graspd_core.types import Outcome
 
     hand = load_hand(make(tmp_path))

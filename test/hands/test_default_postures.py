@@ -96,8 +96,8 @@ def test_a_description_overrides_what_it_names(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
 def test_a_guessed_hand_holds_a_box(name: str) -> None:
+    from graspd_core.perception.load_scene import load_scene
     from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.scene.load_scene import load_scene
     from graspd_core.types import Outcome
 
     hand = load_hand(config_dir() / "hands" / f"{name}.urdf")

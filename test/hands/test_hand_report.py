@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.render import hand_picture
 from graspd_core.cli import build_parser, main
-from graspd_core.hands.hand_report import as_text, as_yaml, report
+from graspd_core.cli.hands_command import as_text, as_yaml, report
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.paths import config_dir
-from graspd_core.rendering.hand_picture import hand_picture
 
 
 @pytest.fixture(scope="module")

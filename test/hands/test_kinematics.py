@@ -12,7 +12,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.hands.collision_tensors import make_collision_tensors
 from graspd_core.hands.kinematics import (
     forward,
     make_kinematics,
@@ -22,6 +21,7 @@ from graspd_core.hands.kinematics import (
     points_in_base,
 )
 from graspd_core.hands.library import load_hand
+from graspd_core.hands.link_distance import make_collision_tensors
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.readers.urdf import read_urdf
 

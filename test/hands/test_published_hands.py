@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.hands.hand_mesh import hand_mesh, primitive_mesh
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import hand_mesh, link_poses, primitive_mesh
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel

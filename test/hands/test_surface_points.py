@@ -8,13 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.hands.collision_spheres import collision_spheres
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.primitive_surface import feature_points, primitive_area, surface_points
-from graspd_core.hands.surface_points import dense_samples
+from graspd_core.hands.self_collision import collision_spheres
+from graspd_core.hands.surface_points import dense_samples, feature_points, primitive_area, surface_points
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [0.03, 0, 0], [0, 0.02, 0], [0, 0, 0.04]])
 SHAPES = {

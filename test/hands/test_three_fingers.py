@@ -291,8 +291,8 @@ def test_joints_that_carry_the_palm_leave_its_normal_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
 @pytest.mark.parametrize("name", GRIPPERS)
 def test_a_guessed_gripper_holds(name: str, shape: str, tmp_path: Path) -> None:
+    from graspd_core.perception.load_scene import load_scene
     from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.scene.load_scene import load_scene
     from graspd_core.types import Verdict
 
     hand = load_hand(write(GRIPPERS[name]().urdf, tmp_path))

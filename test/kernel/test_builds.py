@@ -7,7 +7,8 @@ import ctypes
 import pytest
 
 from graspd_core.errors import ConfigError
-from graspd_core.kernel import builds, structs
+from graspd_core.optimize.kernel import builds
+from graspd_core.optimize.kernel import builds as structs
 
 
 def test_the_best_build_that_runs_here_is_taken(monkeypatch):

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from graspd_core.config import GraspStagesConfig
-from graspd_core.methods.poses import Poses, moved_along, unpack
-from graspd_core.methods.stages.contact_set import nearest_features, self_overlap
-from graspd_core.methods.stages.pregrasp import find_pregrasp
+from graspd_core.optimize.grasp_postures import find_pregrasp, nearest_features, self_overlap
+from graspd_core.optimize.loop import Poses, moved_along, unpack
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 

@@ -9,15 +9,19 @@ import torch
 
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.library import load_hand
-from graspd_core.kernel import builds
-from graspd_core.methods.closed_form.closed_form import ClosedForm, weighted
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
-from graspd_core.methods.closed_form.compiled_search import evaluate_compiled, least_distance_compiled
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.kernel_problem import KernelProblem, kernel_problem
-from graspd_core.methods.losses import hard_contact
-from graspd_core.methods.poses import moved_along, pack, unpack
-from graspd_core.methods.problem import Problem, Terms, build_problem, evaluate, least_distance
+from graspd_core.optimize.closed_form.closed_form import (
+    ClosedForm,
+    evaluate_compiled,
+    least_distance_compiled,
+    weighted,
+)
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.kernel import builds
+from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
+from graspd_core.optimize.loop import moved_along, pack, unpack
+from graspd_core.optimize.losses import hard_contact
+from graspd_core.optimize.problem import Problem, Terms, build_problem, evaluate, least_distance
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 DELTA = 0.006

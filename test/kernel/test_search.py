@@ -8,13 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from graspd_core.methods.closed_form.closed_form import ClosedForm
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, rows_kept
-from graspd_core.methods.closed_form.compiled_search import minimise_compiled
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.kernel_problem import kernel_problem
-from graspd_core.methods.loop import Hooks, Solution, minimise
-from graspd_core.methods.poses import Poses, pack
+from graspd_core.optimize.closed_form.closed_form import ClosedForm, minimise_compiled
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, rows_kept
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.kernel_problem import kernel_problem
+from graspd_core.optimize.loop import Hooks, Poses, Solution, minimise, pack
 
 CONFIG = ClosedFormConfig(explore_steps=12, refine_steps=8, polish_steps=10)
 

@@ -17,8 +17,7 @@ import pytest
 
 from graspd_core import GraspResult, HandModel, Scene, load_hand, load_preset, load_scene
 from graspd_core.errors import FormatError
-from graspd_core.library.grasp_library import GraspLibrary
-from graspd_core.library.library_entry import LibraryEntry, entry_of, hand_hash
+from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, entry_of, hand_hash
 from graspd_core.types import Grasp, Verdict
 
 # Adds records without end, and says the number of each once it is in.

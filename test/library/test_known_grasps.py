@@ -14,15 +14,23 @@ import pytest
 from graspd_core import GraspResult, HandModel, Outcome, Scene, Steering, TriangleMesh, Verdict, load_hand, load_scene
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.library import known_grasps as module
-from graspd_core.library.find_entry import Physics, entry_by_file, entry_by_name
 from graspd_core.library.grasp_library import GraspLibrary
-from graspd_core.library.known_grasps import NEAR, add_planned, clearance, known_grasps, known_or_planned
+from graspd_core.library.known_grasps import (
+    NEAR,
+    Physics,
+    add_planned,
+    clearance,
+    entry_by_file,
+    entry_by_name,
+    known_grasps,
+    known_or_planned,
+)
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning.steering.steering import angle_of_approach
-from graspd_core.trials.trial_registry import grasp_trials
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.planning.steering import angle_of_approach
 from graspd_core.types import Plane
+from graspd_core.verify.trial_registry import grasp_trials
 
 PHYSICS = Physics(mass=0.1, friction=0.6)
 

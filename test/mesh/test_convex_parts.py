@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from graspd_core.bench.stress.broken_meshes import thin_cup
+from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_core.mesh.convex_parts import convex_parts
-from graspd_core.mesh.mesh_distance import make_distance_query, signed_distance
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape, shape_volume
+from graspd_core.mesh.surface_queries import make_distance_query, signed_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.types import TriangleMesh
 

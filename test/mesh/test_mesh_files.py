@@ -17,11 +17,11 @@ from graspd_core.mesh.mesh_files import (
     save_mesh,
     simplify,
     surface_samples,
+    unit_advice,
 )
 from graspd_core.mesh.shapes import BOX_HALF, make_shape, shape_volume
 from graspd_core.mesh.topology import is_closed
-from graspd_core.mesh.units import unit_advice
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import TriangleMesh
 
 

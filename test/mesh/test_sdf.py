@@ -25,8 +25,7 @@ from graspd_core.mesh.shapes import (
     SPHERE_RADIUS,
     make_shape,
 )
-from graspd_core.mesh.surface_queries import closest_points, make_surface
-from graspd_core.mesh.winding_number import winding_inside
+from graspd_core.mesh.surface_queries import closest_points, make_surface, winding_inside
 from graspd_core.se3 import random_rotations
 from graspd_core.types import TriangleMesh
 

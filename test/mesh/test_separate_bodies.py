@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graspd_core.mesh.separate_bodies import bodies_apart
+from graspd_core.mesh.components import bodies_apart
 from graspd_core.mesh.shapes import joined, make_shape
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import build_scene
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import build_scene
 from graspd_core.types import TriangleMesh
 
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_core.mesh.components import drop_small_components, face_components
 from graspd_core.mesh.shapes import joined, make_shape
-from graspd_core.mesh.small_components import drop_small_components, face_components
-from graspd_core.scene.scene import build_scene
+from graspd_core.perception.scene import build_scene
 from graspd_core.types import TriangleMesh
 
 BOX = make_shape("box")

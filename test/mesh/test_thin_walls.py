@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.bench.stress.broken_meshes import thin_cup
-from graspd_core.bench.stress.run_stress_case import GRASP, faults, run_case
-from graspd_core.bench.stress.stress_cases import CASES
+from graspd_bench.stress.broken_meshes import thin_cup
+from graspd_bench.stress.run_stress_case import GRASP, faults, run_case
+from graspd_bench.stress.stress_cases import CASES
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.mesh_files import mass_properties, save_mesh, surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
 from graspd_core.mesh.sharp_features import neighbours_together, sharp_points
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import TriangleMesh
 
 RADIUS, HEIGHT = 0.033, 0.08

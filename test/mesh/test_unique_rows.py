@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from graspd_core.mesh.unique_rows import packed_rows
+from graspd_core.mesh.topology import packed_rows
 
 _SHAPES = array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12).map(lambda shape: (shape[0], 1 + shape[1] % 3))
 # Few values, so that rows repeat; or up to where three of them have no room in one number.

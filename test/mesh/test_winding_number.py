@@ -13,9 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.hands.link_distance import box_sdf
-from graspd_core.mesh.mesh_distance import inside, make_distance_query, signed_distance, unsigned_distance
 from graspd_core.mesh.shapes import BOX_HALF, MUG_HALF, make_shape
-from graspd_core.mesh.winding_number import is_inside, make_winding_tree, winding_inside
+from graspd_core.mesh.surface_queries import (
+    inside,
+    is_inside,
+    make_distance_query,
+    make_winding_tree,
+    signed_distance,
+    unsigned_distance,
+    winding_inside,
+)
 from graspd_core.types import TriangleMesh
 
 

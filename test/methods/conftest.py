@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 
 from graspd_core.config import ProblemConfig
-from graspd_core.contact.free_body import make_body
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.graspd2022.graspd2022 import Graspd2022
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config
-from graspd_core.methods.graspd2022.initial_poses_published import published_starts
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.problem import Problem, build_problem
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Scene
+from graspd_core.optimize.graspd2022.contact_dynamics import make_body
+from graspd_core.optimize.graspd2022.graspd2022 import Graspd2022, published_starts
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.optimize.loop import Poses
+from graspd_core.optimize.problem import Problem, build_problem
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene
 
 
 @pytest.fixture(scope="session")

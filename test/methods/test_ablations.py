@@ -7,18 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from graspd_core.methods.annealing.annealing_config import AnnealingConfig
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.closed_form.closed_form import ClosedForm
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig, LossWeights
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.losses import hard_contact, soft_contact
-from graspd_core.methods.method_registry import METHODS
-from graspd_core.methods.plan_config import PlanConfig, load_preset
-from graspd_core.methods.poses import pack
-from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
+from graspd_bench.baselines.annealing import AnnealingConfig
+from graspd_bench.baselines.random_closure import RandomClosureConfig
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.closed_form.closed_form import ClosedForm
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, minimise, pack
+from graspd_core.optimize.losses import hard_contact, soft_contact
+from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset
 
 DEFAULT = ClosedFormConfig()
 DOUBLE = torch.float64

@@ -12,26 +12,25 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.config import ProblemConfig
-from graspd_core.contact.wrench_support import disturbance_directions
-from graspd_core.methods.annealing.annealing import (
+from graspd_bench.baselines.annealing import (
+    AnnealingConfig,
     cooling,
+    inner_contacts,
     jump,
     make_annealing,
     plan,
+    posture_space,
     quaternion_product,
     sampled_epsilon,
 )
-from graspd_core.methods.annealing.annealing_config import AnnealingConfig
-from graspd_core.methods.annealing.eigengrasps import inner_contacts, posture_space
-from graspd_core.methods.finger_closing import finger_of
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.methods.planner import PlannerInput, PlannerOutput
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.stages.contact_set import ContactSet
-from graspd_core.methods.stages.pregrasp import hand_distance
+from graspd_core.config import ProblemConfig
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
+from graspd_core.optimize.finger_closing import finger_of
+from graspd_core.optimize.grasp_postures import ContactSet, hand_distance
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, Poses, minimise
+from graspd_core.optimize.losses import disturbance_directions
+from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
 

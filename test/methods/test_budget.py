@@ -7,7 +7,7 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.methods.plan_config import PlanConfig
+from graspd_core.optimize.plan_config import PlanConfig
 
 CONFIG = PlanConfig()
 STEPS, STARTS = ("explore_steps", "refine_steps", "polish_steps"), ("starts_per_grasp", "keep_per_grasp")

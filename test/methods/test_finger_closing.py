@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_bench.baselines.random_closure import advance, draw_approaches
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.finger_closing import Closing, finger_of, link_gaps, make_closing, moved_links
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.problem import Problem, build_problem
-from graspd_core.methods.random_closure.random_closure import advance, draw_approaches
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Scene, build_scene
+from graspd_core.optimize.finger_closing import Closing, finger_of, link_gaps, make_closing, moved_links
+from graspd_core.optimize.loop import Hooks, Poses, minimise
+from graspd_core.optimize.problem import Problem, build_problem
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.types import TriangleMesh
 
 DOUBLE = torch.float64

@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspd_core.contact.wrench_support import disturbance_directions, wrench_support
-from graspd_core.methods import losses
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.poses import Poses, pack
-from graspd_core.methods.problem import Terms, evaluate
+from graspd_core.optimize import losses
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Poses, pack
+from graspd_core.optimize.losses import disturbance_directions, wrench_support
+from graspd_core.optimize.problem import Terms, evaluate
 
 ROOT = Path(__file__).parents[2]
 RADIUS, DELTA = 0.002, 0.01
@@ -158,11 +158,11 @@ def test_kernels_trace_in_one_graph(function, arguments):
 
 EVALUATION = """
 import torch
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.initial_poses import draw_starts
+from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.config import ProblemConfig
-from graspd_core.methods.problem import build_problem, evaluate
+from graspd_core.optimize.problem import build_problem, evaluate
 
 torch.set_num_threads(1)
 hand, scene = load_hand("allegro_right", candidates=80), load_scene("shape:box", resolution=24)

@@ -14,16 +14,24 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.graspd2022.contact_force_variables import actual, into_cone, motion_left, physics
-from graspd_core.methods.graspd2022.graspd2022 import plan
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
-from graspd_core.methods.graspd2022.initial_poses_published import published_starts
-from graspd_core.methods.graspd2022.multipliers import Adamax, adamax, adamax_step, damped, excess
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.plan_config import PlanConfig, load_preset, preset_names
-from graspd_core.methods.planner import PlannerInput
-from graspd_core.methods.poses import pack
-from graspd_core.methods.problem import hand_forward
+from graspd_core.optimize.candidates import PlannerInput
+from graspd_core.optimize.graspd2022.graspd2022 import (
+    Adamax,
+    actual,
+    adamax,
+    adamax_step,
+    damped,
+    excess,
+    into_cone,
+    motion_left,
+    physics,
+    plan,
+    published_starts,
+)
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
+from graspd_core.optimize.loop import Hooks, minimise, pack
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
+from graspd_core.optimize.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
 SHORT = Graspd2022Config(steps=12, level_set=LevelSetConfig(coarse_steps=6))

@@ -11,15 +11,13 @@ import torch
 from graspd_core.config import GraspStagesConfig, ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
-from graspd_core.methods.closed_form.closed_form import ClosedForm, adam_step
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.poses import Poses, pack
-from graspd_core.methods.problem import Problem, build_problem
-from graspd_core.methods.stages.contact_set import find_contacts
-from graspd_core.methods.stages.squeeze import squeeze
-from graspd_core.scene.scene import Scene
+from graspd_core.optimize.closed_form.closed_form import ClosedForm, adam_step
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.grasp_postures import find_contacts, squeeze
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, Poses, minimise, pack
+from graspd_core.optimize.problem import Problem, build_problem
+from graspd_core.perception.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
 
 DOUBLE = torch.float64

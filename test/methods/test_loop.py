@@ -8,12 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from graspd_core.methods.closed_form.closed_form import ClosedForm, weighted
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.poses import Poses, pack, unpack
-from graspd_core.methods.problem import evaluate
+from graspd_core.optimize.closed_form.closed_form import ClosedForm, weighted
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, Poses, minimise, pack, unpack
+from graspd_core.optimize.problem import evaluate
 
 CONFIG = ClosedFormConfig(explore_steps=4, refine_steps=2, polish_steps=4)
 STARTS = 4

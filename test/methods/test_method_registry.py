@@ -9,16 +9,15 @@ from types import ModuleType
 
 import pytest
 
-from graspd_core.bench.charts.speed_chart import draw_charts
-from graspd_core.bench.study import Request
-from graspd_core.bench.suites import main_suite
+from graspd_bench.charts import draw_charts
+from graspd_bench.study import Request
+from graspd_bench.suites import main_suite
 from graspd_core.cli import build_parser
 from graspd_core.errors import ConfigError
-from graspd_core.methods.method_registry import METHODS, Method
-from graspd_core.methods.plan_config import PlanConfig, load_preset, override, plan_config, to_mapping
-from graspd_core.methods.planner import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.optimize.plan_config import METHODS, Method, PlanConfig, load_preset, override, plan_config, to_mapping
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.scene.load_scene import load_scene
 from graspd_core.types import Verdict
 
 RECORD = {

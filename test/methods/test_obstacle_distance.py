@@ -12,14 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.hand_mesh import hand_mesh
-from graspd_core.hands.kinematics import forward, place_points
+from graspd_core.hands.kinematics import forward, hand_mesh, place_points
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.obstacle_distance import (
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, pack
+from graspd_core.optimize.obstacle_distance import (
     RETREAT,
     WIDE,
     gap_on_the_way,
@@ -27,11 +26,10 @@ from graspd_core.methods.obstacle_distance import (
     make_obstacle_tensors,
     obstacle_gaps,
 )
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.methods.poses import pack
-from graspd_core.methods.problem import Problem, build_problem, evaluate
-from graspd_core.scene.obstacles import make_obstacles
-from graspd_core.scene.scene import Scene
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.optimize.problem import Problem, build_problem, evaluate
+from graspd_core.perception.obstacles import make_obstacles
+from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Plane, Posture
 

@@ -11,8 +11,7 @@ import torch
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.methods.problem import build_problem
-from graspd_core.methods.problem_tensors import make_hand_tensors, make_object_tensors
+from graspd_core.optimize.problem import build_problem, make_hand_tensors, make_object_tensors
 
 SETTINGS = ProblemConfig(candidates=200, features=24)
 
@@ -53,10 +52,10 @@ def test_a_hand_that_gives_sees_a_thinner_object(scenes):
 
 
 def test_a_hand_that_gives_presses_deeper(scenes, hand):
-    from graspd_core.bench.object_case import raw_grasps
-    from graspd_core.methods.plan_config import load_preset, override
-    from graspd_core.metrics.measure import measure
-    from graspd_core.metrics.metrics_context import make_metrics_context
+    from graspd_bench.study import raw_grasps
+    from graspd_core.optimize.plan_config import load_preset, override
+    from graspd_core.verify.metrics import measure
+    from graspd_core.verify.prepared_grasp import make_metrics_context
 
     context = make_metrics_context(scenes["cylinder"].object, hand)
 

@@ -9,22 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_bench.baselines.random_closure import RandomClosureConfig, advance, draw_approaches, plan, touching_groups
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.finger_closing import link_gaps, make_closing
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.obstacle_distance import obstacle_gaps
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.methods.planner import PlannerInput, PlannerOutput
-from graspd_core.methods.random_closure.random_closure import (
-    advance,
-    draw_approaches,
-    plan,
-    touching_groups,
-)
-from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates
+from graspd_core.optimize.finger_closing import link_gaps, make_closing
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.obstacle_distance import obstacle_gaps
+from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
 

@@ -10,13 +10,12 @@ import pytest
 import ranking as benchmark
 import torch
 
-from graspd_core.methods.candidates import find_candidates, staged
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.problem import Problem
-from graspd_core.methods.stages.ranking import Staged, _fitted, log_odds, ranking_figures, score
+from graspd_core.optimize.candidates import find_candidates, staged
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, Poses
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.optimize.problem import Problem
+from graspd_core.optimize.ranking import Staged, _fitted, log_odds, ranking_figures, score
 
 CONFIG = load_preset("fast")
 

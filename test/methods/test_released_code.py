@@ -9,13 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from graspd_core.methods.graspd2022.graspd2022 import move_shares, plan
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
-from graspd_core.methods.graspd2022.multipliers import adam_step, adamax
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.plan_config import PlanConfig, load_preset, override
-from graspd_core.methods.planner import PlannerInput
-from graspd_core.methods.poses import pack
+from graspd_core.optimize.candidates import PlannerInput
+from graspd_core.optimize.graspd2022.graspd2022 import adam_step, adamax, move_shares, plan
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
+from graspd_core.optimize.loop import Hooks, minimise, pack
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, override
 
 PAPER = PlanConfig(method="graspd2022")
 

@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import expected_to_hold, find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.method_registry import METHODS
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.optimize.candidates import expected_to_hold, find_candidates
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.plan_config import METHODS, load_preset
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import Grasp
 
 CONFIG = load_preset("balanced")

@@ -12,11 +12,18 @@ from scipy.optimize import nnls
 from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import link_poses, point_jacobian
 from graspd_core.mesh.shapes import SPHERE_RADIUS
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.stages.contact_set import find_contacts, self_overlap
-from graspd_core.methods.stages.pregrasp import find_pregrasp, hand_distance
-from graspd_core.methods.stages.squeeze import _cone_edges, balanced_forces, joint_torques, squeeze
+from graspd_core.optimize.grasp_postures import (
+    _cone_edges,
+    balanced_forces,
+    find_contacts,
+    find_pregrasp,
+    hand_distance,
+    joint_torques,
+    self_overlap,
+    squeeze,
+)
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Poses
 from graspd_core.se3 import rotation_from_quaternion
 
 FRICTION, LENGTH = 0.5, 0.035

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.hands.library import load_hand
-from graspd_core.metrics.diversity import distinct
 from graspd_core.types import Grasp, Posture
+from graspd_core.verify.metrics import distinct
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,17 @@ import trimesh
 
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import depth_inside
-from graspd_core.metrics.hand_contacts import contact_area, contact_links, placed_hand, touching
-from graspd_core.metrics.intersection import intersection_volume, penetration, self_penetration
-from graspd_core.metrics.metrics_context import make_metrics_context
 from graspd_core.types import TriangleMesh
+from graspd_core.verify.prepared_grasp import (
+    contact_area,
+    contact_links,
+    intersection_volume,
+    make_metrics_context,
+    penetration,
+    placed_hand,
+    self_penetration,
+    touching,
+)
 
 # The block's surface is 2·(40·30 + 30·20 + 20·40) = 5200 mm², seen by some 4000 samples: an area of A mm² is counted
 # to three standard deviations of 3·sqrt(A·1.3) mm² or better.

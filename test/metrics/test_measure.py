@@ -8,11 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core.metrics.measure import measure
-from graspd_core.metrics.metrics_context import make_metrics_context
-from graspd_core.metrics.prepared_grasp import PROTOCOL_CONTACTS, surface_normals
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
 from graspd_core.types import GraspMetrics, Posture, TriangleMesh
+from graspd_core.verify.metrics import measure
+from graspd_core.verify.prepared_grasp import PROTOCOL_CONTACTS, make_metrics_context, surface_normals
 
 
 def some(value: float | None) -> float:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd_core.mesh.mesh_distance import make_distance_query
-from graspd_core.metrics.skin_metrics import CONTACT_DISTANCES, measure_skin
+from graspd_bench.studies.human_hand import CONTACT_DISTANCES, measure_skin
+from graspd_core.mesh.surface_queries import make_distance_query
 from graspd_core.types import TriangleMesh
 
 

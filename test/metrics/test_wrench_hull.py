@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from graspd_core.metrics.wrench_hull import cone_wrenches, wrench_hull
 from graspd_core.se3 import random_rotations
+from graspd_core.verify.prepared_grasp import cone_wrenches, wrench_hull
 
 FRICTION = 0.6
 # Every edge of a cone is a unit force: its normal part, and its tangential part.

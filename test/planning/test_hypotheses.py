@@ -14,14 +14,24 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.config import CertaintyConfig
-from graspd_core.config.certainty_config import HELD, HELD_THOUGH_FAILED
+from graspd_core.config.planning_config import HELD, HELD_THOUGH_FAILED
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning import hypotheses, verification
-from graspd_core.planning.hypotheses import (
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception import scene as scene_module
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.reconstruct.shape_completion import Evidence
+from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
+from graspd_core.verify import robustness as hypotheses
+from graspd_core.verify import verification
+from graspd_core.verify.hold_trial import STOPPED, hold_trial
+from graspd_core.verify.robustness import (
     Hypotheses,
     Hypothesis,
     begin_other_shape,
@@ -29,19 +39,9 @@ from graspd_core.planning.hypotheses import (
     hypotheses_of,
     try_hypotheses,
 )
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.planning.run_clock import Run
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.evidence import Evidence
-from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core.scene import scene as scene_module
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
-from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.trials.hold_trial import STOPPED, hold_trial
-from graspd_core.trials.trial_registry import TrialContext, build_worlds
-from graspd_core.trials.world import PROTOCOLS, at_friction, build_world
-from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
+from graspd_core.verify.run_clock import Run
+from graspd_core.verify.trial_registry import TrialContext, build_worlds
+from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 0.0)
@@ -196,7 +196,9 @@ def test_nothing_is_tried_after_a_failure():
 def test_the_first_shape_that_there_is_is_taken(missing, expected, monkeypatch):
     seen, hand, protocol = seen_from(), load_hand("allegro_right"), PROTOCOLS["standard"]
     world, made = build_world(hand, seen.object, object_parts(seen.object), protocol), []
-    monkeypatch.setattr("graspd_core.reconstruction.other_shapes.other_rules", lambda _: ("", "mirror", "extrusion"))
+    monkeypatch.setattr(
+        "graspd_core.perception.reconstruct.hidden_side.other_rules", lambda _: ("", "mirror", "extrusion")
+    )
     monkeypatch.setattr(
         hypotheses, "_other_world", lambda *given: made.append(given[-1]) or (None if len(made) <= missing else world)
     )
@@ -252,7 +254,7 @@ def test_a_mesh_is_not_doubted():
 
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
-    monkeypatch.delattr("graspd_core.planning.hypotheses._other_world")
+    monkeypatch.delattr("graspd_core.verify.robustness._other_world")
     verified = [grasp for grasp in plan(seen_all_round(), HELD[-1]).grasps if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
@@ -264,7 +266,7 @@ def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
     cut = []
     monkeypatch.setenv("GRASPD_CACHE", "off")
     monkeypatch.setattr(
-        "graspd_core.scene.scene.convex_parts",
+        "graspd_core.perception.scene.convex_parts",
         lambda *given, **cuts: cut.append(cuts) or convex_parts(*given, **cuts),
     )
     result = plan(seen_from((0.001, 0.0, 0.0)), SURE)
@@ -285,9 +287,9 @@ def test_less_friction_is_that_of_a_world_built_with_it():
 
 @pytest.mark.parametrize(("seen", "hidden"), [(seen_from, True), (seen_all_round, False)])
 def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from(seen, hidden, monkeypatch):
-    monkeypatch.setattr("graspd_core.planning.hypotheses._LESS_FRICTION", 0.01)
+    monkeypatch.setattr("graspd_core.verify.robustness._LESS_FRICTION", 0.01)
     monkeypatch.setattr(
-        "graspd_core.planning.hypotheses.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
+        "graspd_core.verify.robustness.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
     )
     result = plan(seen(), HELD[-1], rounds=1)
     assert result.grasps

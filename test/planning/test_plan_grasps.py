@@ -10,14 +10,14 @@ import pytest
 
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning import verification
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.trials import audit
-from graspd_core.trials.trial_registry import TRIALS
 from graspd_core.types import AuditCount, Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
+from graspd_core.verify import trial_registry as audit
+from graspd_core.verify import verification
+from graspd_core.verify.trial_registry import TRIALS
 
 # A search that nobody waits for.
 ENDLESS = replace(load_preset("fast"), settings=replace(load_preset("fast").settings, refine_steps=10**7))

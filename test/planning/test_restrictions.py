@@ -12,15 +12,15 @@ import torch
 from graspd_core import load_hand, load_scene, plan_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.restrictions import (
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.restrictions import (
     UNRESTRICTED,
     BoundRestriction,
     BoundRestrictions,
     Refusal,
     restrictions_in_words,
 )
-from graspd_core.scene.scene import Scene
+from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Outcome
 
 

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.bench.studies.robust_ranking import correlation, orders
+from graspd_bench.studies.robust_ranking import correlation, orders
 from graspd_core.config import RobustConfig
-from graspd_core.formats.grasps_json import result_document
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.plan_config import load_preset
+from graspd_core.io.grasps_json import result_document
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.planning.verification import most_robust_first
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import object_parts
-from graspd_core.trials.noisy_trial import noisy_share, pose_errors
-from graspd_core.trials.world import PROTOCOLS, build_world
 from graspd_core.types import Grasp, GraspMetrics, Outcome, Posture, Progress, Stage, Verdict
+from graspd_core.verify.hold_trial import noisy_share, pose_errors
+from graspd_core.verify.verification import most_robust_first
+from graspd_core.verify.world import PROTOCOLS, build_world
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 

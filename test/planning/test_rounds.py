@@ -11,13 +11,13 @@ import torch
 from graspd_core.config import RoundsConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.candidates import Candidates
-from graspd_core.methods.plan_config import PlanConfig, load_preset
+from graspd_core.optimize.candidates import Candidates
+from graspd_core.optimize.plan_config import PlanConfig, load_preset
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.planning import rounds as planning_rounds
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.rounds import rounds_of
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Obstacle, Scene
 from graspd_core.types import Plane
 
 

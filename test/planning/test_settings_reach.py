@@ -9,22 +9,20 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
+from graspd_bench.baselines.annealing import AnnealingConfig
+from graspd_bench.baselines.random_closure import RandomClosureConfig
+from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.config import GraspStagesConfig, ProblemConfig, RoundsConfig
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.methods.annealing.annealing_config import AnnealingConfig
-from graspd_core.methods.closed_form.closed_form_config import ClosedFormConfig
-from graspd_core.methods.graspd2022.graspd2022_config import Graspd2022Config, InitialPosesConfig, LevelSetConfig
-from graspd_core.methods.method_registry import METHODS
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.methods.random_closure.random_closure_config import RandomClosureConfig
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.planning.planning_scene import planning_scene
-from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core.scene.scene import Scene, build_scene
-from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, InitialPosesConfig, LevelSetConfig
+from graspd_core.optimize.plan_config import METHODS, PlanConfig
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.scene import Scene, build_scene
+from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Grasp, Plane, Posture, Progress, Stage
 
 # As short as a run can be that still does everything once.

@@ -12,21 +12,21 @@ import torch
 
 from graspd_core.config import RobustConfig
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.metrics.metrics_context import make_metrics_context
-from graspd_core.planning import verification
-from graspd_core.planning.run_clock import Run
-from graspd_core.planning.trial_threads import results_in_order
-from graspd_core.planning.verification import VerificationContext, rank_by_robustness, run_trials
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import object_parts
-from graspd_core.trials import audit
-from graspd_core.trials.noisy_trial import displaced, pose_errors
-from graspd_core.trials.trial_registry import build_worlds
-from graspd_core.trials.world import PROTOCOLS
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import object_parts
 from graspd_core.types import Grasp, GraspMetrics, Progress, StopHook, Verdict
+from graspd_core.verify import trial_registry as audit
+from graspd_core.verify import verification
+from graspd_core.verify.hold_trial import displaced, pose_errors
+from graspd_core.verify.prepared_grasp import make_metrics_context
+from graspd_core.verify.robustness import results_in_order
+from graspd_core.verify.run_clock import Run
+from graspd_core.verify.trial_registry import build_worlds
+from graspd_core.verify.verification import VerificationContext, rank_by_robustness, run_trials
+from graspd_core.verify.world import PROTOCOLS
 
 
 def a_run() -> Run:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.errors import CloudError
-from graspd_core.pointcloud.camera import (
+from graspd_core.perception.cloud.camera import (
     PinholeCamera,
     camera_from_calibration,
     camera_rays,

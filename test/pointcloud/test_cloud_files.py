@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.cloud_files import is_cloud_file, load_views
-from graspd_core.rendering.render import look_at, render_depth
+from graspd_core.perception.cloud.camera import PinholeCamera
+from graspd_core.perception.cloud.cloud_files import is_cloud_file, load_views
 
 MATRIX = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
 LENS = (0.1, -0.2, 0.001, -0.001, 0.05)

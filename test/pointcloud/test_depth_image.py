@@ -7,11 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import CloudError
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
-from graspd_core.pointcloud.camera import PinholeCamera, project
-from graspd_core.pointcloud.depth_image import cloud_from_depth, depth_from_bytes, depth_in_metres
-from graspd_core.rendering.render import look_at, render_depth
+from graspd_core.perception.cloud.camera import (
+    PinholeCamera,
+    cloud_from_depth,
+    depth_from_bytes,
+    depth_in_metres,
+    project,
+)
 
 LENS = (0.1, -0.25, 0.002, -0.001, 0.1)
 CAMERA = PinholeCamera(81, 61, 100.0, 100.0, 40.0, 30.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.pointcloud.image_border import reaches_image_border
+from graspd_core.perception.cloud.camera import reaches_image_border
 
 EYE = np.array([0.0, 0.0, 1.0])
 WIDTH = SegmentationConfig().border_width

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd_core.pointcloud.cloud_files import load_views
+from graspd_core.perception.cloud.cloud_files import load_views
 
 POINTS = np.arange(6, dtype="<f4").reshape(2, 3)
 _PLY = (

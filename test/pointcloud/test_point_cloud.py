@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import CloudError
-from graspd_core.mesh.mesh_distance import make_distance_query, unsigned_distance
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.shapes import make_shape, shape_volume
+from graspd_core.mesh.surface_queries import make_distance_query, unsigned_distance
 from graspd_core.mesh.topology import is_closed
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.pointcloud.point_cloud import PointCloud, clean_cloud, least_axes, transform_cloud
-from graspd_core.reconstruction.reconstruct import reconstruct
-from graspd_core.rendering.render import look_at, render_depth
+from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
+from graspd_core.perception.cloud.point_cloud import PointCloud, clean_cloud, least_axes, transform_cloud
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.types import TriangleMesh
 
 ORIGIN = np.zeros(3)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.errors import CloudError
-from graspd_core.pointcloud.pointcloud2 import CloudLayout, organised_points, points_from_layout
+from graspd_core.perception.cloud.point_cloud import CloudLayout, organised_points, points_from_layout
 
 
 def layout_of(points: np.ndarray, code: str, step: int, row_padding: int) -> CloudLayout:

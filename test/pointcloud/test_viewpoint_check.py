@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.pointcloud.camera import PinholeCamera, camera_rays
-from graspd_core.pointcloud.viewpoint_check import check_viewpoint
-from graspd_core.rendering.depth_noise import DEFAULT
-from graspd_core.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
+from graspd_core.perception.cloud.viewpoint_check import check_viewpoint
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 # Where robots have their base: on the table, above it, on the floor; and right under the object.

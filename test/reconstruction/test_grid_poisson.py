@@ -8,11 +8,9 @@ from hypothesis import strategies as st
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.mesh.surface_queries import make_surface, surface_distance
-from graspd_core.mesh.winding_number import winding_inside
-from graspd_core.reconstruction.grid_poisson import grid_poisson_field
-from graspd_core.reconstruction.merge_views import Surfels
-from graspd_core.reconstruction.poisson import BAND_CELLS, march
+from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
+from graspd_core.perception.reconstruct.merge_views import Surfels
+from graspd_core.perception.reconstruct.poisson import BAND_CELLS, grid_poisson_field, march
 
 CELL = 0.0025
 

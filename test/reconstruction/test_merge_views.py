@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError
-from graspd_core.mesh.mesh_distance import make_distance_query, unsigned_distance
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.merge_views import Surfels, merge_views, point_step, thin
-from graspd_core.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core.mesh.surface_queries import make_distance_query, unsigned_distance
+from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.reconstruct.merge_views import Surfels, merge_views, point_step, thin
 
 CAMERA = PinholeCamera(240, 180, 260.0, 260.0, 119.5, 89.5)
 SCENE = tabletop("mug", yaw=0.3)

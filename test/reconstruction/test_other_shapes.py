@@ -8,10 +8,9 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import BOX_HALF, make_shape
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.next_view import next_view
-from graspd_core.reconstruction.other_shapes import other_rules, other_shape
-from graspd_core.reconstruction.reconstruct import Reconstruction, reconstruct
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.reconstruct.hidden_side import next_view, other_rules, other_shape
+from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
 from graspd_core.types import Plane, TriangleMesh
 
 EYE = np.array([0.3, 0.15, 0.35])

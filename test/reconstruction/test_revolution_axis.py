@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from graspd_core.pointcloud.free_space import FreeSpace
-from graspd_core.reconstruction.merge_views import Surfels
-from graspd_core.reconstruction.revolution import find_revolution
-from graspd_core.reconstruction.revolution_axis import fit_axis, half_plane, settle_axis
+from graspd_core.perception.cloud.free_space import FreeSpace
+from graspd_core.perception.reconstruct.merge_views import Surfels
+from graspd_core.perception.reconstruct.revolution import find_revolution, fit_axis, half_plane, settle_axis
 
 
 def half_cone(seed: int, noise: float) -> tuple[Surfels, np.ndarray]:

@@ -8,14 +8,13 @@ from hypothesis import strategies as st
 from graspd_core.config import ReconstructionConfig
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import BOX_HALF, CYLINDER_HALF, CYLINDER_RADIUS, SPHERE_RADIUS, make_shape
-from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths, weigh
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.extrusion import extrude, stand
-from graspd_core.reconstruction.merge_views import Surfels, join, merge_views, point_step
-from graspd_core.reconstruction.revolution import find_revolution
-from graspd_core.reconstruction.revolution_axis import fit_axis
-from graspd_core.reconstruction.shape_completion import complete_shape, openness, plausible
-from graspd_core.reconstruction.symmetry import find_centre, find_mirrors, image
+from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths, weigh
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.reconstruct.extrusion import extrude, stand
+from graspd_core.perception.reconstruct.merge_views import Surfels, join, merge_views, point_step
+from graspd_core.perception.reconstruct.revolution import find_revolution, fit_axis
+from graspd_core.perception.reconstruct.shape_completion import complete_shape, openness, plausible
+from graspd_core.perception.reconstruct.symmetry import find_centre, find_mirrors, image
 
 EYE = np.array([0.3, 0.15, 0.35])
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_bench.rendering.depth_noise import DEFAULT, HIGH, LEVELS, LOW, NONE, DepthNoise, add_noise
 from graspd_core.errors import CloudError
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.rendering.depth_noise import DEFAULT, HIGH, LEVELS, LOW, NONE, DepthNoise, add_noise
+from graspd_core.perception.cloud.camera import PinholeCamera
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
 NEAR, FAR = 0.5, 0.8

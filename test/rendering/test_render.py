@@ -5,17 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_bench.rendering.render import BACKGROUND, look_at, render_depth, render_scene, render_shaded, save_png
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
-from graspd_core.pointcloud.camera import PinholeCamera, camera_rays, project
-from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.rendering.render import (
-    BACKGROUND,
-    look_at,
-    render_depth,
-    render_scene,
-    render_shaded,
-    save_png,
-)
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, project
 from graspd_core.types import TriangleMesh
 
 CAMERA = PinholeCamera(81, 61, 100.0, 100.0, 40.0, 30.0)

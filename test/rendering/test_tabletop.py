@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from graspd_core.errors import MeshError
-from graspd_core.mesh.shapes import CAPSULE_RADIUS, HEAD_HALF, PLATE_HALF, SHAPES, make_shape
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.rendering.depth_noise import DEFAULT, NONE
-from graspd_core.rendering.tabletop import (
+from graspd_bench.rendering.depth_noise import DEFAULT, NONE
+from graspd_bench.rendering.tabletop import (
     CAMERA,
     TABLE_HALF,
     depth_views,
@@ -17,6 +14,9 @@ from graspd_core.rendering.tabletop import (
     tabletop,
     views_of,
 )
+from graspd_core.errors import MeshError
+from graspd_core.mesh.shapes import CAPSULE_RADIUS, HEAD_HALF, PLATE_HALF, SHAPES, make_shape
+from graspd_core.perception.cloud.camera import PinholeCamera
 
 SMALL = PinholeCamera(160, 120, 154.0, 154.0, 79.5, 59.5)
 

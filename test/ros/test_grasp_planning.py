@@ -19,11 +19,11 @@ from rclpy.action.client import ActionClient
 from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from graspd_bench.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.pointcloud.depth_image import cloud_from_depth
-from graspd_core.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
+from graspd_core.perception.cloud.camera import cloud_from_depth
 from graspd_ros.grasp_planning import PlanningMessages, request_from_goal
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.outputs.error_codes import code_of

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
-from graspd_core.bags.messages import add_transforms
 from graspd_core.errors import GraspdError
+from graspd_core.io.bags import add_transforms
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.request_builder import RequestBuilder

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sensor_msgs.msg import PointCloud2, PointField
 
-from graspd_core.bags.messages import points_from_message
 from graspd_core.errors import CloudError
+from graspd_core.io.bags import points_from_message
 
 
 def encode(points: np.ndarray, order: str, formats: list[str], offsets: list[int], step: int, row_padding: int):

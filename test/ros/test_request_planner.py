@@ -15,7 +15,7 @@ from builtin_interfaces.msg import Time
 from graspd_core import Steering
 from graspd_core.errors import MeshError, TransformError
 from graspd_core.hands.library import load_hand
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import GraspResult, Outcome, Progress, Stage, Verdict
 from graspd_ros import request_planner as planning
 from graspd_ros.inputs.frames import matrix_of_pose

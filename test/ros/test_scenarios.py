@@ -29,10 +29,10 @@ from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
 
-from graspd_core.formats.read_grasps import grasps_of, load_document
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.rendering.depth_noise import DEFAULT
-from graspd_core.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
+from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
+from graspd_core.io.grasps_json import grasps_of, load_document
+from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}

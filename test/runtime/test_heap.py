@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core.runtime.heap import limit_malloc_arenas, trim_heap
+from graspd_core.runtime.worker_process import limit_malloc_arenas, trim_heap
 
 
 def resident() -> float:
@@ -43,7 +43,7 @@ def test_where_the_c_library_has_no_such_thing_nothing_is_raised(monkeypatch: py
 def test_threads_share_two_arenas_once_they_are_told_to():
     code = (
         "import threading, ctypes, sys\n"
-        "from graspd_core.runtime.heap import limit_malloc_arenas\n"
+        "from graspd_core.runtime.worker_process import limit_malloc_arenas\n"
         "if sys.argv[1] == 'shared': limit_malloc_arenas()\n"
         "wait = threading.Barrier(9)\n"
         "def work():\n"

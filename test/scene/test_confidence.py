@@ -8,8 +8,7 @@ import torch
 
 from graspd_core.errors import MeshError
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.confidence import sample_confidence
-from graspd_core.scene.scene import build_scene
+from graspd_core.perception.scene import build_scene, sample_confidence
 from graspd_core.types import Plane
 
 SPHERE = make_shape("sphere")

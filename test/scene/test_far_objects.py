@@ -5,20 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graspd_core.formats.grasps_json import save_result
-from graspd_core.formats.read_grasps import grasps_of, load_document
 from graspd_core.hands.library import load_hand
+from graspd_core.io.grasps_json import grasps_of, load_document, save_result
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape, shape_volume
 from graspd_core.mesh.topology import far_centre
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.planning.planning_scene import planning_scene
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import build_scene, object_parts
-from graspd_core.trials.hold_trial import hold_trial
-from graspd_core.trials.world import PROTOCOLS, build_world
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import build_scene, object_parts
+from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Outcome, Plane, TriangleMesh, Verdict
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.world import PROTOCOLS, build_world
 
 MAP = np.array([512_345.25, 5_401_234.5, 370.0])
 

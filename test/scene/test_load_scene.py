@@ -9,9 +9,8 @@ import torch
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape, shape_volume
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene_from_views import scene_from_views
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import load_scene, scene_from_views
 
 
 def test_file_scale_and_value_agree(tmp_path):

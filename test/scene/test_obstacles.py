@@ -12,7 +12,7 @@ from graspd_core.config import ObstacleConfig
 from graspd_core.mesh.mesh_files import mass_properties
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.obstacles import make_obstacles, padded_hull
+from graspd_core.perception.obstacles import make_obstacles, padded_hull
 from graspd_core.types import Plane
 
 TARGET = make_shape("box")

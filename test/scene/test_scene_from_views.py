@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.pointcloud.free_space import FreeSpace, empty_depth, make_view_depths
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.reconstruction.reconstruct import reconstruct
-from graspd_core.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.segmentation.segment import segment
-from graspd_core.segmentation.target_selection import Target
+from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.target_selection import Target
 
 # A box that hides the lower part of a ball from the camera.
 CROWDED = tabletop("sphere", obstacles=(("box", 0.115, 0.02),))

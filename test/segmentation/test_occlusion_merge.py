@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.depth_noise import LEVELS, NONE, DepthNoise
+from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.rendering.depth_noise import LEVELS, NONE, DepthNoise
-from graspd_core.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
-from graspd_core.segmentation.segment import Segmentation, segment
-from graspd_core.segmentation.target_selection import Target
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.segment.segment import Segmentation, segment
+from graspd_core.perception.segment.target_selection import Target
 
 
 def seen(scene: TabletopScene, elevation: float, turn: float = 0.0, noise: DepthNoise = NONE) -> PointCloud:

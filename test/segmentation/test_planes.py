@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.segmentation.clusters import extent, link_length, link_points, renumber
-from graspd_core.segmentation.planes import find_planes
+from graspd_core.perception.segment.clusters import extent, link_length, link_points, renumber
+from graspd_core.perception.segment.planes import find_planes
 
 EYE = np.array([[0.0, 0.0, 0.0]])
 

@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
-from graspd_core.bench.stress.broken_clouds import beside_a_step, half_out_of_view, zero_filled
+from graspd_bench.rendering.depth_noise import NONE
+from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
+from graspd_bench.stress.broken_clouds import beside_a_step, half_out_of_view, zero_filled
 from graspd_core.config import ReconstructionConfig, SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.point_cloud import PointCloud, measured
-from graspd_core.pointcloud.voxel_downsample import voxel_downsample
-from graspd_core.reconstruction.reconstruct import _clean
-from graspd_core.rendering.depth_noise import NONE
-from graspd_core.rendering.tabletop import ring_poses, tabletop, views_of
-from graspd_core.segmentation import support_plane as support
-from graspd_core.segmentation.occlusion_merge import merge_occluded
-from graspd_core.segmentation.planes import find_planes
-from graspd_core.segmentation.segment import segment
-from graspd_core.segmentation.target_selection import Target
+from graspd_core.perception.cloud.camera import PinholeCamera
+from graspd_core.perception.cloud.point_cloud import PointCloud, measured
+from graspd_core.perception.cloud.voxel_downsample import voxel_downsample
+from graspd_core.perception.reconstruct.reconstruct import _clean
+from graspd_core.perception.segment import support_plane as support
+from graspd_core.perception.segment.clusters import merge_occluded
+from graspd_core.perception.segment.planes import find_planes
+from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.target_selection import Target
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 STAGE = tabletop("box", yaw=0.3)

@@ -6,13 +6,13 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 
+from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.tabletop import TabletopScene, ring_poses, tabletop, views_of
 from graspd_core.mesh.shapes import SHAPES
-from graspd_core.pointcloud.camera import PinholeCamera
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.rendering.depth_noise import DEFAULT
-from graspd_core.rendering.tabletop import TabletopScene, ring_poses, tabletop, views_of
-from graspd_core.segmentation.segment import segment
-from graspd_core.segmentation.target_selection import Target
+from graspd_core.perception.cloud.camera import PinholeCamera
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.target_selection import Target
 
 # As a D415 with half its pixels each way.
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)

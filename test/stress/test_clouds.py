@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd_core.bench.stress.broken_clouds import bled
+from graspd_bench.rendering.depth_noise import DEFAULT, HIGH
+from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, depth_views, ring_poses, tabletop, views_of
+from graspd_bench.stress.broken_clouds import bled
 from graspd_core.errors import NoObjectError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.segment.segment import Target
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.pointcloud.point_cloud import PointCloud
-from graspd_core.rendering.depth_noise import DEFAULT, HIGH
-from graspd_core.rendering.tabletop import CAMERA, TabletopScene, depth_views, ring_poses, tabletop, views_of
-from graspd_core.scene.scene_from_views import scene_from_views
-from graspd_core.segmentation.segment import Target
 from graspd_core.types import Outcome, Verdict
 
 PAGE = Path(__file__).parents[2] / "docs" / "clouds.md"

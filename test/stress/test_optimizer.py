@@ -14,16 +14,14 @@ from torch import Tensor
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.methods.candidates import assemble
-from graspd_core.methods.closed_form.closed_form import ClosedForm
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.loop import Hooks, minimise
-from graspd_core.methods.plan_config import PlanConfig
-from graspd_core.methods.planner import PlannerInput, problem_of
-from graspd_core.methods.poses import Poses, pack, unpack
-from graspd_core.methods.problem import Problem, evaluate, hand_forward
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Scene
+from graspd_core.optimize.candidates import PlannerInput, assemble, problem_of
+from graspd_core.optimize.closed_form.closed_form import ClosedForm
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, Poses, minimise, pack, unpack
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.optimize.problem import Problem, evaluate, hand_forward
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
 
 PLAN = PlanConfig()
@@ -167,7 +165,7 @@ import resource, torch
 torch.set_num_threads(1)
 from graspd_core.hands.library import load_hand
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.scene.load_scene import load_scene
+from graspd_core.perception.load_scene import load_scene
 hand, scene = load_hand("allegro_right"), load_scene("shape:box")
 plan_grasps(scene, hand, count=1, preset="fast")
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()

@@ -12,7 +12,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import content_hash, mass_properties
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.scene import ObjectModel
+from graspd_core.perception.scene import ObjectModel
 from graspd_core.types import Grasp, Posture, TriangleMesh
 
 FINGER = """

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.trials import audit, hold_trial
-from graspd_core.trials.audit import audited_trials, is_audited
-from graspd_core.trials.trial_registry import TrialContext, grasp_trials
-from graspd_core.trials.world import PROTOCOLS, Protocol, build_world
 from graspd_core.types import AuditCount, Grasp, StopHook, TrialResult
+from graspd_core.verify import hold_trial
+from graspd_core.verify import trial_registry as audit
+from graspd_core.verify.trial_registry import TrialContext, audited_trials, grasp_trials, is_audited
+from graspd_core.verify.world import PROTOCOLS, Protocol, build_world
 
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
 

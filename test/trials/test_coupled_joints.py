@@ -14,9 +14,9 @@ import pytest
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel, all_joint_positions
-from graspd_core.trials.hold_trial import hold_trial, set_hand_pose, set_joints
-from graspd_core.trials.world import PROTOCOLS, World, build_world
 from graspd_core.types import Grasp, Posture
+from graspd_core.verify.hold_trial import hold_trial, set_hand_pose, set_joints
+from graspd_core.verify.world import PROTOCOLS, World, build_world
 
 STANDARD = PROTOCOLS["standard"]
 AWAY = np.array([0.0, 0.0, -1.0])

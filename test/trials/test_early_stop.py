@@ -15,13 +15,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graspd_bench.trials import TOLERANCE, gravity_trial
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.candidates import find_candidates
-from graspd_core.methods.loop import Hooks
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import Scene, object_parts
-from graspd_core.trials.early_stop import (
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.types import Grasp, Plane
+from graspd_core.verify.early_stop import (
     CHECK_EVERY,
     CREEPING,
     FIRM,
@@ -31,12 +33,9 @@ from graspd_core.trials.early_stop import (
     answer_known,
     stop_rule,
 )
-from graspd_core.trials.gravity_trial import TOLERANCE, gravity_trial
-from graspd_core.trials.hold_trial import hold_trial
-from graspd_core.trials.lift_trial import lift_trial
-from graspd_core.trials.noisy_trial import displaced, pose_errors
-from graspd_core.trials.world import PROTOCOLS, Protocol, World, at_friction, build_world, trial_data
-from graspd_core.types import Grasp, Plane
+from graspd_core.verify.hold_trial import displaced, hold_trial, pose_errors
+from graspd_core.verify.lift_trial import lift_trial
+from graspd_core.verify.world import PROTOCOLS, Protocol, World, at_friction, build_world, trial_data
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 SOFT = {"slide_stiffness": 500.0, "slide_damping": 10.0}

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graspd_bench.trials import Lifted, lift_out, placed, settle
 from graspd_core.hands.model import HandModel
-from graspd_core.trials.bodies import FreeBody
-from graspd_core.trials.free_bodies import Lifted, lift_out, placed, settle
-from graspd_core.trials.lift_trial import LiftSettings
-from graspd_core.trials.world import PROTOCOLS
 from graspd_core.types import Grasp, Posture
+from graspd_core.verify.lift_trial import LiftSettings
+from graspd_core.verify.world import PROTOCOLS, FreeBody
 
 # As in test_lift_trial.py: a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)

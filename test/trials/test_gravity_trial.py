@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from graspd_core.trials.gravity_trial import LOST, gravity_trial
-from graspd_core.trials.world import PROTOCOLS, World, build_world
+from graspd_bench.trials import LOST, gravity_trial
+from graspd_core.verify.world import PROTOCOLS, World, build_world
 
 STANDARD = PROTOCOLS["standard"]
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from graspd_core.hands.model import HandModel
-from graspd_core.trials import world as trial_world
-from graspd_core.trials.hold_trial import hold_trial
-from graspd_core.trials.noisy_trial import displaced, noisy_trial, pose_error
-from graspd_core.trials.world import PROTOCOLS, Protocol, World, build_world
 from graspd_core.types import Posture, Verdict
+from graspd_core.verify import world as trial_world
+from graspd_core.verify.hold_trial import displaced, hold_trial, noisy_trial, pose_error
+from graspd_core.verify.world import PROTOCOLS, Protocol, World, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)

@@ -14,11 +14,11 @@ import pytest
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.scene.scene import Obstacle
-from graspd_core.trials.lift_trial import LiftSettings, lift_trial, retreat_posture
-from graspd_core.trials.trial_registry import TrialContext, grasp_trials
-from graspd_core.trials.world import PROTOCOLS, World, build_world
+from graspd_core.perception.scene import Obstacle
 from graspd_core.types import Plane, TrialResult, TriangleMesh, Verdict
+from graspd_core.verify.lift_trial import LiftSettings, lift_trial, retreat_posture
+from graspd_core.verify.trial_registry import TrialContext, grasp_trials
+from graspd_core.verify.world import PROTOCOLS, World, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from graspd_core.errors import ConfigError
-from graspd_core.trials.trial_recording import record_trial
-from graspd_core.trials.trial_registry import TrialContext, grasp_trials
-from graspd_core.trials.world import PROTOCOLS, build_world
 from graspd_core.types import Plane
+from graspd_core.verify.trial_registry import TrialContext, grasp_trials
+from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_viewer.trial_controls import record_trial
 
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
 TABLE = Plane(np.array([0.0, 0.0, -1.0]), -0.02)

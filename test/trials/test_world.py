@@ -14,8 +14,8 @@ import pytest
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import MUG_HALF, MUG_WALL, make_shape
-from graspd_core.trials.hold_trial import DIRECTIONS, start_penetration
-from graspd_core.trials.world import PROTOCOLS, World, at_friction, build_world
+from graspd_core.verify.hold_trial import DIRECTIONS, start_penetration
+from graspd_core.verify.world import PROTOCOLS, World, at_friction, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)

@@ -16,10 +16,10 @@ import torch
 from PIL import Image
 
 from graspd_core import GraspResult, load_hand, load_preset, load_scene, plan_grasps, save_result
-from graspd_core.scene.scene import object_parts
-from graspd_core.trials.trial_registry import build_worlds, grasp_trials
-from graspd_core.trials.world import PROTOCOLS
+from graspd_core.perception.scene import object_parts
 from graspd_core.types import Grasp
+from graspd_core.verify.trial_registry import build_worlds, grasp_trials
+from graspd_core.verify.world import PROTOCOLS
 
 FLAGS = [
     "--no-sandbox",
@@ -174,7 +174,7 @@ def grasps_file(result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def viewer() -> Iterator[Any]:
     """A page on a free port that nothing is shown on yet."""
     pytest.importorskip("viser", reason="viser is not installed: pip install 'graspd[view]'")
-    from graspd_core.viewer.viewer import Viewer
+    from graspd_viewer.viewer import Viewer
 
     viewer = Viewer(port=0)
     yield viewer

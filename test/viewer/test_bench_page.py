@@ -8,14 +8,14 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from graspd_core.bench.measurements.measurement import Cell, run_cell
-from graspd_core.bench.result_store import write_results
-from graspd_core.bench.run_cases import Job, run_job
+from graspd_bench.measurement import Cell, run_cell
+from graspd_bench.result_store import write_results
+from graspd_bench.run_studies import Job, run_job
 from graspd_core.cli import main
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.methods.plan_config import load_preset
-from graspd_core.viewer.bench_page import bench_page, plan_again, serve_page
-from graspd_core.viewer.session import Session
+from graspd_core.optimize.plan_config import load_preset
+from graspd_viewer.bench_page import bench_page, plan_again, serve_page
+from graspd_viewer.session import Session
 
 
 def a_record(name: str, seconds: float, *, held: bool = True, thing: str = "box") -> dict:

@@ -11,11 +11,11 @@ import pytest
 
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.planning.steering.steering import angle_of_approach
+from graspd_core.planning.steering import angle_of_approach
 from graspd_core.types import TriangleMesh
-from graspd_core.viewer.drawing import OBJECT, Part
-from graspd_core.viewer.scene_nodes import PER_METRE
-from graspd_core.viewer.session import open_grasps
+from graspd_viewer.drawing import OBJECT, Part
+from graspd_viewer.scene_nodes import PER_METRE
+from graspd_viewer.session import open_grasps
 
 
 def places(viewer) -> np.ndarray:
@@ -194,7 +194,7 @@ def test_a_bad_file_is_refused_with_its_reason(viewer, visit, name: str, content
 
 
 def test_a_page_that_is_closed_leaves_no_thread_behind(visit):
-    from graspd_core.viewer.viewer import Viewer
+    from graspd_viewer.viewer import Viewer
 
     before = set(threading.enumerate())
     viewer = Viewer(port=0)

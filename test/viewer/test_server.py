@@ -11,10 +11,10 @@ from graspd_core.cli import main
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.planning.steering.steering import angle_of_approach
-from graspd_core.viewer import server as viewer_server
-from graspd_core.viewer.plan_request import PlanRequest, Upload, check, load_object
-from graspd_core.viewer.server import may_connect
+from graspd_core.planning.steering import angle_of_approach
+from graspd_viewer import server as viewer_server
+from graspd_viewer.plan_tab import PlanRequest, Upload, check, load_object
+from graspd_viewer.server import may_connect
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'graspd[view]'")
 
@@ -137,7 +137,7 @@ def test_the_hand_comes_from_the_side_that_was_chosen(side, way):
 
 def test_a_file_is_called_by_its_visitors_name_and_read_from_nowhere_else(monkeypatch):
     # Here, because the child of a test run would stay behind.
-    monkeypatch.setattr("graspd_core.viewer.plan_request.start_planning_worker", lambda: None)
+    monkeypatch.setattr("graspd_viewer.plan_tab.start_planning_worker", lambda: None)
     box = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
     sent = PlanRequest(**{**vars(GOOD), "upload": Upload("../../my thing.obj", box)})
     check(sent)

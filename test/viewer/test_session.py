@@ -11,17 +11,15 @@ import pytest
 import torch
 
 from graspd_core.errors import FormatError, HandError, MeshError
-from graspd_core.methods.poses import Poses
-from graspd_core.methods.stages.contact_set import find_contacts
-from graspd_core.runtime.latest_jobs import LatestJobs
+from graspd_core.optimize.grasp_postures import find_contacts
+from graspd_core.optimize.loop import Poses
 from graspd_core.types import HYPOTHESES, Snapshot, TrialResult, Verdict
-from graspd_core.viewer.drawing import sdf_slice, slice_axes
-from graspd_core.viewer.grasp_list import figures_html, label, listed, table_html
-from graspd_core.viewer.live_view import LiveView
-from graspd_core.viewer.mechanics import Mechanics
-from graspd_core.viewer.motion import placed_links, posture_at, skeletons
-from graspd_core.viewer.scene_nodes import SceneNodes
-from graspd_core.viewer.session import open_grasps
+from graspd_viewer.drawing import Mechanics, placed_links, posture_at, sdf_slice, skeletons, slice_axes
+from graspd_viewer.grasp_list import figures_html, label, listed, table_html
+from graspd_viewer.live_view import LiveView
+from graspd_viewer.scene_nodes import SceneNodes
+from graspd_viewer.server import LatestJobs
+from graspd_viewer.session import open_grasps
 
 
 def changed(grasps_file, tmp_path, **changes):

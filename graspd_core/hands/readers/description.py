@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from graspd_core.config.yaml_text import YamlError, parse_yaml
+from graspd_core.config.mapping import YamlError, parse_yaml
 from graspd_core.errors import HandError, shown
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses

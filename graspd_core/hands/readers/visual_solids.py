@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.readers.urdf_geometry import read_visuals
+from graspd_core.hands.readers.urdf import read_visuals
 from graspd_core.hands.readers.xml_io import read_xml
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import simplify

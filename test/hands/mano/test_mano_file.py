@@ -14,8 +14,7 @@ from scipy.sparse import csr_matrix
 
 from graspd_core.errors import HandError
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.mano.mano_file import read_mano
-from graspd_core.hands.mano.mano_numbers import ADMITTED, numbers, read_pickle
+from graspd_core.hands.mano.mano_file import ADMITTED, numbers, read_mano, read_pickle
 from graspd_core.runtime.inert_pickle import Maker
 
 SYNTHETIC = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "mano_synthetic.py"))

@@ -11,8 +11,7 @@ import torch
 from graspd_core import load_hand, load_scene
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.planning.steering.avoided_boxes import boxes_in_reach, entered
-from graspd_core.planning.steering.regions import Box
+from graspd_core.planning.regions import Box, boxes_in_reach, entered
 from graspd_core.types import Posture
 
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.errors import ConfigError
-from graspd_core.planning.steering.regions import Box, NearPoints, Sphere
+from graspd_core.planning.regions import Box, NearPoints, Sphere
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 

@@ -13,19 +13,17 @@ from graspd_core.errors import ConfigError
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.topology import moved_mesh
-from graspd_core.methods.aimed_starts import Roll
-from graspd_core.methods.initial_poses import draw_starts
-from graspd_core.methods.restrictions import BoundRestrictions, Refusal
-from graspd_core.planning.steering.avoided_boxes import entered
-from graspd_core.planning.steering.regions import Box, NearPoints, Sphere
-from graspd_core.planning.steering.steering import (
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.restrictions import BoundRestrictions, Refusal, Roll
+from graspd_core.planning.regions import Box, NearPoints, Sphere, entered
+from graspd_core.planning.steering import (
     CONTACT_TOLERANCE,
     Steering,
     angle_of_approach,
     hand_side,
     outside_region,
+    untouched_part,
 )
-from graspd_core.planning.steering.untouched_part import untouched_part
 from graspd_core.se3 import axis_rotation
 from graspd_core.types import Outcome, Plane
 

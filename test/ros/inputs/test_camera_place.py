@@ -11,11 +11,11 @@ from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspRequest
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
+from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError, TransformError
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.pointcloud.camera import PinholeCamera, camera_rays
-from graspd_core.rendering.depth_noise import DEFAULT
-from graspd_core.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_ros.inputs.camera_place import CameraPlace, place_of, seen_by_camera
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.sensor_frames import cloud_frame

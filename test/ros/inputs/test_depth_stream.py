@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 from std_msgs.msg import Header
 
-from graspd_core.bags.messages import camera_from_message
 from graspd_core.errors import CloudError
-from graspd_core.pointcloud.camera import distort
-from graspd_core.pointcloud.depth_image import cloud_from_depth
+from graspd_core.io.bags import camera_from_message
+from graspd_core.perception.cloud.camera import cloud_from_depth, distort
 from graspd_ros.inputs.depth_stream import ImagePairs, frame_of
 
 SECOND = 1_000_000_000

@@ -16,8 +16,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from graspd_core.errors import CloudError, GraspdError, NoObjectError, ResourceError, TransformError
-from graspd_core.methods.plan_config import preset_names
-from graspd_core.pointcloud.point_cloud import PointCloud
+from graspd_core.optimize.plan_config import preset_names
+from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.requests import MOST_CLOUD_BYTES, check_request, pose_matrix, settings_of
 from graspd_ros.inputs.sensor_frames import MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed

@@ -8,7 +8,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from graspd_core import load_hand
-from graspd_core.arms.hand_way import STAGE_ROWS
+from graspd_core.arms.arm_paths import STAGE_ROWS
 from graspd_core.types import ArmPath, Grasp, Posture
 from graspd_ros.outputs.arm_trajectory import arm_trajectory
 from graspd_ros.outputs.messages import grasp_message

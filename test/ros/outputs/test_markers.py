@@ -14,7 +14,7 @@ from rclpy.serialization import serialize_message
 from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker
 
-from graspd_core.hands.hand_mesh import hand_mesh
+from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir

@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from graspd_core.hands.library import load_hand
-from graspd_core.methods.plan_config import preset_names
+from graspd_core.optimize.plan_config import preset_names
 from graspd_core.types import HYPOTHESES, GraspResult, Outcome, Posture, Timing, TrialResult
 from graspd_core.types import Grasp as CoreGrasp
 from graspd_ros.inputs.frames import moved_result

@@ -18,18 +18,8 @@ from visualization_msgs.msg import MarkerArray
 
 from graspd_core.errors import MeshError
 from graspd_core.hands.library import load_hand
-from graspd_core.scene.scene import Scene
-from graspd_core.types import (
-    Contact,
-    Grasp,
-    GraspResult,
-    Outcome,
-    Posture,
-    Progress,
-    Stage,
-    Timing,
-    TrialResult,
-)
+from graspd_core.perception.scene import Scene
+from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Progress, Stage, Timing, TrialResult
 from graspd_ros.inputs.requests import Request
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings

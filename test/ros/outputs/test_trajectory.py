@@ -21,11 +21,11 @@ from trajectory_msgs.msg import JointTrajectory
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.scene.load_scene import load_scene
-from graspd_core.scene.scene import object_parts
-from graspd_core.trials.world import PROTOCOLS, build_world
 from graspd_core.types import Grasp, Posture
+from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_ros.outputs.trajectory import Pace, base_poses, stage_times, trajectory_of
 
 HAND = load_hand("allegro_right")

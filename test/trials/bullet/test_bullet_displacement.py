@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.bench.bullet import bullet_world as bullet
-from graspd_core.bench.bullet.bullet_world import (
+from graspd_bench.bullet import bullet_world as bullet
+from graspd_bench.bullet.bullet_world import (
     OBMAN,
     BulletWorld,
     build_bullet_world,
     bullet_displacement,
     displacements,
 )
+from graspd_bench.trials import FrozenWorld, build_frozen_world, displacement_trial
 from graspd_core.errors import SimulatorError
 from graspd_core.mesh.mesh_files import content_hash, mass_properties
-from graspd_core.scene.scene import ObjectModel
+from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
-from graspd_core.trials.displacement_trial import FrozenWorld, build_frozen_world, displacement_trial
-from graspd_core.trials.hold_trial import DIRECTIONS
 from graspd_core.types import Posture, TriangleMesh
+from graspd_core.verify.hold_trial import DIRECTIONS
 
 pytest.importorskip("pybullet")
 

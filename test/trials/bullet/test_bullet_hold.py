@@ -10,17 +10,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core.bench.bullet.bullet_hand import load_hand_urdf, roll_pitch_yaw
-from graspd_core.bench.bullet.bullet_hold import bullet_hold_trial
-from graspd_core.bench.bullet.bullet_world import BulletWorld, build_bullet_world, simulation
+from graspd_bench.bullet.bullet_hold import bullet_hold_trial
+from graspd_bench.bullet.bullet_world import BulletWorld, build_bullet_world, load_hand_urdf, roll_pitch_yaw, simulation
 from graspd_core.errors import SimulatorError
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mimic
 from graspd_core.hands.readers.xml_io import rotation_from_rpy
 from graspd_core.se3 import random_rotations, rotation_from_quaternion
-from graspd_core.trials.hold_trial import hold_trial
-from graspd_core.trials.world import PROTOCOLS, build_world
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.world import PROTOCOLS, build_world
 
 pybullet = pytest.importorskip("pybullet")
 

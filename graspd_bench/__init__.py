@@ -1,0 +1,1 @@
+"""The benchmark: studies, charts and tables, and what only they need."""

@@ -1,0 +1,384 @@
+"""Settings of simulated annealing.
+
+A low-dimensional space of postures for any hand, and the places on the inside of its links.
+
+Eigengrasps (Ciocarlie and Allen, IJRR 2009) are the principal components of how people shape their hands. No such
+recordings exist for an arbitrary hand, so here they are those of seeded random postures between open and closed, in
+which the fingers mostly close together: the first is the hand's closing, the next are how fingers differ.
+
+A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
+
+A chain's state is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, the mean over
+chosen places on the inside of the hand of their distance to the object and of how far they face away from it,
+
+    E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i the unit direction from the place to the object,
+
+and states in which the hand collides are refused. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛) for k from
+30,000 to 100,000, jumps drawn by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each
+chain is then closed until contact, and the best of those by ε are kept. ε is Ferrari and Canny's for forces that sum
+to one, over sampled wrenches instead of the hull's faces, so an upper bound. Batched over chains; no gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from graspd_core.hands.kinematics import link_poses, place_points, placement
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import collision_spheres
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.optimize.finger_closing import finger_of, link_gaps, make_closing, sphere_overlap
+from graspd_core.optimize.grasp_postures import ContactSet, find_contacts
+from graspd_core.optimize.loop import Hooks, Poses, minimise
+from graspd_core.optimize.losses import disturbance_directions, wrench_support
+from graspd_core.optimize.obstacle_distance import obstacle_gaps
+from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
+
+
+@dataclass(frozen=True)
+class AnnealingConfig:
+    """A GraspIt!-style planner: simulated annealing in a low-dimensional space of hand postures.
+
+    Attributes:
+        chains_per_grasp: chains run for each grasp asked for, one grasp each; the best by ε are kept.
+        keep_per_grasp: closed grasps kept for each grasp asked for.
+        steps: states tried by each chain.
+        eigengrasps: dimensions of the space of hand postures.
+        contacts_per_link: places on the inside of each link that are drawn to the object.
+        normal_weight: what a contact location that faces away from the object costs, as a distance [m].
+        translation_jump: largest jump of the base [m].
+        rotation_jump: largest turn of the base about each of its axes [rad].
+        posture_jump: largest jump along an eigengrasp, as a share of its range.
+        close_steps: of the closing of the best states, from open to closed.
+        directions: wrenches that ε is the least resistance against.
+    """
+
+    chains_per_grasp: float = 4.0
+    keep_per_grasp: float = 2.0
+    steps: int = 2500
+    eigengrasps: int = 2
+    contacts_per_link: int = 2
+    normal_weight: float = 0.05
+    translation_jump: float = 0.1
+    rotation_jump: float = 0.63
+    posture_jump: float = 0.25
+    close_steps: int = 60
+    directions: int = 256
+
+
+# Random postures, how far fingers differ from the common closing (shares), and joints from their finger (range).
+_POSTURES, _FINGER_SPREAD, _JOINT_SPREAD = 512, 0.3, 0.05
+# The inside of a group of links: where its surface faces the way that closing moves it (cosine), or comes nearest to
+# facing it; a group that never does by as much as the second has no inside.
+_FACING, _LEAST_FACING = 0.85, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class PostureSpace:
+    """Postures `center + amplitudes @ basis`, clamped to the joint limits.
+
+    Attributes:
+        center: the mean posture [rad] or [m].
+        basis: the eigengrasps, orthonormal rows, in units of joint range.
+        low, high: the range of each amplitude.
+    """
+
+    center: Float[np.ndarray, "joints"]
+    basis: Float[np.ndarray, "dimensions joints"]
+    low: Float[np.ndarray, "dimensions"]
+    high: Float[np.ndarray, "dimensions"]
+
+
+def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
+    """The first principal components of random postures; fewer where the hand has fewer joints that vary."""
+    rng = np.random.default_rng(seed)
+    fingers = finger_of(hand)
+    span = hand.upper - hand.lower
+    common = rng.uniform(0.0, 1.0, (_POSTURES, 1))
+    share = common + _FINGER_SPREAD * rng.uniform(-1.0, 1.0, (_POSTURES, int(fingers.max()) + 1))[:, fingers]
+    postures = hand.open_posture + share * (hand.closed_posture - hand.open_posture)
+    postures += _JOINT_SPREAD * span * rng.uniform(-1.0, 1.0, postures.shape)
+    postures = np.clip(postures, hand.lower, hand.upper)
+    center = postures.mean(0)
+    # In units of each joint's range, so that metres and radians weigh alike.
+    scaled = (postures - center) / span
+    values, rows = np.linalg.svd(scaled, full_matrices=False)[1:]
+    rows = rows[: min(dimensions, int((values > 1e-9 * values[0]).sum()))]
+    # The sign of a component is arbitrary: closing is positive.
+    sign = np.where(rows @ ((hand.closed_posture - hand.open_posture) / span) < 0, -1.0, 1.0)
+    rows = rows * sign[:, None]
+    amplitudes = scaled @ rows.T
+    return PostureSpace(center, rows * span, amplitudes.min(0), amplitudes.max(0))
+
+
+def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"]:
+    """Indices of contact candidates on the inside of the hand: the palm's, and those that closing moves ahead of it.
+
+    For each rigid group of links the one nearest to the middle of its inside, then those farthest from the chosen.
+    """
+    chosen: list[int] = []
+    facing = _facing(hand)
+    group = hand.link_group[hand.candidate_link]
+    rotation, translation = link_poses(hand, hand.open_posture)
+    hand_forward = np.einsum("pij,pj->pi", rotation[hand.candidate_link], hand.candidate_points)
+    hand_forward += translation[hand.candidate_link]
+    for number in np.unique(group):
+        most = float(facing[group == number].max())
+        if most < _LEAST_FACING:
+            continue
+        inside = np.flatnonzero((group == number) & (facing >= min(most, _FACING)))
+        middle = hand.palm_center if number == hand.link_group[0] else hand_forward[inside].mean(0)
+        away = np.linalg.norm(hand_forward[inside] - middle, axis=1)
+        picks = [int(away.argmin())]
+        for _ in range(min(per_link, len(inside)) - 1):
+            nearest = np.linalg.norm(hand_forward[inside][:, None] - hand_forward[inside][picks], axis=-1).min(1)
+            picks.append(int(nearest.argmax()))
+        chosen += inside[picks].tolist()
+    return np.array(chosen, dtype=np.int64)
+
+
+def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
+    """Cosine between each candidate's outward normal and the way that closing moves it; for the palm, its normal."""
+    links = hand.candidate_link
+    early, late = (
+        link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
+    )
+
+    def points(frames) -> Float[np.ndarray, "candidates 3"]:
+        return np.einsum("pij,pj->pi", frames[0][links], hand.candidate_points) + frames[1][links]
+
+    motion = points(late) - points(early)
+    length = np.linalg.norm(motion, axis=1)
+    still = length < 1e-6
+    motion = np.where(still[:, None], hand.palm_normal, motion / np.maximum(length, 1e-6)[:, None])
+    normals = np.einsum("pij,pj->pi", early[0][links], hand.candidate_normals)
+    # Links that stand still but are not the palm have no inside.
+    idle = still & (hand.link_group[links] != hand.link_group[0])
+    return np.where(idle, 0.0, (normals * motion).sum(1))
+
+
+# GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
+_T0, _COOLING, _DIMENSIONS, _FIRST, _LAST = 1e6, 7.0, 8, 30_000, 100_000
+# Energies are accepted at this many times the temperature [m].
+_ENERGY_SCALE = 1e3
+# Overlap of the hand's proxy spheres that is not yet a collision, beyond that of the open hand [m].
+_SELF_SLACK = 0.002
+_FEWEST_CHAINS, _FEWEST_KEPT = 16, 8
+
+
+@dataclass(frozen=True)
+class ChainState:
+    """States of a batch of chains and the best that each has seen.
+
+    Attributes:
+        x: base translation [m], base quaternion, amplitudes.
+        energy: [m]; infinite where the state collides.
+        best_x, best_energy: of the best legal state so far.
+    """
+
+    x: Float[Tensor, "batch variables"]
+    energy: Float[Tensor, "batch"]
+    best_x: Float[Tensor, "batch variables"]
+    best_energy: Float[Tensor, "batch"]
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """The annealing as a solver for the shared loop; build with `make_annealing`.
+
+    Attributes:
+        config: its settings.
+        seed: of the jumps.
+        center, basis, low, high: the space of postures, see `eigengrasps.PostureSpace`.
+        lower, upper: joint limits [rad] or [m].
+        contacts: places the chosen contact locations, see `hands.kinematics.placement`.
+        normals: places their outward normals likewise.
+        sphere_links: link of each proxy sphere of the problem.
+        self_overlap: depth of the hand's proxy spheres in each other that is allowed [m].
+    """
+
+    config: AnnealingConfig
+    seed: int
+    center: Float[Tensor, "joints"]
+    basis: Float[Tensor, "dimensions joints"]
+    low: Float[Tensor, "dimensions"]
+    high: Float[Tensor, "dimensions"]
+    lower: Float[Tensor, "joints"]
+    upper: Float[Tensor, "joints"]
+    contacts: Float[Tensor, "contacts columns"]
+    normals: Float[Tensor, "contacts columns"]
+    sphere_links: Int[Tensor, "spheres"]
+    self_overlap: float
+
+    @property
+    def steps(self) -> int:
+        return self.config.steps
+
+    def init(self, problem: Problem, starts: Poses) -> ChainState:
+        # The hand begins open: every amplitude is the one nearest to the start's joints.
+        amplitudes = (starts.joints - self.center) @ torch.linalg.pinv(self.basis)
+        x = torch.cat([starts.translation, starts.quaternion, amplitudes.clamp(self.low, self.high)], -1)
+        energy = self.energy(problem, x)
+        return ChainState(x, energy, x, energy)
+
+    def step(self, problem: Problem, state: ChainState, index: int) -> ChainState:
+        temperature = cooling(index / max(self.steps, 1))
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + index) % 2**63)
+        drawn = torch.rand(len(state.x), 7 + len(self.low), generator=generator).to(state.x)
+        tried = self.neighbour(state.x, jump(drawn[:, 1:], temperature))
+        energy = self.energy(problem, tried)
+        # From a start that collides every legal state is welcome.
+        rise = torch.where(torch.isfinite(state.energy), energy - state.energy, torch.where(energy < 1e3, -1.0, 1.0))
+        taken = drawn[:, 0] < (-rise / (_ENERGY_SCALE * temperature)).exp()
+        # The dear test last, of the few states that would be taken.
+        taken = taken.masked_scatter(taken, ~self.pierced(problem, tried[taken]))
+        better = taken & (energy < state.best_energy)
+        return ChainState(
+            torch.where(taken[:, None], tried, state.x),
+            torch.where(taken, energy, state.energy),
+            torch.where(better[:, None], tried, state.best_x),
+            torch.where(better, energy, state.best_energy),
+        )
+
+    def best(self, state: ChainState) -> tuple[Poses, Float[Tensor, "batch"]]:
+        return self.poses(state.best_x), state.best_energy
+
+    def poses(self, x: Float[Tensor, "batch variables"]) -> Poses:
+        """The hands of states."""
+        return Poses(x[:, :3], x[:, 3:7], (self.center + x[:, 7:] @ self.basis).clamp(self.lower, self.upper))
+
+    def neighbour(
+        self, x: Float[Tensor, "batch variables"], jumps: Float[Tensor, "batch jumps"]
+    ) -> Float[Tensor, "batch variables"]:
+        """States a jump away, jumps in units of the largest: three of place, three of turn, then amplitudes."""
+        config = self.config
+        translation = x[:, :3] + config.translation_jump * jumps[:, :3]
+        half = 0.5 * config.rotation_jump * jumps[:, 3:6]
+        turned = quaternion_product(torch.cat([torch.ones_like(half[:, :1]), half], -1), x[:, 3:7])
+        amplitudes = x[:, 7:] + config.posture_jump * (self.high - self.low) * jumps[:, 6:]
+        quaternion = turned / turned.norm(dim=-1, keepdim=True)
+        return torch.cat([translation, quaternion, amplitudes.clamp(self.low, self.high)], -1)
+
+    @torch.no_grad()
+    def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
+        """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
+        poses = self.poses(x)
+        placed = hand_forward(problem, problem.hand.coarse, poses.translation, poses.quaternion, poses.joints)
+        points = placed.base.apply(place_points(self.contacts, placed.links))
+        outward = place_points(self.normals, placed.links) @ placed.base.rotation.transpose(-1, -2)
+        distance, normal = sample_sdf(problem.object.sdf, torch.cat([placed.points, points], 1))
+        count = len(self.contacts)
+        away = 1.0 + (outward * normal[:, -count:]).sum(-1)
+        energy = (distance[:, -count:].abs() + self.config.normal_weight * away).mean(-1)
+        legal = (distance.amin(-1) >= 0.0) & self.clear(problem, placed)
+        return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
+
+    def clear(self, problem: Problem, placed: HandPlacement) -> Bool[Tensor, "batch"]:
+        """Whether the hand keeps clear of itself and of obstacles."""
+        clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
+        if problem.obstacles is None:
+            return clear
+        return clear & (obstacle_gaps(problem.obstacles, placed.base, placed.links).amin(-1) >= 0.0)
+
+    @torch.no_grad()
+    def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
+        """Whether object and hand overlap, by all of the hand's points and the object's sharp ones."""
+        if len(x) == 0:
+            return torch.zeros(0, dtype=torch.bool, device=x.device)
+        return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0
+
+
+def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, seed: int) -> Annealing:
+    """The annealing of one hand about one object."""
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values).to(problem.hand.lower)
+
+    space = posture_space(hand, config.eigengrasps, seed)
+    chosen = inner_contacts(hand, config.contacts_per_link)
+    links = torch.as_tensor(hand.candidate_link[chosen]).to(problem.hand.coarse.links)
+    points, normals = tensor(hand.candidate_points[chosen]), tensor(hand.candidate_normals[chosen])
+    stands = Poses(
+        problem.object.center[None], torch.eye(4).to(problem.hand.lower)[:1], tensor(hand.open_posture)[None]
+    )
+    opened = hand_forward(problem, problem.hand.coarse, stands.translation, stands.quaternion, stands.joints)
+    return Annealing(
+        config=config,
+        seed=seed,
+        center=tensor(space.center),
+        basis=tensor(space.basis),
+        low=tensor(space.low),
+        high=tensor(space.high),
+        lower=problem.hand.lower,
+        upper=problem.hand.upper,
+        contacts=placement(hand.num_links, points, links),
+        normals=placement(hand.num_links, normals, links, directions=True),
+        sphere_links=torch.as_tensor(collision_spheres(hand)[2]).to(links),
+        self_overlap=_SELF_SLACK + float(sphere_overlap(problem, opened).max()),
+    )
+
+
+def cooling(progress: float) -> float:
+    """GraspIt!'s default temperature at a share of its run."""
+    k = _FIRST + progress * (_LAST - _FIRST)
+    return _T0 * math.exp(-_COOLING * k ** (1 / _DIMENSIONS))
+
+
+def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
+    """Ingber's distribution of jumps (1989) from numbers in [0, 1): between −1 and 1, mostly of the size of T."""
+    side = 2 * uniform - 1
+    return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
+
+
+def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"]) -> Float[Tensor, "batch 4"]:
+    """Hamilton's product: the turn b, then the turn a."""
+    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(-1, keepdim=True)
+    v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])
+    return torch.cat([w, v], -1)
+
+
+def sampled_epsilon(
+    problem: Problem, contact_set: ContactSet, directions: Float[Tensor, "directions 6"]
+) -> Float[Tensor, "batch"]:
+    """Ferrari and Canny's ε for forces that sum to one, with hard contacts: min over directions of max over contacts.
+
+    An upper bound of the true radius, because only these directions are looked at; zero without force closure.
+    """
+    batch, slots = contact_set.active.shape
+    support = wrench_support(
+        ((contact_set.position - problem.object.center) / problem.object.length).reshape(-1, 1, 3),
+        contact_set.normal.reshape(-1, 1, 3),
+        contact_set.active.to(problem.hand.lower).reshape(-1, 1),
+        directions,
+        problem.friction,
+    )
+    return support.reshape(batch, slots, -1).amax(1).amin(-1)
+
+
+def plan(task: PlannerInput) -> PlannerOutput:
+    """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
+    settings, hooks = task.config.settings, task.hooks
+    problem = problem_of(task)
+    annealing = make_annealing(problem, task.hand, settings, task.seed)
+    starts = initial_poses_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
+    if len(starts.joints) == 0:
+        return PlannerOutput(problem, starts)
+    annealed = minimise(annealing, problem, starts, hooks)
+    legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
+    if annealed.interrupted == "cancelled" or len(legal) == 0:
+        return PlannerOutput(problem, annealed.poses[legal], annealed.interrupted)
+    # What the deadline cut short is closed all the same: open fingers would be no grasps.
+    closing = make_closing(problem, task.hand, settings.close_steps)
+    closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
+    contact_set = find_contacts(problem, closed.poses, task.config.grasp_stages.touch_reach)
+    directions = disturbance_directions(settings.directions, task.seed).to(problem.hand.lower)
+    epsilon = sampled_epsilon(problem, contact_set, directions)
+    kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
+    return PlannerOutput(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)

@@ -1,0 +1,121 @@
+"""Settings of the random baseline.
+
+The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
+
+The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open, and moves along
+its normal until the hand first touches; then the fingers close (`closing`). Nothing is chosen by quality: of the hands
+that touch with enough links, and reach through no obstacle, the first are taken. No gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from graspd_core.hands.kinematics import forward
+from graspd_core.hands.model import HandModel
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, allowed_of, problem_of
+from graspd_core.optimize.finger_closing import Closing, link_gaps, make_closing
+from graspd_core.optimize.loop import Poses, minimise
+from graspd_core.optimize.obstacle_distance import hand_reach, obstacle_gaps
+from graspd_core.optimize.problem import Problem
+from graspd_core.se3 import quaternion_from_rotation, random_rotations
+
+
+@dataclass(frozen=True)
+class RandomClosureConfig:
+    """Approach at random, close until contact.
+
+    Attributes:
+        rounds: of as many approaches as grasps are asked for, until as many touch well enough.
+        touching: rigid groups of links that must touch.
+        close_steps: of the closing, from open to closed.
+    """
+
+    rounds: int = 4
+    touching: int = 3
+    close_steps: int = 60
+
+
+# The advance ends this far from the object, or after so many steps of the nearest distance each [m].
+_TOUCHING, _ADVANCES = 0.0003, 60
+
+
+def plan(task: PlannerInput) -> PlannerOutput:
+    """Closed hands from random sides, `count` tries a round until as many touch; a round cut short gives none."""
+    settings, hand, count = task.config.settings, task.hand, task.count
+    problem = problem_of(task)
+    closing = make_closing(problem, hand, settings.close_steps)
+    least = min(settings.touching, int(hand.link_group.max()) + 1)
+    tries = allowed_of(task, draw_approaches(problem, hand, count * settings.rounds, task.seed))
+    kept, interrupted = tries[torch.arange(0, device=task.device)], ""
+    for rows in torch.arange(len(tries.joints), device=task.device).split(count):
+        if interrupted or len(kept.joints) >= count or len(rows) == 0:
+            break
+        solution = minimise(closing, problem, advance(problem, closing, hand, tries[rows]), task.hooks)
+        interrupted = solution.interrupted
+        if not interrupted:
+            groups = touching_groups(problem, closing, hand, solution.poses, task.config.grasp_stages.touch_reach)
+            good = (groups >= least) & clear_of_obstacles(problem, solution.poses)
+            kept = join(kept, solution.poses[good])
+    return PlannerOutput(problem, kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
+
+
+def join(a: Poses, b: Poses) -> Poses:
+    """One batch of two."""
+    pairs = ((getattr(a, name), getattr(b, name)) for name in ("translation", "quaternion", "joints"))
+    return Poses(*(torch.cat(pair) for pair in pairs))
+
+
+def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) -> Poses:
+    """Open hands clear of the object whose palms face its centre of mass, from uniform directions, rolled uniformly."""
+    generator = torch.Generator().manual_seed(seed)
+    rotation = random_rotations(count, generator, torch.float64)
+    away = problem.object.length + hand_reach(hand)
+    palm = torch.as_tensor(hand.palm_center + away * hand.palm_normal)
+    translation = problem.object.center.double().cpu() - rotation @ palm
+    joints = torch.as_tensor(hand.open_posture).clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
+    return Poses(
+        translation.to(problem.hand.lower),
+        quaternion_from_rotation(rotation).to(problem.hand.lower),
+        joints.expand(count, -1).to(problem.hand.lower),
+    )
+
+
+@torch.no_grad()
+def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -> Poses:
+    """The hands moved along their palms' normals until something touches, the palm at the centre of mass at most.
+
+    Sphere tracing: the hand may always go as far as its least distance from the object.
+    """
+    forwards = poses.base.rotation @ torch.as_tensor(hand.palm_normal).to(problem.hand.lower)
+    left = torch.full_like(poses.translation[:, 0], problem.object.length + hand_reach(hand))
+    for _ in range(_ADVANCES):
+        gap = link_gaps(problem, poses, closing.sphere_links)[:, 0].amin(-1) - _TOUCHING
+        step = gap.clamp_min(0.0).minimum(left)
+        if not bool((step > 0.1 * _TOUCHING).any()):
+            break
+        poses = Poses(poses.translation + step[:, None] * forwards, poses.quaternion, poses.joints)
+        left = left - step
+    return poses
+
+
+def touching_groups(
+    problem: Problem, closing: Closing, hand: HandModel, poses: Poses, reach: float
+) -> Float[Tensor, "batch"]:
+    """How many rigid groups of links are within `reach` [m] of the object."""
+    near = link_gaps(problem, poses, closing.sphere_links)[:, 0] <= reach
+    groups = torch.as_tensor(hand.link_group, device=near.device)
+    found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.hand.lower.dtype)
+    return found.scatter_reduce(1, groups.expand(len(near), -1), near.to(found), "amax").sum(-1)
+
+
+def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
+    """Which hands reach into no support and no neighbour."""
+    if problem.obstacles is None:
+        return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
+    links = forward(problem.hand.kinematics, poses.joints)
+    return obstacle_gaps(problem.obstacles, poses.base, links).amin(-1) >= 0.0

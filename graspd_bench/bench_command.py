@@ -1,0 +1,161 @@
+"""`graspd bench`: one runner for every study, resumable, to figures, tables, charts and pages."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
+from graspd_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graspd_bench.run_studies import Plan
+
+
+EXIT_FAULTS = 1
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("bench", help="measure presets and methods on objects; tables and charts")
+    parser.set_defaults(run=run)
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or others of docs/bench.md")
+    parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="the same")
+    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in ones")
+    parser.add_argument(
+        "--objects",
+        nargs="+",
+        default=(),
+        metavar="OBJECT",
+        help="shape:NAME, meshes in metres or folders; default: all shapes",
+    )
+    parser.add_argument(
+        "--cases",
+        nargs="+",
+        default=(),
+        metavar="CASE",
+        help="of stress: names, families; maps: names; piles: sizes",
+    )
+    parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: by study")
+    parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
+    parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
+    parser.add_argument("--trials", default="", metavar="A,B", help="of raw grasps (docs/bench.md lists them)")
+    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps of others, beside ours")
+    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of imported npy files")
+    parser.add_argument("--quick", action="store_true", help="few objects and grasps: minutes")
+    parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="for finished cases")
+    parser.add_argument("--processes", type=int, default=1, help="cases at a time, each on one thread (default 1)")
+    parser.add_argument("--any-code", action="store_true", help="keep finished cases of other versions of the code")
+    parser.add_argument("--no-run", action="store_true", help="only report on the finished cases")
+    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="what moved since that run")
+    parser.add_argument("--chart", type=Path, default=None, metavar="PATH", help="PATH.png, PATH.svg, …")
+    parser.add_argument(
+        "--readme", type=Path, action="append", default=[], metavar="FILE", help="fill its marked sections (repeatable)"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Returns the exit status: 0, 1 where something is wrong, 130 after Ctrl-C; finished cases are kept either way."""
+    from graspd_bench.result_store import read_results, write_results
+    from graspd_bench.run_studies import faults_of, make_plan, records_of, run_plan, studies_of
+    from graspd_bench.study import Request
+    from graspd_core.io.grasps_json import check_writable
+
+    if options.processes < 1:
+        raise ConfigError(f"processes: {options.processes}; at least 1")
+    request = Request(
+        presets=tuple(options.presets),
+        objects=tuple(options.objects),
+        cases=tuple(options.cases),
+        seeds=tuple(options.seeds),
+        count=options.count,
+        hand=options.hand,
+        trials=tuple(name for name in options.trials.split(",") if name),
+        quick=options.quick,
+        imported=options.imported,
+        joint_order=tuple(name for name in options.joint_order.split(",") if name),
+    )
+    studies = studies_of([*options.studies, *options.suite] or ["imported" if options.imported else "main"])
+    old_code = options.any_code or options.no_run
+    plan = make_plan(studies, request, options.out, any_code=old_code, failed=options.no_run)
+    old = read_results(options.compare) if options.compare else None
+    for path in (options.out / "results.json", options.chart):
+        if path:
+            check_writable(path)
+    with Interrupt() as interrupt, Lines(plan, 0 if options.no_run else options.processes) as lines:
+        for job, record in run_plan(plan, options.processes, interrupt.came) if not options.no_run else ():
+            lines(job.study, record)
+    if interrupt.came():
+        kept = f"{len(plan.done)} of {len(plan.jobs)} cases are kept in {options.out}"
+        print(f"graspd: interrupted; {kept}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    every = [record for own in records_of(plan).values() for record in own]
+    write_results(options.out / "results.json", every)
+    _report(options, plan)
+    if old is not None:
+        from graspd_bench.figures import comparison
+
+        print(f"\n{comparison(old, every)}")
+    faults = faults_of(plan)
+    for line in faults:
+        print(f"graspd: failed: {line}", file=sys.stderr)
+    return EXIT_FAULTS if faults else EXIT_OK
+
+
+def _report(options: argparse.Namespace, plan: Plan) -> None:
+    from graspd_bench.run_studies import report_of
+    from graspd_bench.tables import fill, written
+
+    sections = report_of(plan, options.chart)
+    # Every object's table is long, and what a first page shows is part of the whole.
+    shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
+    print("\n\n".join(filter(None, shown)))
+    wrong = []
+    for document in options.readme:
+        try:
+            fill(document, sections)
+        except ConfigError as error:
+            wrong.append(error)
+    # One page that cannot be filled leaves the others filled.
+    if wrong:
+        raise wrong[0]
+
+
+class Lines:
+    """Progress over cases: a bar on a terminal, elsewhere a line a case; first, how long it will take."""
+
+    def __init__(self, plan: Plan, processes: int) -> None:
+        self.plan, self.processes = plan, processes
+
+    def __enter__(self) -> Lines:
+        self._bar: Any = None
+        total, done = len(self.plan.jobs), len(self.plan.done)
+        if done:
+            print(f"graspd: {done} of {total} cases had finished before", file=sys.stderr)
+        if self.plan.missing and self.processes:
+            minutes = self.plan.seconds(self.processes) / 60
+            told = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} quiet cores"
+            print(f"graspd: {told}", file=sys.stderr)
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=total, initial=done, desc="cases", file=sys.stderr)
+        return self
+
+    def __call__(self, study: str, record: dict[str, Any]) -> None:
+        from graspd_bench.study_registry import STUDIES
+
+        came = "; ".join(STUDIES[study].faults(record)) or STUDIES[study].came(record)
+        if self._bar is not None:
+            self._bar.set_postfix_str(f"{study} {record['label']}: {came}")
+            self._bar.update()
+        else:
+            took = f"{record.get('case_cpu', 0.0):.1f} CPU s"
+            where = f"{len(self.plan.done)}/{len(self.plan.jobs)} {study} {record['label']}"
+            print(f"graspd: {where}: {came}, {took}", file=sys.stderr, flush=True)
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()

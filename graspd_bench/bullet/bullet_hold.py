@@ -1,0 +1,212 @@
+"""The hold trial in the second simulator: same stages, gains, effort limits, pulls and limits as `trial.hold_trial`.
+
+What Bullet does in another way, and how it is matched: docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_bench.bullet.bullet_world import BulletWorld, add_object, load_hand_urdf, simulation
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Grasp, Posture, TrialResult
+from graspd_core.verify.hold_trial import DIRECTIONS, axis_name, broken_limit
+from graspd_core.verify.world import Protocol
+
+# pybullet is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+
+
+# [s]. At MuJoCo's 4 ms, Bullet's sequential impulses let an object creep out of fingers this light, by 10° in 2 s.
+TIMESTEP = 0.001
+SOLVER_ITERATIONS = 50
+_NAME = "bullet_hold"
+# Steps between looks at the limits: as often as MuJoCo's trial looks, every 0.1 s.
+_CHECK_EVERY = 100
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One running simulation.
+
+    Attributes:
+        client: PyBullet's client.
+        world: what it was made of.
+        protocol: physics settings.
+        body: the object.
+        hand: the hand.
+        joints: PyBullet's numbers of the hand's joints.
+        worst: greatest travel [m] and turn [rad] so far, brought up to date in place.
+    """
+
+    client: int
+    world: BulletWorld
+    protocol: Protocol
+    body: int
+    hand: int
+    joints: tuple[int, ...]
+    worst: Float[np.ndarray, "2"]
+
+
+def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> TrialResult:
+    """Run one hold trial of `protocol` in PyBullet; ends at the first breach.
+
+    Returns:
+        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions.
+
+    Raises:
+        SimulatorError: the hand has coupled joints.
+    """
+    import pybullet
+
+    with simulation(timestep=TIMESTEP, solver_iterations=SOLVER_ITERATIONS) as client:
+        pybullet.setPhysicsEngineParameter(enableConeFriction=1, physicsClientId=client)
+        run = _start(client, world, grasp.pregrasp, protocol)
+        depth = _start_penetration(run)
+        if depth > protocol.max_start_penetration:
+            return TrialResult(_NAME, False, 0.0, 0.0, f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm")
+        for stage, start, end in (
+            ("closing", grasp.pregrasp, grasp.grasp),
+            ("squeezing", grasp.grasp, grasp.squeeze),
+        ):
+            reason = _move(run, start, end)
+            if reason:
+                return _result(run, f"{reason} while {stage}")
+        held = pybullet.saveState(physicsClientId=client)
+        for direction in DIRECTIONS:
+            pybullet.restoreState(held, physicsClientId=client)
+            reason = _pull(run, grasp.squeeze, direction)
+            if reason:
+                return _result(run, f"{reason} under a pull along {axis_name(direction)}")
+        return _result(run, "")
+
+
+def _result(run: _Run, reason: str) -> TrialResult:
+    return TrialResult(_NAME, not reason, float(run.worst[0]), float(run.worst[1]), reason)
+
+
+def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol) -> _Run:
+    """Hand at a posture, object at rest in its frame."""
+    import pybullet
+
+    sliding, torsional, _ = protocol.friction
+    body = add_object(client, world, world.mass)
+    hand, joints = load_hand_urdf(client, world.hand, protocol.armature)
+    # Bullet multiplies sliding coefficients, and a body's spinning one with the other's sliding one: the hand's rule.
+    free = {"linearDamping": 0.0, "angularDamping": 0.0, "restitution": 0.0, "rollingFriction": 0.0}
+    pybullet.changeDynamics(
+        body, -1, lateralFriction=1.0, spinningFriction=0.0, collisionMargin=0.0, **free, physicsClientId=client
+    )
+    for link in range(-1, pybullet.getNumJoints(hand, physicsClientId=client)):
+        pybullet.changeDynamics(
+            hand,
+            link,
+            lateralFriction=sliding,
+            spinningFriction=torsional,
+            jointDamping=0.0,
+            **free,
+            physicsClientId=client,
+        )
+    for joint, value in zip(joints, posture.joint_positions.tolist(), strict=True):
+        pybullet.resetJointState(hand, joint, value, physicsClientId=client)
+    run = _Run(client, world, protocol, body, hand, joints, np.zeros(2))
+    _put_base(run, posture.position, posture.quaternion_wxyz)
+    return run
+
+
+def _put_base(run: _Run, position: Float[np.ndarray, "3"], quaternion_wxyz: Float[np.ndarray, "4"]) -> None:
+    import pybullet
+
+    pybullet.resetBasePositionAndOrientation(
+        run.hand, position.tolist(), np.roll(quaternion_wxyz, -1).tolist(), physicsClientId=run.client
+    )
+
+
+def _start_penetration(run: _Run) -> float:
+    """Deepest overlap of hand and object in the current state [m]."""
+    import pybullet
+
+    pybullet.performCollisionDetection(physicsClientId=run.client)
+    contacts = pybullet.getContactPoints(run.hand, run.body, physicsClientId=run.client)
+    return max(0.0, -min((contact[8] for contact in contacts), default=0.0))
+
+
+def _move(run: _Run, start: Posture, end: Posture) -> str:
+    """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
+    steps = round(run.protocol.stage_time / TIMESTEP)
+    # The shorter way round for the base: wxyz and its negative are the same rotation.
+    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
+    for step in range(1, steps + 1):
+        a = step / steps
+        quaternion = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
+        _put_base(run, (1 - a) * start.position + a * end.position, quaternion / np.linalg.norm(quaternion))
+        _drive(run, (1 - a) * start.joint_positions + a * end.joint_positions)
+        if reason := _step(run, step):
+            return reason
+    return ""
+
+
+def _pull(run: _Run, posture: Posture, direction: Float[np.ndarray, "3"]) -> str:
+    """Pull at the object's centre of mass for as long as the protocol says; why the trial is over, empty if not."""
+    import pybullet
+
+    force = (run.protocol.pull * run.world.mass * direction).tolist()
+    for step in range(1, round(run.protocol.hold_time / TIMESTEP) + 1):
+        _drive(run, posture.joint_positions)
+        position, _ = pybullet.getBasePositionAndOrientation(run.body, physicsClientId=run.client)
+        pybullet.applyExternalForce(run.body, -1, force, position, pybullet.WORLD_FRAME, physicsClientId=run.client)
+        if reason := _step(run, step):
+            return reason
+    return ""
+
+
+def _step(run: _Run, step: int) -> str:
+    """One step of the simulation; every so often, why the trial is over, empty if it is not."""
+    import pybullet
+
+    pybullet.stepSimulation(physicsClientId=run.client)
+    return "" if step % _CHECK_EVERY else _breach(run)
+
+
+def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
+    """Springs towards `target` [rad], damped, for one step.
+
+    Bullet's motor aims at a velocity with at most a given force. Told the velocity at which the damper balances the
+    spring, and the force that spring and damper have now, it is that spring and damper, and cannot overshoot: an
+    explicit torque on fingers this light would need steps of microseconds.
+    """
+    import pybullet
+
+    hand, protocol = run.world.hand, run.protocol
+    states = pybullet.getJointStates(run.hand, run.joints, physicsClientId=run.client)
+    position, velocity = np.array([state[:2] for state in states]).T
+    stiffness = np.where(hand.slides, protocol.slide_stiffness, protocol.stiffness)
+    damping = np.where(hand.slides, protocol.slide_damping, protocol.damping)
+    torque = np.clip(stiffness * (target - position), -hand.effort, hand.effort)
+    pybullet.setJointMotorControlArray(
+        run.hand,
+        run.joints,
+        pybullet.VELOCITY_CONTROL,
+        targetVelocities=(torque / damping).tolist(),
+        forces=np.abs(torque - damping * velocity).tolist(),
+        physicsClientId=run.client,
+    )
+
+
+def _breach(run: _Run) -> str:
+    """Bring the worst travel and turn up to date; name the limit that is broken, if any."""
+    import pybullet
+
+    position, quaternion = pybullet.getBasePositionAndOrientation(run.body, physicsClientId=run.client)
+    if not np.isfinite([*position, *quaternion]).all():
+        run.worst[:] = np.inf
+        return "the simulation diverged"
+    rotation = rotation_from_quaternion(torch.tensor(np.roll(quaternion, 1))).numpy() @ run.world.axes.T
+    travel = float(np.linalg.norm(np.array(position) - run.world.center_of_mass))
+    turn = float(np.arccos(np.clip(0.5 * (np.trace(rotation) - 1), -1.0, 1.0)))
+    run.worst[:] = np.maximum(run.worst, [travel, turn])
+    return broken_limit(run.protocol, travel, turn)

@@ -1,0 +1,319 @@
+"""How charts look: light, printable, told apart by shape as well as by colour; and labels that keep apart.
+
+The charts: speed against accuracy, planned grasps, and the settings sweeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.figures import (
+    FEW,
+    Row,
+    by_name,
+    is_preset,
+    is_sweep_value,
+    parent_of,
+    pareto_front,
+    rows,
+    short_name,
+    spread,
+)
+from graspd_bench.study import Record
+from graspd_bench.suites import SWEEPS
+from graspd_core.optimize.plan_config import METHODS
+
+# Colours of Okabe and Ito (2008), which the colour-blind can tell apart; a marker's shape says the same.
+FRONT = "#222222"
+_STYLE: Any = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#888888",
+    "svg.hashsalt": "graspd",
+    "figure.dpi": 100,
+}
+# The line from a label that stands far off to its point.
+_LEADER = {"arrowstyle": "-", "lw": 0.5, "alpha": 0.6, "shrinkA": 0, "shrinkB": 3}
+# Where a label may stand about its point, in points of print; the nearest free place is taken.
+_ANGLES = np.deg2rad([0, 180, 90, 270, 45, 135, 315, 225, 22, 158, 202, 338, 67, 113, 247, 293])
+_DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
+
+
+@contextmanager
+def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
+    """A figure and its axes in the common style [inches]; closed at the end."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    with matplotlib.rc_context(_STYLE):
+        made, axes = pyplot.subplots(figsize=(width, height), layout="constrained", **grid)
+        try:
+            yield made, axes
+        finally:
+            pyplot.close(made)
+
+
+def save(made: Any, path: Path) -> Path:
+    """Write PNG and SVG, the same bytes for the same data; returns the PNG's path."""
+    png, svg = path.with_name(f"{path.name}.png"), path.with_name(f"{path.name}.svg")
+    png.parent.mkdir(parents=True, exist_ok=True)
+    made.savefig(png, dpi=160, metadata={"Software": None})
+    made.savefig(svg, metadata={"Date": None, "Creator": None})
+    return png
+
+
+def place_labels(
+    axes: Any, points: Sequence[tuple[float, float]], texts: Sequence[str], colours: Sequence[str]
+) -> None:
+    """Write a label beside each point of an axes, clear of the points, of other labels and of the frame.
+
+    Call it last: it needs the final layout.
+    """
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=2, foreground="white")]
+    canvas = axes.figure.canvas
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    scale = axes.figure.dpi / 72.0
+    frame = axes.get_window_extent(renderer)
+    at = axes.transData.transform(np.array(points))
+    taken = [(x - 5 * scale, y - 5 * scale, x + 5 * scale, y + 5 * scale) for x, y in at]
+    for index in np.argsort(-at[:, 1]):
+        label = axes.annotate(
+            texts[index], points[index], xytext=(0, 0), textcoords="offset points", color=colours[index],
+            fontsize=7.5, ha="center", va="center", zorder=6, path_effects=halo,
+            arrowprops=_LEADER | {"color": colours[index]},
+        )  # fmt: skip
+        box = label.get_window_extent(renderer)
+        half = np.array([box.width, box.height]) / 2 + scale
+        others = [t for i, t in enumerate(taken) if i != index]
+        places = [_place(at[index], half, d * scale, angle) for d, angle in product(_DISTANCES, _ANGLES)]
+        best = min(places, key=lambda place: _trouble(place, half, others, frame))
+        label.set_position(tuple((best - at[index]) / scale))
+        taken.append((*(best - half), *(best + half)))
+        if np.linalg.norm(best - at[index]) < half[0] + 10 * scale:
+            label.arrow_patch.set_visible(False)
+
+
+def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -> np.ndarray:
+    """Centre of a label whose nearest edge is that far from its point."""
+    way = np.array([np.cos(angle), np.sin(angle)])
+    return point + way * distance + np.sign(np.round(way, 6)) * half * np.abs(way) ** 0.5
+
+
+def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
+    """Area that a label would share with what is there, or have outside the frame; ties go to the first place."""
+    low, high = place - half, place + half
+    shared = 0.0
+    for x0, y0, x1, y1 in taken:
+        shared += max(0.0, min(high[0], x1) - max(low[0], x0)) * max(0.0, min(high[1], y1) - max(low[1], y0))
+    outside = max(0.0, frame.x0 - low[0]) + max(0.0, high[0] - frame.x1)
+    outside += max(0.0, frame.y0 - low[1]) + max(0.0, high[1] - frame.y1)
+    return shared + 50.0 * outside
+
+
+_LABELS = {
+    "candidates": "contact candidates",
+    "directions": "disturbance directions",
+    "resolution": "grid nodes a side",
+    "steps": "steps",
+}
+_SUCCESS, _TIME = METHODS["closed_form"].colour, METHODS["graspd2022"].colour
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a panel shows against time.
+
+    Attributes:
+        figure: of `figures.Row`.
+        label: of its axis.
+        factor: from the figure's unit to the label's.
+        less_is_better: or more is.
+        mean: the marker is the mean over objects, because a share's median hides failures; or the median.
+        log: of the axis.
+    """
+
+    figure: str
+    label: str
+    factor: float = 1.0
+    less_is_better: bool = True
+    mean: bool = False
+    log: bool = False
+
+
+PANELS = (
+    Panel("standard", "hold success, raw [%]", factor=100.0, less_is_better=False, mean=True),
+    Panel("sd_cm", "simulation displacement SD [cm]", log=True),
+    Panel("penetration_mm", "penetration [mm]"),
+)
+# What a log axis shows of less than this [cm].
+_LEAST = 0.01
+
+
+@dataclass(frozen=True)
+class Point:
+    """One preset on one panel: middle and quartiles over objects on both axes, and whether any grasp of it held."""
+
+    name: str
+    method: str
+    x: tuple[float, float, float]
+    y: tuple[float, float, float]
+    held: bool
+
+
+def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
+    """Draw what the records have figures for: PATH.png and .svg, PATH_short, PATH_planned, PATH_ladder.
+
+    Returns the PNGs drawn, by "speed", "short", "planned" and "ladder".
+    """
+    found = rows(records)
+    swept = [row for row in found if is_sweep_value(row.name)]
+    presets = by_name(row for row in found if is_preset(row.name))
+    few = {name: group for name, group in presets.items() if name in FEW}
+    drawn = {
+        "speed": draw_speed(presets, path),
+        "short": draw_speed(few, path.with_name(f"{path.name}_short")),
+        "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned")),
+        "ladder": draw_sweeps(swept, path.with_name(f"{path.name}_ladder")) if swept else None,
+    }
+    return {name: png for name, png in drawn.items() if png}
+
+
+def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
+    """Seconds per verified grasp against seconds to the first, both as planned. None where there is nothing to draw."""
+    panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
+    points = points_of(presets, "first_cpu", panel)
+    if not points:
+        return None
+    with figure(4.8, 4.2, squeeze=False) as (made, axes):
+        axis = axes[0][0]
+        _draw_panel(axis, points, panel)
+        axis.set_xscale("linear")
+        axis.set_xlabel("CPU seconds to the first verified grasp")
+        axis.set_xlim(left=0.0)
+        names = [p.name for p in points]
+        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [METHODS[p.method].colour for p in points])
+        return save(made, path)
+
+
+def draw_speed(presets: dict[str, list[Row]], path: Path) -> Path | None:
+    """A panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw."""
+    panels = [(panel, points) for panel in PANELS if (points := points_of(presets, "cpu_per_grasp", panel))]
+    if not panels:
+        return None
+    with figure(4.6 * len(panels), 4.4, ncols=len(panels), squeeze=False) as (made, axes):
+        for axis, (panel, points) in zip(axes[0], panels, strict=True):
+            _draw_panel(axis, points, panel)
+        made.supxlabel("CPU seconds per raw grasp (one thread, log scale)", fontsize=9)
+        _legend(made, list(dict.fromkeys(row.method for group in presets.values() for row in group)))
+        for axis, (_, points) in zip(axes[0], panels, strict=True):
+            names, colours = [short_name(p.name) for p in points], [METHODS[p.method].colour for p in points]
+            place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, colours)
+        return save(made, path)
+
+
+def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
+    """A point for every preset that has both figures, in the panel's unit."""
+    points = []
+    for name, group in presets.items():
+        x, y = spread(group, time), spread(group, panel.figure)
+        if x and y:
+            heights = (y.low, y.mean if panel.mean else y.median, y.high)
+            low, mid, high = (max(height * panel.factor, _LEAST if panel.log else 0.0) for height in heights)
+            held = any(row.held for row in group)
+            points.append(Point(name, group[0].method, (x.low, x.median, x.high), (low, mid, high), held))
+    return points
+
+
+def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
+    place = {p.name: (p.x[1], p.y[1]) for p in points}
+    for p in points:
+        (x, y), colour, parent = place[p.name], METHODS[p.method].colour, parent_of(p.name)
+        if parent in place:
+            axis.plot(*zip(place[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2)
+        bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
+        axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
+        filling = "white" if parent else colour
+        axis.plot(x, y, METHODS[p.method].marker, color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
+    # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
+    spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
+    front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
+    axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
+    axis.set_xscale("log")
+    axis.set_ylabel(panel.label)
+    axis.margins(0.18, 0.1)
+    if panel.log:
+        axis.set_yscale("log")
+    else:
+        low, high = axis.get_ylim()
+        axis.set_ylim((0.0, high) if panel.less_is_better else (max(-4.0, low), 104.0))
+    way = "left and down" if panel.less_is_better else "left and up"
+    axis.set_title(f"better: {way}", fontsize=7.5, color="#666666")
+
+
+def _bars(low: float, middle: float, high: float) -> list[list[float]]:
+    return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
+
+
+def _legend(made: Any, methods: Sequence[str]) -> None:
+    from matplotlib.lines import Line2D
+
+    plain = {"ls": "none", "ms": 7, "mew": 1.3}
+    handles = [
+        Line2D([], [], marker=METHODS[m].marker, color=METHODS[m].colour, label=METHODS[m].label, **plain)
+        for m in methods
+    ]
+    handles.append(Line2D([], [], marker="o", color="#666666", mfc="white", label="ablation", **plain))
+    handles.append(Line2D([], [], color=FRONT, lw=1.2, alpha=0.6, label="Pareto front"))
+    made.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=8.5)
+
+
+def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
+    """Draw a panel for every sweep. Returns the PNG's path."""
+    sweeps = {name: {} for name in SWEEPS}
+    for name, group in by_name(found).items():
+        sweep, sweep_value = name.split("=")
+        sweeps[sweep][float(sweep_value)] = group
+    present = {name: dict(sorted(sweep_values.items())) for name, sweep_values in sweeps.items() if sweep_values}
+    with figure(3.2 * len(present), 3.0, ncols=len(present), squeeze=False, sharey=True) as (made, axes):
+        seconds = [axis.twinx() for axis in axes[0]]
+        for axis, second, (name, sweep_values) in zip(axes[0], seconds, present.items(), strict=True):
+            _draw_line(axis, sweep_values, "standard", 100.0, _SUCCESS, "o-")
+            _draw_line(second, sweep_values, "cpu_with_scene", 1.0, _TIME, "s--")
+            axis.set_xscale("log", base=2)
+            axis.set_xticks(list(sweep_values), [f"{sweep_value:g}" for sweep_value in sweep_values])
+            axis.minorticks_off()
+            axis.set_xlabel(_LABELS[name])
+            axis.set_ylim(-4.0, 104.0)
+            second.grid(False)
+            second.tick_params(axis="y", colors=_TIME, labelright=second is seconds[-1])
+        for second in seconds:
+            second.set_ylim(0.0, 1.1 * max(max(line.get_ydata()) for s in seconds for line in s.lines))
+        axes[0][0].set_ylabel("hold success, raw [%]", color=_SUCCESS)
+        axes[0][0].tick_params(axis="y", colors=_SUCCESS)
+        seconds[-1].set_ylabel("CPU seconds per raw grasp,\nits share of the grid included", color=_TIME)
+        return save(made, path)
+
+
+def _draw_line(axis, sweep_values: dict[float, list[Row]], name: str, factor: float, colour: str, line: str) -> None:
+    """Mean over objects, with quartiles as a band."""
+    over = {sweep_value: found for sweep_value, group in sweep_values.items() if (found := spread(group, name))}
+    axis.plot(list(over), [s.mean * factor for s in over.values()], line, color=colour, ms=4.5, lw=1.4)
+    low, high = ([getattr(s, end) * factor for s in over.values()] for end in ("low", "high"))
+    axis.fill_between(list(over), low, high, color=colour, alpha=0.12, lw=0)

@@ -1,0 +1,471 @@
+"""One case of a map: a planning, the cells that its grasps are tried in, and what came of it in each.
+
+What each map does for a case: friction and mass, the object's size, a single depth view, the wall of a cup.
+
+All maps: their axes, their objects, and the cases that they are made of. `MAPS` is the registry.
+
+Failure maps as heat maps: the share held in every cell, methods side by side, and where half of it is lost.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from graspd_bench import failure_maps as map_runs
+from graspd_bench.charts import figure, save
+from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
+from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_bench.stress.broken_meshes import thin_cup
+from graspd_bench.study import Case, Picture, Record, Request, Sections, raw_grasps
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.hands.fingers import find_fingers
+from graspd_core.hands.kinematics import make_kinematics, points_in_base
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import build_sdf
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.optimize.plan_config import PlanConfig, load_preset
+from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.scene import ObjectModel, Scene, build_scene, object_parts
+from graspd_core.planning.feasibility import kind_of
+from graspd_core.types import Grasp, TriangleMesh
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world
+
+# Where a cell lies on an axis of its map: a number, or the name of an object.
+Place = float | str
+
+# What an empty place among the grasps asked for is called.
+NOT_FOUND, NO_SCENE = "no grasp found", "no scene"
+
+
+@dataclass(frozen=True)
+class MapCase(Case):
+    """A planning, and the cells that its grasps are tried in.
+
+    Attributes:
+        map: name of the map.
+        preset: settings of the method.
+        thing: name of the object.
+        across: place of all its cells on the horizontal axis.
+        up: places of its cells on the vertical axis.
+        count: raw grasps asked for, each of which is tried in every cell.
+        seed: of everything that is drawn.
+        hand: by name.
+    """
+
+    map: str
+    preset: str
+    thing: str
+    across: Place
+    up: tuple[Place, ...]
+    count: int
+    seed: int
+    hand: str = "allegro_right"
+
+    @property
+    def label(self) -> str:
+        place = (self.thing, self.across, *self.up[:1])
+        return " ".join(str(word) for word in (self.map, self.preset, *place, f"seed {self.seed}"))
+
+
+@dataclass(frozen=True)
+class MapCell:
+    """What came of one case's grasps in one cell.
+
+    Attributes:
+        up: its place on the vertical axis.
+        held: grasps that passed the hold trial.
+        reasons: why the others did not, and how many each; a grasp that was not found has a reason, too.
+    """
+
+    up: Place
+    held: int
+    reasons: Mapping[str, int]
+
+
+# What a map does for each of its cases. A scene that is refused raises a GraspdError.
+Run = Callable[[MapCase], tuple[MapCell, ...]]
+
+
+def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
+    """The cells of a case; where its scene is refused, all of its grasps are lost for that reason."""
+    try:
+        return run(case)
+    except GraspdError as error:
+        reason = f"{NO_SCENE}: {kind_of(str(error))}"
+        return tuple(MapCell(up, 0, {reason: case.count}) for up in case.up)
+
+
+@lru_cache(maxsize=4)
+def settings(preset: str) -> PlanConfig:
+    """Settings by name."""
+    return load_preset(preset)
+
+
+@lru_cache(maxsize=4)
+def hand_for(name: str, candidates: int) -> HandModel:
+    """A hand with so many contact candidates."""
+    return load_hand(name, candidates=candidates)
+
+
+def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
+    """The hand, and the first of the method's own ranking, none filtered by a trial."""
+    config = settings(case.preset)
+    hand = hand_for(case.hand, config.problem.fine_candidates)
+    return hand, raw_grasps(scene, hand, config, case.count, case.seed)
+
+
+def try_grasps(
+    case: MapCase, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
+) -> MapCell:
+    """Every grasp in the hold trial on `target`."""
+    if not grasps:
+        return MapCell(up, 0, {NOT_FOUND: case.count})
+    world = build_world(hand, target, object_parts(target), protocol)
+    holds = [hold_trial(world, grasp, protocol) for grasp in grasps]
+    reasons = Counter(kind_of(hold.reason) for hold in holds if not hold.passed)
+    if len(grasps) < case.count:
+        reasons[NOT_FOUND] = case.count - len(grasps)
+    return MapCell(up, sum(hold.passed for hold in holds), dict(reasons))
+
+
+_POSTURES = 4096
+_YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
+
+
+def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
+    """Plan at the friction of the case, for the 0.1 kg that planning supposes; try at every mass."""
+    config = settings(case.preset)
+    scene = load_scene(f"shape:{case.thing}", friction=float(case.across), resolution=config.resolution)
+    hand, grasps = plan(case, scene)
+    protocol = at_friction(PROTOCOLS["standard"], float(case.across))
+    return tuple(try_grasps(case, mass, hand, at_mass(scene.object, mass), grasps, protocol) for mass in case.up)
+
+
+def at_mass(target: ObjectModel, mass: float | str) -> ObjectModel:
+    """The same object of another mass [kg], evenly spread as before."""
+    share = float(mass) / target.mass
+    return replace(target, mass=float(mass), inertia=target.inertia * share)
+
+
+def run_size(case: MapCase) -> tuple[MapCell, ...]:
+    """Plan and try on the shape scaled so that its least width is that share of the hand's span; 0.1 kg throughout."""
+    config = settings(case.preset)
+    width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
+    scale = width / least_width(make_shape(case.thing))
+    scene = load_scene(f"shape:{case.thing}", scale=scale, resolution=config.resolution)
+    hand, grasps = plan(case, scene)
+    return tuple(try_grasps(case, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in case.up)
+
+
+def least_width(mesh: TriangleMesh) -> float:
+    """The least extent along the axes of a mesh [m]: of the authored shapes, what a hand has to span."""
+    return float(np.ptp(mesh.vertices, axis=0).min())
+
+
+def hand_span(hand: HandModel) -> float:
+    """The greatest distance between two fingertips that joints within their limits allow [m].
+
+    The greatest of a few thousand seeded postures: about a millimetre short of the true one.
+    """
+    fingers = find_fingers(hand)
+    draw = torch.Generator().manual_seed(0)
+    lower, upper = torch.as_tensor(hand.lower), torch.as_tensor(hand.upper)
+    shares = torch.rand(_POSTURES, hand.num_joints, generator=draw, dtype=torch.float64)
+    # The greatest distances are at limits: half of the postures have every joint at one of its ends.
+    shares[::2] = shares[::2].round()
+    kinematics = make_kinematics(hand, dtype=torch.float64)
+    tips = points_in_base(
+        kinematics, lower + shares * (upper - lower), torch.as_tensor(fingers.points), torch.as_tensor(fingers.links)
+    )
+    return float(torch.cdist(tips, tips).max())
+
+
+@lru_cache(maxsize=4)
+def _span(hand: str, candidates: int) -> float:
+    return hand_span(hand_for(hand, candidates))
+
+
+def run_view(case: MapCase) -> tuple[MapCell, ...]:
+    """Plan on the reconstruction of one view at that elevation [deg]; try on the true object in its place."""
+    (noise,) = case.up
+    truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
+    hand, grasps = plan(case, scene)
+    return (try_grasps(case, noise, hand, truth, grasps, PROTOCOLS["standard"]),)
+
+
+def noise_at(times: float) -> DepthNoise:
+    """The usual sensor with its errors and losses so many times as large; none at all at zero.
+
+    Its resolution, its range and the angles at which it goes blind stay: they are no noise.
+    """
+    if not times:
+        return NONE
+    grown = {name: getattr(DEFAULT, name) * times for name in ("floor", "quadratic", "jitter")}
+    shares = {name: min(getattr(DEFAULT, name) * times, 1.0) for name in ("flying", "edge_loss", "loss")}
+    return replace(DEFAULT, **grown, **shares)
+
+
+@lru_cache(maxsize=1)
+def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int) -> tuple[ObjectModel, Scene]:
+    """The true object, and the scene that one view of it makes; the same for every method.
+
+    Raises:
+        CloudError: the view shows no usable object.
+    """
+    stage = tabletop(thing, yaw=_YAW)
+    poses = ring_poses(1, elevation=float(np.deg2rad(elevation)), azimuth=float(_AZIMUTH))
+    views = views_of(stage, CAMERA, poses, noise_at(noise), seed)
+    scene = scene_from_views(views, resolution=resolution)
+    return build_scene(stage.truth, source=thing, resolution=resolution).object, scene
+
+
+def run_wall(case: MapCase) -> tuple[MapCell, ...]:
+    """Plan on a grid of that resolution, and no finer, of a cup with walls of so many millimetres."""
+    (wall,) = case.up
+    scene = on_grid(cup(float(wall)), int(case.across))
+    hand, grasps = plan(case, scene)
+    return (try_grasps(case, wall, hand, scene.object, grasps, PROTOCOLS["standard"]),)
+
+
+@lru_cache(maxsize=1)
+def cup(wall: float) -> Scene:
+    """A cup with walls of so many millimetres."""
+    return build_scene(thin_cup(wall * 1e-3), source=f"cup of {wall:g} mm")
+
+
+def on_grid(scene: Scene, resolution: int) -> Scene:
+    """The same scene with the distances of another grid, however much too coarse."""
+    return replace(scene, sdf=build_sdf(scene.object.mesh, resolution=resolution))
+
+
+# Methods side by side, each by the preset that stands for it. The published settings hold nothing anywhere, and the
+# repaired ones take seven times as long as their short form.
+METHODS: Mapping[str, str] = {"closed_form": "balanced", "graspd2022": "graspd2022_short"}
+# Raw grasps of a cell and a seed, shared evenly among its objects.
+COUNT, SEEDS = 16, (0, 1, 2)
+# Objects that the map of sizes has a row each for.
+_SIZED = ("sphere", "box", "cylinder")
+
+
+@dataclass(frozen=True)
+class MapAxis:
+    """What an axis shows, and where its cells lie, from left to right or from the bottom up."""
+
+    label: str
+    places: tuple[Place, ...]
+
+
+@dataclass(frozen=True)
+class Map:
+    """One picture.
+
+    Attributes:
+        title: what it shows.
+        across, up: its axes.
+        things: objects; a cell is of all of them, unless they are what an axis shows.
+        run: what is done for a case.
+        together: whether one planning serves all cells of a column.
+    """
+
+    title: str
+    across: MapAxis
+    up: MapAxis
+    things: tuple[str, ...]
+    run: Run
+    together: bool = False
+
+    @property
+    def rows(self) -> bool:
+        """Whether every row has an object of its own."""
+        return self.up.places == self.things
+
+
+MAPS: Mapping[str, Map] = {
+    "friction_mass": Map(
+        "friction and mass",
+        MapAxis("friction coefficient", (0.1, 0.2, 0.3, 0.6, 1.5)),
+        MapAxis("mass [kg]", (0.005, 0.03, 0.1, 0.3, 1.0, 2.0)),
+        ("cylinder", "mug"),
+        map_runs.run_friction_mass,
+        together=True,
+    ),
+    "size": Map(
+        "size",
+        MapAxis("least width of the object / span of the hand", (0.025, 0.05, 0.1, 0.25, 0.4, 0.5)),
+        MapAxis("object", _SIZED),
+        _SIZED,
+        map_runs.run_size,
+    ),
+    "view": Map(
+        "view",
+        MapAxis("elevation of the only camera [deg]", (15.0, 30.0, 50.0, 80.0)),
+        MapAxis("noise [times a D415's]", (0.0, 1.0, 2.0, 4.0)),
+        ("mug",),
+        map_runs.run_view,
+    ),
+    "wall": Map(
+        "wall and grid",
+        MapAxis("resolution of the distance grid", (8.0, 16.0, 48.0, 96.0)),
+        MapAxis("wall of the cup [mm]", (0.3, 1.0, 3.0, 6.0)),
+        ("cup",),
+        map_runs.run_wall,
+    ),
+}
+
+
+def map_cases(request: Request) -> tuple[MapCase, ...]:
+    """The cases of the maps that are asked for. Raises ConfigError: there is no such map."""
+    if unknown := [name for name in request.cases if name not in MAPS]:
+        raise ConfigError(f"unknown map {unknown[0]!r}; valid: {', '.join(MAPS)}")
+    names = request.cases or (tuple(MAPS)[1:2] if request.quick else tuple(MAPS))
+    seeds = request.seeds or (SEEDS[:1] if request.quick else SEEDS)
+    # Both methods on one object after the other: what is built of it is remembered.
+    pairs = (zip(*(cases_of(name, method) for method in METHODS), strict=True) for name in names)
+    return tuple(replace(case, seed=seed) for pair in pairs for cases in pair for seed in seeds for case in cases)
+
+
+def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
+    """All cases of a map with one method and the first seed; those on the same object lie next to each other."""
+    drawn = MAPS[name]
+    count = COUNT if drawn.rows else COUNT // len(drawn.things)
+    cases = []
+    for thing in drawn.things:
+        rows = (thing,) if drawn.rows else drawn.up.places
+        for up in (rows,) if drawn.together else ((row,) for row in rows):
+            cases += [MapCase(name, METHODS[method], thing, x, up, count, SEEDS[0]) for x in drawn.across.places]
+    return tuple(cases)
+
+
+def run_map(case: MapCase) -> Record:
+    """The figures of one case."""
+    cells = [asdict(cell) for cell in run_on(MAPS[case.map].run, case)]
+    return {"cells": cells, "held": max(cell["held"] for cell in cells)}
+
+
+def map_seconds(case: MapCase) -> float:
+    """CPU seconds of a case, roughly."""
+    each = {"balanced": 0.1, "graspd2022_short": 0.45}.get(case.preset, 1.0)
+    return 0.5 + case.count * (each + 0.05 * len(case.up))
+
+
+Shares = Mapping[tuple[Place, Place], float]
+
+# Nuñez, Anderton and Renslow (2018): even in lightness, and alike to those who see no red or green.
+_COLOURS = "cividis"
+_CELL, _EDGE = 0.52, "#D55E00"
+
+
+def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
+    """One panel a method, by its caption. Returns the PNG's path.
+
+    Cells without a record stay white; rows and columns in which no panel has any are left out.
+    """
+    drawn = _known(drawn, methods)
+    columns, rows = len(drawn.across.places), len(drawn.up.places)
+    width = len(methods) * max(columns * _CELL, 2.6) + 1.5
+    with figure(width, rows * _CELL + 1.3, ncols=len(methods), squeeze=False, sharey=True) as (made, axes):
+        made.get_layout_engine().set(wspace=0.06)
+        image = None
+        for axis, (caption, shares) in zip(axes[0], methods.items(), strict=True):
+            image = _panel(axis, drawn, shares)
+            axis.set_title(caption, fontsize=9)
+            axis.set_xlabel(drawn.across.label)
+        axes[0][0].set_ylabel(drawn.up.label)
+        bar = made.colorbar(image, ax=list(axes[0]), fraction=0.04, pad=0.015)
+        bar.set_label("grasps that held [%]")
+        bar.outline.set_visible(False)
+        return save(made, path)
+
+
+def _known(drawn: Map, methods: Mapping[str, Shares]) -> Map:
+    places = [place for shares in methods.values() for place in shares]
+    across = tuple(x for x in drawn.across.places if any(x == place[0] for place in places))
+    up = tuple(y for y in drawn.up.places if any(y == place[1] for place in places))
+    if not places:
+        return drawn
+    return replace(drawn, across=replace(drawn.across, places=across), up=replace(drawn.up, places=up))
+
+
+def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
+    across, up = drawn.across.places, drawn.up.places
+    grid = np.array([[100 * shares.get((x, y), np.nan) for x in across] for y in up])
+    image = axis.imshow(grid, cmap=_COLOURS, vmin=0, vmax=100, origin="lower", aspect="auto")
+    for row, column in np.argwhere(np.isfinite(grid)):
+        value = grid[row, column]
+        colour = "white" if value < 50 else "black"
+        axis.text(column, row, f"{value:.0f}", ha="center", va="center", color=colour, fontsize=8)
+    _border(axis, grid)
+    axis.set_xticks(range(len(across)), [_written(place) for place in across])
+    axis.set_yticks(range(len(up)), [_written(place) for place in up])
+    for ticks, places in ((axis.set_xticks, across), (axis.set_yticks, up)):
+        ticks(np.arange(1, len(places)) - 0.5, minor=True)
+    axis.tick_params(which="both", length=0)
+    axis.grid(False)
+    axis.grid(which="minor", color="white", lw=1.0)
+    for spine in axis.spines.values():
+        spine.set_visible(False)
+    return image
+
+
+def _border(axis: Any, grid: Any) -> None:
+    """A line between cells of which one holds at least half of its grasps and the other less."""
+    works, known = grid >= 50, np.isfinite(grid)
+    beside = (works[:, 1:] != works[:, :-1]) & known[:, 1:] & known[:, :-1]
+    above = (works[1:] != works[:-1]) & known[1:] & known[:-1]
+    line: dict[str, Any] = {"color": _EDGE, "lw": 2.2, "solid_capstyle": "round"}
+    for row, column in np.argwhere(beside):
+        axis.plot([column + 0.5] * 2, [row - 0.5, row + 0.5], **line)
+    for row, column in np.argwhere(above):
+        axis.plot([column - 0.5, column + 0.5], [row + 0.5] * 2, **line)
+
+
+def _written(place: Place) -> str:
+    return place if isinstance(place, str) else f"{place:g}"
+
+
+def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """A picture a map, under the marker of its name, and all failures by reason."""
+    sections: dict[str, list[str | Picture | None]] = {}
+    body = []
+    for name, drawn in MAPS.items():
+        panels = {
+            f"{method} (preset {preset})": [r for r in records if (r["map"], r["preset"]) == (name, preset)]
+            for method, preset in METHODS.items()
+        }
+        if not any(panels.values()):
+            continue
+        if chart is not None:
+            png = draw_map(drawn, {title: shares(own) for title, own in panels.items()}, chart.with_name(f"map_{name}"))
+            sections[f"map-{name.replace('_', '-')}"] = [Picture(f"Success over {drawn.title}", png)]
+        body += [[drawn.title, title, _counts(reasons(own))] for title, own in panels.items()]
+    return {**sections, "map-failures": [markdown_table(["map", "method", "failures by reason"], body)] if body else []}
+
+
+def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
+    """Share of the grasps asked for that held, all objects together, by place across and up."""
+    held, asked = Counter[tuple[Place, Place]](), Counter[tuple[Place, Place]]()
+    for record in records:
+        for cell in record["cells"]:
+            held[record["across"], cell["up"]] += cell["held"]
+            asked[record["across"], cell["up"]] += record["count"]
+    return {place: held[place] / asked[place] for place in asked}
+
+
+def reasons(records: Sequence[Record]) -> Counter[str]:
+    """Why grasps failed, and how many each."""
+    return sum((Counter(cell["reasons"]) for record in records for cell in record["cells"]), Counter[str]())
+
+
+def _counts(why: Counter[str]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in why.most_common()) or "no failure"

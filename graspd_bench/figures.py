@@ -1,0 +1,275 @@
+"""Names of presets: which is an ablation of which, and how each method is told from the others.
+
+Records to figures: for every name (a preset, a sweep value) and object, then for every name over its objects.
+
+What moved since an earlier run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from graspd_bench.study import Record
+from graspd_core.verify.metrics import METRICS
+
+# Presets of the first page: those that people plan with, the published method, its repaired form and a baseline.
+FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_repaired", "random_closure")
+# The first that fits a name tells its parent; a parent has none.
+_ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
+
+
+def parent_of(name: str) -> str | None:
+    """The preset that `name` is an ablation of; None for one of its own."""
+    return next((parent for prefix, parent in _ABLATIONS if name.startswith(prefix)), None)
+
+
+def hand_row(hand: str) -> str:
+    """The name of the cells by which hands are compared."""
+    return f"hand:{Path(hand).stem}"
+
+
+def is_hand(name: str) -> bool:
+    """Whether a name is of cells by which hands are compared, `hand:leap_right` say."""
+    return name.startswith("hand:")
+
+
+def is_preset(name: str) -> bool:
+    """Whether a name is of a preset: neither a sweep value nor a hand."""
+    return not is_sweep_value(name) and not is_hand(name)
+
+
+def is_sweep_value(name: str) -> bool:
+    """Whether a name is of a sweep value, `steps=90` say, and not of a preset."""
+    return "=" in name
+
+
+def short_name(name: str) -> str:
+    """A label for the chart: an ablation goes by what it lacks."""
+    parent = parent_of(name)
+    if parent is None:
+        return name
+    method = "closed_form_" if name.startswith("closed_form_") else "graspd2022_"
+    return name.removeprefix(method).replace("_", " ")
+
+
+# Shares of grasps that passed a trial; a grasp that was not found did not pass.
+TRIAL_FIGURES = ("standard", "hard", "noisy")
+# Displacements that trials measured [cm], by figure: which trial.
+_DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one name on one object, all seeds together; None where there is none.
+
+    Attributes:
+        asked: grasps asked for.
+        given: grasps found.
+        held: grasps that passed the standard hold trial.
+        spent: CPU seconds of the optimiser and of those trials.
+
+    `values` has the medians of `_grasp_figures` over the grasps, the shares of `TRIAL_FIGURES` of the grasps asked for,
+    and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`, `cpu_per_verified` (`spent` over `held`),
+    `first_cpu` and `first_wall` until the first verified grasp.
+    """
+
+    name: str
+    object: str
+    method: str
+    asked: int
+    given: int
+    held: int
+    spent: float
+    values: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, quartiles and mean over objects, and how many there were."""
+
+    median: float
+    low: float
+    high: float
+    mean: float
+    objects: int
+
+
+def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
+    """A row for every name and object, in the order of the records. Cells that raised are left out."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    # Where nothing was found there is no trace of the trials: those of the other records are meant, and the first.
+    ran = {TRIAL_FIGURES[0]}
+    for record in records:
+        if record.get("kind") == kind and not record["error"]:
+            groups.setdefault((record["name"], record["object"]), []).append(record)
+            ran.update(trial for grasp in record["grasps"] for trial in TRIAL_FIGURES if trial in grasp)
+    return [_row(group, ran) for group in groups.values()]
+
+
+def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
+    asked, held = sum(r["count"] for r in group), sum(r["held"] for r in group)
+    grasps = [grasp for r in group for grasp in r["grasps"]]
+    figures = [_grasp_figures(grasp) for grasp in grasps]
+    names = _grasp_figures({})
+    values: dict[str, float | None] = {name: _median(figure[name] for figure in figures) for name in names}
+    for trial in TRIAL_FIGURES:
+        outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
+        tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
+        values[trial] = sum(outcome or 0.0 for outcome in outcomes) / asked if tried else None
+    # Planned runs have one total; raw ones count what a plan would have spent, the best of trials only.
+    spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)
+    values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / asked
+    prepared = sum(r["cpu"].get("scene", 0.0) for r in group)
+    values["cpu_with_scene"] = values["cpu_per_grasp"] + prepared / asked
+    values["cpu_per_verified"] = spent / held if held else None
+    for clock in ("cpu", "wall"):
+        values[f"first_{clock}"] = _median((r.get("first_verified") or {}).get(clock) for r in group)
+    values["peak_mb"] = max((r["peak_mb"] for r in group), default=None)
+    values["rounds"] = _median(float(r["rounds"]) if "rounds" in r else None for r in group)
+    one, given = group[0], sum(r["given"] for r in group)
+    return Row(one["name"], one["object"], one["method"], asked, given, held, spent, values)
+
+
+def spread(rows: Iterable[Row], figure: str) -> Spread | None:
+    """A figure's spread over objects; None where no object has it."""
+    values = [value for row in rows if (value := row.values.get(figure)) is not None]
+    if not values:
+        return None
+    low, middle, high = np.percentile(values, [25, 50, 75])
+    return Spread(float(middle), float(low), float(high), float(np.mean(values)), len(values))
+
+
+def per_verified(rows: Sequence[Row]) -> float | None:
+    """CPU seconds of the optimiser and the trials for each grasp that held, all objects together; None where none did.
+
+    Not a mean over objects: one on which nothing held has cost seconds, too.
+    """
+    held = sum(row.held for row in rows)
+    return sum(row.spent for row in rows) / held if held else None
+
+
+def by_name(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Rows of each name."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.name, []).append(row)
+    return groups
+
+
+def _grasp_figures(grasp: dict[str, Any]) -> dict[str, float | None]:
+    """Figures of one grasp's record by name, each in the unit of its name; None where there is none."""
+    measured = grasp.get("metrics") or {}
+    moved = {name: _inner(grasp, trial, "displacement_cm") for name, trial in _DISPLACEMENTS.items()}
+    metrics = {row.key: (measured.get(name), row.scale) for name, row in METRICS.items()}
+    return moved | {key: None if value is None else float(value) * scale for key, (value, scale) in metrics.items()}
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
+    value = (grasp.get(trial) or {}).get(figure)
+    return None if value is None else float(value)
+
+
+def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
+    """Which points are on the front where less is better on every axis.
+
+    A point is off it when another is no worse on every axis and better on one; equal points are on it together.
+    """
+    no_worse = (points[:, None] <= points[None]).all(-1)
+    better = (points[:, None] < points[None]).any(-1)
+    return np.asarray(~(no_worse & better).any(0))
+
+
+# Figures compared: heading, digits, and the least change worth a line (a share of the old value, or absolute).
+FIGURES = {
+    "standard": ("held", 3, 0.0, 0.001),
+    "hard": ("held hard", 3, 0.0, 0.001),
+    "sd_cm": ("SD cm", 2, 0.05, 0.02),
+    "penetration_mm": ("penetration mm", 2, 0.05, 0.1),
+    "contact_area_cm2": ("contact area cm²", 1, 0.05, 0.5),
+    "cpu_per_grasp": ("CPU s per grasp", 3, 0.15, 0.02),
+    "cpu_per_verified": ("CPU s per verified", 2, 0.15, 0.1),
+    "first_cpu": ("first verified, CPU s", 2, 0.15, 0.3),
+}
+
+
+@dataclass(frozen=True)
+class Move:
+    """One figure that is not what it was; None where it is not there."""
+
+    kind: str
+    name: str
+    object: str
+    figure: str
+    old: float | None
+    new: float | None
+
+
+def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
+    """What moved: for each name over all objects that both runs have ("all"), then object by object."""
+    found: list[Move] = []
+    for kind in ("raw", "verified"):
+        before = {(row.name, row.object): row for row in rows(old, kind)}
+        after = {(row.name, row.object): row for row in rows(new, kind)}
+        shared = [key for key in after if key in before]
+        befores, afters = (by_name(side[key] for key in shared) for side in (before, after))
+        for name in afters:
+            means = [{f: _mean(side[name], f) for f in FIGURES} for side in (befores, afters)]
+            found += _differences(kind, name, "all", *means)
+            found += [
+                move
+                for row in afters[name]
+                for move in _differences(kind, name, row.object, before[name, row.object].values, row.values)
+            ]
+    return found
+
+
+def _differences(
+    kind: str, name: str, thing: str, old: dict[str, float | None], new: dict[str, float | None]
+) -> list[Move]:
+    pairs = ((figure, old.get(figure), new.get(figure)) for figure in FIGURES)
+    return [Move(kind, name, thing, figure, a, b) for figure, a, b in pairs if _moved(figure, a, b)]
+
+
+def _moved(figure: str, old: float | None, new: float | None) -> bool:
+    _, _, share, least = FIGURES[figure]
+    if old is None or new is None:
+        return (old is None) != (new is None)
+    return abs(new - old) > max(share * abs(old), least)
+
+
+def _mean(group: Sequence[Row], figure: str) -> float | None:
+    if figure == "cpu_per_verified":
+        return per_verified(group)
+    over = spread(group, figure)
+    return over.mean if over else None
+
+
+def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
+    """The moves of cells as a table; what only one of the runs has is named below it."""
+    old, new = ([record for record in records if "kind" in record] for records in (old, new))
+    lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
+    for move in moves(old, new):
+        heading, digits = FIGURES[move.figure][:2]
+        a, b = (f"{v:.{digits}f}" if v is not None else "–" for v in (move.old, move.new))
+        change = f"{(move.new - move.old) / move.old:+.0%}" if move.old and move.new is not None else ""
+        lines.append(f"{move.kind:9} {move.name:32} {move.object:22} {heading:22} {a:>9} {b:>9}  {change}".rstrip())
+    if len(lines) == 1:
+        lines = ["nothing moved"]
+    for text, some, others in (("only in the old run", old, new), ("only in this run", new, old)):
+        have = {(r["kind"], r["name"], r["object"]) for r in others}
+        missing = dict.fromkeys((r["kind"], r["name"], r["object"]) for r in some)
+        if names := [" ".join(key) for key in missing if key not in have]:
+            lines.append(f"{text}: {len(names)} ({', '.join(names[:6])}{', …' if len(names) > 6 else ''})")
+    return "\n".join(lines)

@@ -1,0 +1,289 @@
+"""The trials that a raw grasp goes through, by the name that `--trials` knows them by; docs/metrics.md defines them.
+
+Lengths are written in the unit of their name, [cm] and [deg].
+
+One cell: a kind of run, settings, an object, a hand and a seed; and what is run for it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from graspd_bench.bullet.bullet_hold import bullet_hold_trial
+from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
+from graspd_bench.stopwatch import Stopwatch
+from graspd_bench.study import Case, Record, hand_hash, object_hash, raw_grasps, thing_name
+from graspd_bench.trials import gravity_trial
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.plan_config import PlanConfig, to_mapping
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import ObjectModel, object_parts
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Grasp, Progress, Stage, TrialResult, TriangleMesh, Verdict
+from graspd_core.verify.hold_trial import hold_trial, noisy_trial
+from graspd_core.verify.metrics import measure
+from graspd_core.verify.prepared_grasp import make_metrics_context
+from graspd_core.verify.world import PROTOCOLS, build_world
+
+# One trial of one grasp: figures by name.
+Trial = Callable[[Grasp], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What a trial needs to know: the hand, the object and its convex parts."""
+
+    hand: HandModel
+    target: ObjectModel
+    parts: Sequence[TriangleMesh]
+
+
+def _hold(name: str, tried: Tried) -> Trial:
+    protocol = PROTOCOLS[name]
+    world = build_world(tried.hand, tried.target, tried.parts, protocol)
+    return lambda grasp: _figures(hold_trial(world, grasp, protocol))
+
+
+def _noisy(tried: Tried) -> Trial:
+    protocol = PROTOCOLS["standard"]
+    world = build_world(tried.hand, tried.target, tried.parts, protocol)
+    return lambda grasp: {"share": noisy_trial(world, grasp, protocol)}
+
+
+def _gravity(tried: Tried) -> Trial:
+    protocol = PROTOCOLS["standard"]
+    world = build_world(tried.hand, tried.target, tried.parts, protocol)
+    return lambda grasp: {"displacement_cm": gravity_trial(world, grasp, protocol) * 100}
+
+
+def _displacement(tried: Tried) -> Trial:
+    if not bullet_available():
+        return _nothing
+    world = build_bullet_world(tried.hand, tried.target, tried.parts)
+    return lambda grasp: {"displacement_cm": bullet_displacement(world, grasp.grasp) * 100}
+
+
+def _second(tried: Tried) -> Trial:
+    if not bullet_available():
+        return _nothing
+    world = build_bullet_world(tried.hand, tried.target, tried.parts)
+    return lambda grasp: _figures(bullet_hold_trial(world, grasp, PROTOCOLS["standard"]))
+
+
+def _nothing(grasp: Grasp) -> dict[str, Any]:
+    """Without PyBullet there is no figure."""
+    return {}
+
+
+def _figures(result: TrialResult) -> dict[str, Any]:
+    return {
+        "passed": result.passed,
+        "displacement_cm": result.displacement * 100,
+        "rotation_deg": float(np.rad2deg(result.rotation)),
+        "reason": result.reason,
+    }
+
+
+TRIALS: Mapping[str, Callable[[Tried], Trial]] = {
+    "standard": partial(_hold, "standard"),
+    "hard": partial(_hold, "hard"),
+    "sd": _displacement,
+    "gravity": _gravity,
+    "noisy": _noisy,
+    "bullet": _second,
+}
+# What a raw cell goes through unless told otherwise: the noisy trial takes eight times as long as the others.
+USUAL = ("standard", "hard", "sd", "gravity")
+
+
+Kind = Literal["raw", "verified", "pace", "start"]
+_RUNS = 3
+
+# What `graspd synthesize` does, without a cache, from the first import on.
+_FRESH = """
+import sys, time
+import torch; torch.set_num_threads(1)
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.hands.library import load_hand
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.perception.load_scene import load_scene
+source, hand, seed = sys.argv[1:]
+result = plan_grasps(load_scene(source), load_hand(hand), count=1, seed=int(seed))
+print(str(result.grasps[0].verdict) == "verified" if result.grasps else False, time.process_time())
+"""
+
+
+@dataclass(frozen=True)
+class Cell(Case):
+    """One run of the suites.
+
+    Attributes:
+        kind: what is run: "raw" grasps each tried, "verified" ones planned, "pace" of the optimiser alone, "start":
+            the first verified grasp of a fresh process.
+        name: of the settings: a preset, or a sweep value.
+        settings: the settings themselves.
+        object: a mesh file or shape:NAME.
+        hand: name or path.
+        seed: of the method.
+        count: grasps asked for.
+        trials: names of the trials of every raw grasp.
+    """
+
+    kind: Kind
+    name: str
+    settings: PlanConfig
+    object: str
+    hand: str
+    seed: int
+    count: int
+    trials: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        return f"{self.kind} {self.name} {thing_name(self.object)} seed {self.seed}"
+
+    def asked(self) -> Record:
+        return {
+            **{name: getattr(self, name) for name in ("kind", "name", "seed", "count")},
+            "object": object_hash(self.object),
+            "hand": hand_hash(self.hand),
+            "settings": to_mapping(self.settings),
+            "trials": sorted(self.trials),
+        }
+
+    def shown(self) -> Record:
+        return {
+            **{name: getattr(self, name) for name in ("kind", "name", "hand", "seed", "count")},
+            "object": thing_name(self.object),
+            "method": self.settings.method,
+            "settings": to_mapping(self.settings),
+        }
+
+
+def run_cell(cell: Cell) -> Record:
+    """Figures of one cell."""
+    return {"raw": run_raw, "verified": run_verified, "pace": run_pace, "start": run_start}[cell.kind](cell)
+
+
+def run_raw(cell: Cell) -> dict[str, Any]:
+    """Figures of one raw cell. Grasps that a method does not find are missing from the list, and count as failed."""
+    stopwatch = Stopwatch()
+    hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
+    with stopwatch("scene"):
+        scene = load_scene(cell.object, resolution=cell.settings.resolution)
+    with stopwatch("optimise"):
+        grasps = raw_grasps(scene, hand, cell.settings, cell.count, cell.seed)
+    with stopwatch("parts"):
+        tried = Tried(hand, scene.object, object_parts(scene.object))
+    results: list[dict[str, Any]] = [{"score": grasp.score, "links": len(grasp.contacts)} for grasp in grasps]
+    # A method that finds nothing has paid for its scene and its search only.
+    first: dict[str, float] | None = None
+    for name in cell.trials if grasps else ():
+        with stopwatch(f"world {name}"):
+            trial = TRIALS[name](tried)
+        for grasp, result in zip(grasps, results, strict=True):
+            with stopwatch(name):
+                result[name] = trial(grasp)
+            if name == "standard" and first is None and result[name]["passed"]:
+                # The parts are built beside the optimiser in `plan_grasps`: in CPU seconds they count all the same.
+                first = {"cpu": sum(stopwatch.cpu.values()), "wall": sum(stopwatch.wall.values())}
+    context = make_metrics_context(scene.object, hand)
+    for grasp, result in zip(grasps, results, strict=True):
+        with stopwatch("metrics"):
+            result["metrics"] = dict(measure(context, grasp.grasp))
+    return {
+        "given": len(grasps),
+        "held": sum(bool(r.get("standard", {}).get("passed")) for r in results),
+        "first_verified": first,
+        "cpu": stopwatch.cpu,
+        "wall": stopwatch.wall,
+        "parts": len(tried.parts),
+        "grasps": results,
+    }
+
+
+class _First:
+    """Notes when the first grasp was verified, and how often the optimiser was started."""
+
+    def __init__(self, began: dict[str, float]) -> None:
+        self.began, self.first, self.rounds, self._stage = began, None, 0, Stage.LOAD
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.stage is Stage.OPTIMISE and self._stage is not Stage.OPTIMISE:
+            self.rounds += 1
+        self._stage = progress.stage
+        if progress.verified and self.first is None:
+            self.first = {name: value - self.began[name] for name, value in _now().items()}
+
+
+def run_verified(cell: Cell) -> dict[str, Any]:
+    """Figures of one planned run: how many of `count` were verified, and what all of it cost."""
+    hand = load_hand(cell.hand)
+    began = _now()
+    told = _First(began)
+    scene = load_scene(cell.object)
+    result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=told)
+    taken = {name: value - began[name] for name, value in _now().items()}
+    return {
+        "given": len(result.grasps),
+        "held": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
+        "first_verified": told.first,
+        "rounds": told.rounds,
+        "outcome": result.outcome.name,
+        "audits": asdict(result.audits),
+        "cpu": {"total": taken["cpu"]},
+        "wall": {"total": taken["wall"], "optimise": result.timing.optimise, "verify": result.timing.verify},
+        "grasps": [{"verdict": str(grasp.verdict), "reason": grasp.reason} for grasp in result.grasps],
+    }
+
+
+def _now() -> dict[str, float]:
+    return {"cpu": time.process_time(), "wall": time.perf_counter()}
+
+
+def run_pace(cell: Cell) -> dict[str, Any]:
+    """CPU seconds of one batch, the least of three after one that is not counted, and what a grasp-step of it costs.
+
+    A grasp-step is one step of one start: what the optimiser does most of.
+    """
+    hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
+    scene = load_scene(cell.object, resolution=cell.settings.resolution)
+    runs: list[Stopwatch] = []
+    for run in range(_RUNS + 1):
+        stopwatch = Stopwatch()
+        with stopwatch("optimise"):
+            raw_grasps(scene, hand, cell.settings, cell.count, cell.seed + run)
+        runs.append(stopwatch)
+    best = min(runs[1:], key=lambda stopwatch: stopwatch.cpu["optimise"])
+    return {"cpu": best.cpu, "wall": best.wall, "grasp_steps": grasp_steps(cell)}
+
+
+def grasp_steps(cell: Cell) -> int | None:
+    """Steps times starts of one batch of the closed form; None for other methods."""
+    s = cell.settings.settings
+    if not isinstance(s, ClosedFormConfig):
+        return None
+    kept = s.keep_per_grasp * cell.count
+    return round(s.starts_per_grasp * cell.count * s.explore_steps + kept * (s.refine_steps + s.polish_steps))
+
+
+def run_start(cell: Cell) -> dict[str, Any]:
+    """Seconds from the start of a process to its first verified grasp, with nothing remembered on disk."""
+    environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
+    began = time.perf_counter()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    wall = time.perf_counter() - began
+    verified, cpu = done.stdout.split()
+    return {"given": 1, "held": int(verified == "True"), "cpu": {"total": float(cpu)}, "wall": {"total": wall}}

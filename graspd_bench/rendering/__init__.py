@@ -1,0 +1,1 @@
+"""Pictures, depth images, and scenes whose truth is known."""

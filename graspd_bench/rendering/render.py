@@ -1,0 +1,179 @@
+"""Rays against meshes: depth images as a camera sees them, and shaded pictures, without any display.
+
+Camera frames follow the optical convention: z forward, x right, y down.
+
+A picture of a hand by ray casting: open and closed, from the side and onto the palm, with what was found of it.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from graspd_core.hands.kinematics import hand_mesh, link_poses
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.shapes import joined
+from graspd_core.mesh.surface_queries import first_hits
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
+from graspd_core.se3 import perpendicular
+from graspd_core.types import TriangleMesh
+
+Vector = Sequence[float | int] | Float[np.ndarray, "3"]
+
+BACKGROUND = 255
+AMBIENT = 0.25
+
+
+def camera_of_view(width: int, height: int, field_of_view: float = 0.7) -> PinholeCamera:
+    """A centred camera of that vertical field of view [rad]."""
+    focal = 0.5 * height / float(np.tan(0.5 * field_of_view))
+    return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
+    """`T_world_camera` of a camera at `eye` that looks at `target` with `up` upwards in its image [m].
+
+    Looking along `up`, any roll will do and one is chosen.
+    """
+    forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, dtype=float))
+    if np.linalg.norm(right) < 1e-9:
+        right = perpendicular(forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = eye
+    return pose
+
+
+def render_depth(
+    mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "height width"]:
+    """Distance along the optical axis [m], 0 where the ray meets nothing."""
+    distance, _, _ = _cast(mesh, camera, T_world_camera)
+    return np.where(np.isfinite(distance), distance, 0.0)
+
+
+def render_scene(
+    meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
+    """Distance along the optical axis [m], 0 where the ray meets nothing, and which mesh it meets, -1 for none."""
+    distance, face, _ = _cast(joined(*meshes), camera, T_world_camera)
+    hit = np.isfinite(distance)
+    label = np.full(distance.shape, -1)
+    label[hit] = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])[face[hit]]
+    return np.where(hit, distance, 0.0), label
+
+
+def render_shaded(
+    meshes: Sequence[tuple[TriangleMesh, tuple[float, float, float]]],
+    *,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    width: int = 640,
+    height: int = 480,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
+    together = joined(*(mesh for mesh, _ in meshes))
+    colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
+    distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
+    hit = np.isfinite(distance)
+    view, above = -T_world_camera[:3, 2], np.array([0.0, 0.0, 1.0])
+    # A face is lit whichever way it is wound: towards the viewer.
+    normal = normal * np.where(normal @ view < 0, -1.0, 1.0)[..., None]
+    light = AMBIENT + 0.55 * (normal @ view).clip(0) + 0.2 * (normal @ above).clip(0)
+    image = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
+    image[hit] = (255 * (colours[face[hit]] * light[hit][:, None]).clip(0, 1)).astype(np.uint8)
+    return image
+
+
+def save_png(image: UInt8[np.ndarray, "height width 3"], path: str | Path) -> None:
+    """Write an RGB picture (PNG specification: one IHDR, one IDAT of unfiltered rows, IEND)."""
+    height, width, _ = image.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, width * 3)], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
+    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
+    """Depth (infinite where nothing is hit), face index and unit face normal of each pixel."""
+    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    rays = camera_rays(camera)
+    # Pixels beyond the lens's range look nowhere.
+    blind = np.isnan(rays[..., 0])
+    distance, face, normal = first_hits(
+        TriangleMesh(mesh.vertices - position, mesh.faces), np.nan_to_num(rays) @ rotation.T
+    )
+    return np.where(blind, np.inf, distance), face, normal
+
+
+_HAND, _CANDIDATE, _PALM = (0.45, 0.55, 0.75), (0.85, 0.25, 0.15), (0.15, 0.6, 0.2)
+_WIDTH, _HEIGHT = 560, 480
+# Dots for candidates, and the arrow out of the palm, in shares of the hand's size.
+_DOT, _ARROW, _SHAFT = 0.006, 0.35, 0.012
+
+
+def hand_picture(hand: HandModel) -> UInt8[np.ndarray, "height width 3"]:
+    """Four views: above from the side, below onto the palm; left open, right closed.
+
+    Contact candidates are red dots; a green arrow stands on the palm's centre along its normal.
+    """
+    reach = hand_mesh(hand, hand.open_posture).vertices
+    middle, size = 0.5 * (reach.min(0) + reach.max(0)), float(np.ptp(reach, axis=0).max())
+    up = _up(hand, middle)
+    side = np.cross(up, hand.palm_normal)
+    eyes = (side + 0.5 * hand.palm_normal + 0.25 * up, hand.palm_normal + 0.15 * side + 0.1 * up)
+    rows = []
+    for eye in eyes:
+        # The light comes from z: the world is turned so that the fingers point up.
+        frame = np.column_stack([np.cross(hand.palm_normal, up), hand.palm_normal, up]).T
+        pose = look_at(frame @ (2.1 * size * eye / np.linalg.norm(eye)), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        row = []
+        for posture in (hand.open_posture, hand.closed_posture):
+            meshes = [
+                (TriangleMesh((mesh.vertices - middle) @ frame.T, mesh.faces), colour)
+                for mesh, colour in _scene(hand, posture, size)
+            ]
+            row.append(render_shaded(meshes, T_world_camera=pose, width=_WIDTH, height=_HEIGHT))
+        rows.append(np.concatenate(row, axis=1))
+    return np.concatenate(rows, axis=0)
+
+
+def _up(hand: HandModel, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The direction from the palm to the middle of the hand, square to the palm's normal, unit."""
+    along = middle - hand.palm_center
+    along = along - (along @ hand.palm_normal) * hand.palm_normal
+    length = float(np.linalg.norm(along))
+    return along / length if length > 1e-3 else perpendicular(hand.palm_normal)
+
+
+def _scene(
+    hand: HandModel, posture: Float[np.ndarray, "joints"], size: float
+) -> list[tuple[TriangleMesh, tuple[float, float, float]]]:
+    import trimesh
+
+    rotations, translations = link_poses(hand, posture)
+    links = hand.candidate_link
+    placed = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
+    dot = trimesh.creation.icosphere(subdivisions=0, radius=_DOT * size)
+    count = len(dot.vertices)
+    dots = TriangleMesh(
+        (placed[:, None] + np.asarray(dot.vertices)).reshape(-1, 3),
+        (np.asarray(dot.faces) + count * np.arange(len(placed))[:, None, None]).reshape(-1, 3),
+    )
+    ends = np.stack([hand.palm_center, hand.palm_center + _ARROW * size * hand.palm_normal])
+    shaft = trimesh.creation.cylinder(radius=_SHAFT * size, segment=ends, sections=12)
+    knob = trimesh.creation.icosphere(subdivisions=1, radius=2 * _SHAFT * size)
+    knob.apply_translation(ends[1])
+    arrow = joined(*(TriangleMesh(np.asarray(body.vertices), np.asarray(body.faces)) for body in (shaft, knob)))
+    return [(hand_mesh(hand, posture), _HAND), (dots, _CANDIDATE), (arrow, _PALM)]

@@ -1,0 +1,180 @@
+"""Authored scenes on a table with their truth: a shape at rest on z = 0, neighbours beside it, cameras around it.
+
+World frame: z up, the table's top in the plane z = 0, the object above the origin. Clouds are in that frame too, so a
+grasp that was planned on them can be tried on `truth` as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from graspd_bench.rendering.depth_noise import NONE, DepthNoise, add_noise
+from graspd_bench.rendering.render import look_at, render_scene
+from graspd_core.mesh.mesh_files import mass_properties
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.se3 import perpendicular, quaternion_between, rotation_from_quaternion
+from graspd_core.types import Plane, TriangleMesh
+
+# Half the table's side and its thickness [m].
+TABLE_HALF, TABLE_THICK = 0.4, 0.02
+
+# As a D415 sees: 640 x 480 pixels, 55° across.
+CAMERA = PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5)
+
+# Authored shapes that would topple as they are authored.
+LYING = ("capsule", "hammer")
+
+
+@dataclass(frozen=True)
+class TabletopScene:
+    """What stands on a table, all in the world frame.
+
+    Attributes:
+        truth: the object to grasp [m].
+        T_world_object: pose of the shape's own frame.
+        obstacles: what stands beside it [m].
+        table: its surface [m].
+        support: its top as a half-space.
+    """
+
+    truth: TriangleMesh
+    T_world_object: Float[np.ndarray, "4 4"]
+    obstacles: tuple[TriangleMesh, ...]
+    table: TriangleMesh
+    support: Plane
+
+    @property
+    def meshes(self) -> tuple[TriangleMesh, ...]:
+        """In the order of the labels of `depth_views`: the object 0, its neighbours 1 and on, the table last."""
+        return (self.truth, *self.obstacles, self.table)
+
+
+def tabletop(
+    shape: str | TriangleMesh,
+    *,
+    yaw: float = 0.0,
+    obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = (),
+) -> TabletopScene:
+    """A shape by name, or a mesh, on the table.
+
+    Args:
+        shape: named ones stand as authored if they would, else lie; a mesh lies where it is lowest.
+        yaw: turn about the vertical [rad].
+        obstacles: shape, x and y [m] of what stands beside it.
+
+    Raises:
+        MeshError: an unknown shape.
+    """
+    mesh, pose = _at_rest(shape, yaw)
+    others = []
+    for other, x, y in obstacles:
+        resting, T_world_other = _at_rest(other, 0.0)
+        others.append(moved(resting, _translation(x, y, 0.0) @ T_world_other))
+    return TabletopScene(moved(mesh, pose), pose, tuple(others), _table(), Plane(np.array([0.0, 0.0, 1.0]), 0.0))
+
+
+def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
+    """The pose on z = 0 in which the mesh's centre of mass is lowest; it is always one of stable rest.
+
+    The facet of the convex hull nearest to the centre of mass has the foot of the perpendicular inside it.
+    """
+    from scipy.spatial import ConvexHull
+
+    centre = mass_properties(mesh)[1]
+    facets = ConvexHull(mesh.vertices).equations
+    down = facets[np.argmax(facets[:, :3] @ centre + facets[:, 3]), :3]
+    pose = np.eye(4)
+    turn = quaternion_between(down, np.array([0.0, 0.0, -1.0]), around=perpendicular(down))
+    pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(turn)).numpy()
+    return _set_down(mesh, pose, centre)
+
+
+def ring_poses(
+    count: int,
+    *,
+    elevation: float,
+    distance: float = 0.55,
+    azimuth: float = 0.0,
+    target: tuple[float, float, float] = (0.0, 0.0, 0.04),
+) -> tuple[Float[np.ndarray, "4 4"], ...]:
+    """`T_world_camera` of cameras spaced evenly on a horizontal ring, all looking at `target`.
+
+    Args:
+        elevation: of the cameras above the horizon, seen from the target [rad].
+        distance: from the target [m].
+        azimuth: of the first camera, from x towards y [rad].
+        target: [m].
+    """
+    turns = azimuth + 2 * np.pi * np.arange(count) / count
+    flat, up = distance * np.cos(elevation), distance * np.sin(elevation)
+    return tuple(look_at(np.add(target, (flat * np.cos(a), flat * np.sin(a), up)), target) for a in turns)
+
+
+def depth_views(
+    scene: TabletopScene,
+    camera: PinholeCamera,
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    noise: DepthNoise = NONE,
+    seed: int = 0,
+) -> tuple[tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]], ...]:
+    """The depth image [m] of each pose, and which of `scene.meshes` each pixel truly shows, -1 for none."""
+    images = []
+    for index, pose in enumerate(poses):
+        depth, label = render_scene(scene.meshes, camera, pose)
+        images.append((add_noise(depth, camera, noise, seed + index), label))
+    return tuple(images)
+
+
+def views_of(
+    scene: TabletopScene,
+    camera: PinholeCamera,
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    noise: DepthNoise = NONE,
+    seed: int = 0,
+) -> tuple[PointCloud, ...]:
+    """What the camera sees from each pose, table and all, in the world frame."""
+    images = depth_views(scene, camera, poses, noise, seed)
+    return tuple(cloud_from_depth(depth, camera, pose) for (depth, _), pose in zip(images, poses, strict=True))
+
+
+def moved(mesh: TriangleMesh, transform: Float[np.ndarray, "4 4"]) -> TriangleMesh:
+    """The mesh under a rigid motion."""
+    return TriangleMesh(mesh.vertices @ transform[:3, :3].T + transform[:3, 3], mesh.faces)
+
+
+def _at_rest(shape: str | TriangleMesh, yaw: float) -> tuple[TriangleMesh, Float[np.ndarray, "4 4"]]:
+    mesh = make_shape(shape) if isinstance(shape, str) else shape
+    if isinstance(shape, str) and shape not in LYING:
+        pose = _set_down(mesh, np.eye(4), mesh.vertices.mean(0))
+    else:
+        pose = lowest_pose(mesh)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    return mesh, turn @ pose
+
+
+def _set_down(mesh: TriangleMesh, pose: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]):
+    """The same attitude, its lowest point at z = 0 and `centre` above the origin."""
+    turned = mesh.vertices @ pose[:3, :3].T
+    x, y, _ = pose[:3, :3] @ centre
+    return _translation(-x, -y, -turned[:, 2].min()) @ pose
+
+
+def _translation(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def _table() -> TriangleMesh:
+    import trimesh
+
+    slab = trimesh.creation.box(extents=(2 * TABLE_HALF, 2 * TABLE_HALF, TABLE_THICK))
+    return TriangleMesh(np.array(slab.vertices) - [0, 0, TABLE_THICK / 2], np.array(slab.faces, dtype=np.int64))

@@ -1,0 +1,1 @@
+"""Objects and clouds broken on purpose."""

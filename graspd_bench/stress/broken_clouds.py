@@ -1,0 +1,327 @@
+"""Clouds broken on purpose: what depth cameras, drivers and clutter make of a thing on a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.rendering.depth_noise import DEFAULT, HIGH
+from graspd_bench.rendering.tabletop import (
+    CAMERA,
+    TABLE_HALF,
+    TabletopScene,
+    depth_views,
+    moved,
+    ring_poses,
+    tabletop,
+    views_of,
+)
+from graspd_bench.stress.broken_meshes import box
+from graspd_bench.stress.run_stress_case import GRASP, Case
+from graspd_core.perception.cloud.camera import cloud_from_depth
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.scene import Scene
+from graspd_core.perception.segment.segment import Target
+from graspd_core.types import TriangleMesh
+
+_SEED, _YAW = 11, 0.3
+_FEW = ("TOO_FEW", "NO_CANDIDATES")
+_POSES = ring_poses(3, elevation=0.7, azimuth=0.5)
+_EYE = np.array([0.4, 0.2, 0.4])
+
+Views = Sequence[PointCloud]
+
+_PAIR = tabletop("box", obstacles=[("cylinder", 0.063, 0.0)])
+_SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
+
+
+def cloud_cases() -> tuple[Case, ...]:
+    """Every broken cloud, through `scene_from_views`."""
+    return (*_measured(), *_refused(), *_special())
+
+
+def _measured() -> Iterator[Case]:
+    """What sensors and scenes do to clouds that grasps are still expected of."""
+    cuboid, mug, cylinder, block = (_true(shape) for shape in ("box", "mug", "cylinder", "l_block"))
+    seen = (
+        ("single-view", "one view of a box on a table", lambda: _views("box", 1), cuboid),
+        ("single-view-mug", "one view of a mug, its inside unseen", lambda: _views("mug", 1), mug),
+        ("single-view-bottle", "one view of a bottle", lambda: _views("bottle", 1), _true("bottle")),
+        (
+            "noisy-sensor",
+            "three views with three times the usual noise",
+            lambda: _views("l_block", 3, noise=HIGH),
+            block,
+        ),
+        ("flying-pixels", "every edge smeared along its rays", _flying, cuboid),
+        ("table-bleed", "a ring of table about the foot of a mug taken for mug", bled, mug),
+        ("dropouts", "nine of ten points lost", lambda: _dropped(_views("box", 3), 0.9), cuboid),
+        ("half-nan", "every other point is NaN", lambda: _with_nan(_views("cylinder", 3), 0.5), cylinder),
+        ("outliers", "two hundred points anywhere in the room", _outliers, cuboid),
+        ("repeated-points", "every point five times", _repeated, cylinder),
+        ("coarse-depth", "depth in steps of 4 mm", _stepped, cuboid),
+        ("moved-view", "three views of which one stands 4 mm and 1° off", _misplaced, cuboid),
+        ("mirror-shine", "a hole of 3 cm burnt into the middle of the object", _shiny, cuboid),
+        ("far-camera", "a box seen from 1.6 m", lambda: _views("box", 3, distance=1.6), cuboid),
+        ("half-out-of-view", "the image ends in the middle of a box", lambda: half_out_of_view("box"), cuboid),
+        ("black-neighbour", "beside a box something black leaves a hole", lambda: black_neighbour("box"), cuboid),
+        ("table-edge", "a mug at the edge of the table", lambda: at_the_edge("mug"), mug),
+        ("stepped-table", "a table with a step of 3 cm beside a box", lambda: beside_a_step("box"), cuboid),
+        ("arm-in-view", "a forearm beside a cylinder", lambda: with_an_arm("cylinder"), cylinder),
+        ("same-view-thrice", "one message of a mug three times", lambda: thrice("mug"), mug),
+        ("zero-filled", "two points of three are the camera's own place", lambda: zero_filled("box"), cuboid),
+        ("tilted-table", "camera coordinates: the table tilts by 40°", _in_camera, _box_in_camera),
+    )
+    return (_case(name, about, make, truth=truth) for name, about, make, truth in seen)
+
+
+def _refused() -> Iterator[Case]:
+    """What holds no object."""
+    refused = (
+        ("empty", "no point at all", lambda: [_cloud(np.zeros((0, 3)))], ("CloudError",)),
+        ("no-view", "a list of no views", lambda: [], ("CloudError",)),
+        ("all-nan", "every point is NaN", lambda: [_cloud(np.full((5000, 3), np.nan))], ("CloudError",)),
+        ("ten-points", "ten points", lambda: [_cloud(np.random.default_rng(_SEED).normal(0, 0.02, (10, 3)))], None),
+        ("infinite", "points at infinity", lambda: [_cloud(np.full((5000, 3), np.inf))], ("CloudError",)),
+        ("no-object", "a table and nothing on it", _bare, ("NoObjectError",)),
+        ("all-at-origin", "a driver that fills with zeros", lambda: [_cloud(np.zeros((307_200, 3)))], None),
+        ("white-noise", "points anywhere in a cube of 2 m", _room, ("CloudError", "NoObjectError", *_FEW)),
+        ("wrong-units", "a cloud in millimetres", lambda: _scaled(_views("box", 1), 1e3), None),
+    )
+    return (
+        _case(name, about, make, expect or ("CloudError", "NoObjectError"), whole=False)
+        for name, about, make, expect in refused
+    )
+
+
+def _special() -> tuple[Case, ...]:
+    """What is asked for or bounded in another way."""
+    return (
+        _case(
+            "lone-object",
+            "the object alone, nothing under it",
+            lambda: _alone("cylinder"),
+            alone=True,
+            truth=_true("cylinder"),
+        ),
+        _case(
+            "touching-masked",
+            "two things that touch, one of them masked",
+            _touching,
+            target=_mask,
+            truth=_true("box", 0.0),
+        ),
+        _case("touching", "two things that touch, and no word which", _touching, (GRASP, *_FEW), whole=False),
+        _case("touching-unequal", "a slab against a box, and no word which", unequal_pair, (GRASP, *_FEW), whole=False),
+        _case("ten-million-points", "ten million points", _many, memory=3000.0, loading=30.0, truth=_true("box")),
+    )
+
+
+def _case(
+    name: str,
+    about: str,
+    make: Callable[[], Views],
+    expect: tuple[str, ...] = (GRASP,),
+    *,
+    target: Callable[[], Target] | None = None,
+    whole: bool = True,
+    alone: bool = False,
+    memory: float = 2000.0,
+    loading: float = 15.0,
+    truth: Callable[[], TriangleMesh] | None = None,
+) -> Case:
+    def scene(folder: Path) -> Scene:
+        return scene_from_views(make(), source=name, alone=alone, target=target() if target else None)
+
+    return Case(name, "cloud", about, scene, expect, whole, memory=memory, loading=loading, truth=truth)
+
+
+def _views(shape: str, count: int, *, noise: Any = DEFAULT, distance: float = 0.55) -> Views:
+    poses = ring_poses(count, elevation=0.7, azimuth=0.5, distance=distance)
+    return views_of(tabletop(shape, yaw=_YAW), CAMERA, poses, noise, _SEED)
+
+
+def _true(shape: str, yaw: float = _YAW) -> Callable[[], TriangleMesh]:
+    return lambda: tabletop(shape, yaw=yaw).truth
+
+
+def _cloud(points: np.ndarray) -> PointCloud:
+    return PointCloud(points, _EYE, -_EYE / np.linalg.norm(_EYE))
+
+
+def _each(views: Views, change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Views:
+    rng = np.random.default_rng(_SEED)
+    return [replace(view, points=change(view.points, rng)) for view in views]
+
+
+def _scaled(views: Views, factor: float) -> Views:
+    return [replace(view, points=view.points * factor, viewpoint=view.viewpoint * factor) for view in views]
+
+
+def _flying() -> Views:
+    return _views("box", 3, noise=replace(HIGH, flying=1.0, edge_loss=0.0))
+
+
+def bled() -> Views:
+    """What a cut by a plane a little too low leaves: a patch of table about a mug's foot."""
+    stage = tabletop("mug", yaw=_YAW)
+    ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT)
+    (view,) = views_of(stage, CAMERA, _POSES[:1], DEFAULT)
+    shown = label[depth > 0]
+    x, y, z = view.points.T
+    patch = (shown == 1) & (np.hypot(x, y) < 0.06) & (z > 0.0015)
+    return [replace(view, points=view.points[(shown == 0) | patch])]
+
+
+def _dropped(views: Views, share: float) -> Views:
+    return _each(views, lambda points, rng: points[rng.random(len(points)) >= share])
+
+
+def _with_nan(views: Views, share: float) -> Views:
+    return _each(views, lambda points, rng: np.where(rng.random((len(points), 1)) < share, np.nan, points))
+
+
+def _outliers() -> Views:
+    return _each(_views("box", 3), lambda points, rng: np.vstack([points, rng.uniform(-0.7, 0.7, (200, 3))]))
+
+
+def _repeated() -> Views:
+    return _each(_views("cylinder", 1), lambda points, rng: np.repeat(points, 5, axis=0))
+
+
+def _stepped() -> Views:
+    stage = tabletop("box", yaw=_YAW)
+    images = depth_views(stage, CAMERA, _POSES, DEFAULT, _SEED)
+    return [
+        cloud_from_depth(np.round(depth / 0.004) * 0.004, CAMERA, pose)
+        for (depth, _), pose in zip(images, _POSES, strict=True)
+    ]
+
+
+def _misplaced() -> Views:
+    first, second, third = _views("box", 3)
+    a = np.deg2rad(1.0)
+    turn = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    return [first, second, replace(third, points=third.points @ turn.T + np.array([0.004, 0.0, 0.0]))]
+
+
+def _shiny() -> Views:
+    """The hole is where one camera looks straight at the object."""
+
+    def burn(view: PointCloud) -> PointCloud:
+        above = view.points[:, 2] > 0.01
+        middle = np.nanmean(view.points[above], axis=0)
+        near = np.linalg.norm(view.points - middle, axis=1)
+        nearest = view.points[np.argmin(near)]
+        return replace(view, points=view.points[np.linalg.norm(view.points - nearest, axis=1) > 0.015])
+
+    return [burn(view) for view in _views("box", 3)]
+
+
+def _in_camera() -> Views:
+    (view,) = _views("box", 1)
+    R, t = _POSES[0][:3, :3], _POSES[0][:3, 3]
+    return [PointCloud((view.points - t) @ R, np.zeros(3), np.array([0.0, 0.0, 1.0]))]
+
+
+def _box_in_camera() -> TriangleMesh:
+    return moved(_true("box")(), np.linalg.inv(_POSES[0]))
+
+
+def _alone(shape: str) -> Views:
+    stage = tabletop(shape, yaw=_YAW)
+    images = depth_views(stage, CAMERA, _POSES, DEFAULT, _SEED)
+    views = views_of(stage, CAMERA, _POSES, DEFAULT, _SEED)
+    return [
+        replace(view, points=view.points[label[depth > 0] == 0])
+        for view, (depth, label) in zip(views, images, strict=True)
+    ]
+
+
+def _bare() -> Views:
+    stage = tabletop("box", yaw=_YAW)
+    bare = replace(stage, truth=replace(stage.truth, vertices=stage.truth.vertices - np.array([0.0, 0.0, 1.0])))
+    return views_of(bare, CAMERA, _POSES[:1], DEFAULT, _SEED)
+
+
+def _room() -> Views:
+    return [_cloud(np.random.default_rng(_SEED).uniform(-1.0, 1.0, (100_000, 3)))]
+
+
+def _many() -> Views:
+    rng = np.random.default_rng(_SEED)
+    (view,) = _views("box", 1)
+    many = view.points[rng.integers(0, len(view.points), 10_000_000)]
+    return [replace(view, points=many + rng.normal(0, 3e-4, many.shape))]
+
+
+def _touching() -> Views:
+    return views_of(_PAIR, CAMERA, _SIDE, DEFAULT, _SEED)
+
+
+def _mask() -> Target:
+    ((depth, label),) = depth_views(_PAIR, CAMERA, _SIDE, DEFAULT, _SEED)
+    return Target(mask=label[depth > 0] == 0)
+
+
+def half_out_of_view(shape: str) -> Views:
+    """The image ends in the middle of the object."""
+    ((depth, label),) = depth_views(tabletop(shape, yaw=_YAW), CAMERA, _POSES[:1], DEFAULT, _SEED)
+    middle = int(np.nonzero(label == 0)[1].mean())
+    return [cloud_from_depth(np.where(np.arange(CAMERA.width) < middle, depth, 0.0), CAMERA, _POSES[0])]
+
+
+def black_neighbour(shape: str) -> Views:
+    """Beside the object a thing stands that gives no depth, and its place on the table with it."""
+    stage = tabletop(shape, yaw=_YAW, obstacles=[("cylinder", 0.13, 0.03)])
+    ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT, _SEED)
+    return [cloud_from_depth(np.where(label == 1, 0.0, depth), CAMERA, _POSES[0])]
+
+
+def at_the_edge(shape: str) -> Views:
+    """The table ends beside the object, towards the camera."""
+    stage = tabletop(shape, yaw=_YAW)
+    table = stage.table.vertices - np.array([TABLE_HALF - 0.05, 0.0, 0.0])
+    return _seen(replace(stage, table=TriangleMesh(table, stage.table.faces)))
+
+
+def beside_a_step(shape: str) -> Views:
+    """Half of the table is 3 cm higher."""
+    return _seen(_with(shape, box((0.3, 0.8, 0.03), (0.23, 0.0, 0.015))))
+
+
+def with_an_arm(shape: str) -> Views:
+    """A forearm of half a metre reaches in over the table."""
+    return _seen(_with(shape, box((0.09, 0.5, 0.09), (-0.05, -0.38, 0.17))))
+
+
+def thrice(shape: str) -> Views:
+    """The same message three times, as three views."""
+    (view,) = _seen(tabletop(shape, yaw=_YAW))
+    return [view, view, view]
+
+
+def zero_filled(shape: str) -> Views:
+    """Two pixels of three have no depth, and the driver sends the camera's own place for them."""
+    (view,) = _seen(tabletop(shape, yaw=_YAW))
+    lost = np.random.default_rng(_SEED).random(len(view.points)) < 2 / 3
+    return [replace(view, points=np.where(lost[:, None], view.viewpoint, view.points))]
+
+
+def unequal_pair() -> Views:
+    """A box, and a slab of a third of its height against it."""
+    stage = tabletop("box", obstacles=[(box((0.08, 0.05, 0.03), (0.0, 0.0, 0.0)), 0.0702, 0.0)])
+    return views_of(stage, CAMERA, ring_poses(1, elevation=0.9, azimuth=-1.57), DEFAULT, _SEED)
+
+
+def _seen(stage: TabletopScene) -> Views:
+    return views_of(stage, CAMERA, _POSES[:1], DEFAULT, _SEED)
+
+
+def _with(shape: str, other: TriangleMesh) -> TabletopScene:
+    return replace(tabletop(shape, yaw=_YAW), obstacles=(other,))

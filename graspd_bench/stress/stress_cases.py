@@ -1,0 +1,133 @@
+"""Every stress case by its name, what the benchmark runs of them, and the endings as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from graspd_bench import study
+from graspd_bench.stress.broken_clouds import cloud_cases
+from graspd_bench.stress.broken_meshes import extreme_cases, mesh_cases
+from graspd_bench.stress.run_stress_case import GRASP, Case, StressEnding, faults, run_case
+from graspd_bench.study import Record, Request, Sections
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import ConfigError
+from graspd_core.types import Outcome
+
+CASES: dict[str, Case] = {case.name: case for case in (*mesh_cases(), *cloud_cases(), *extreme_cases())}
+# Beyond loading and planning, before a process is called hung [s].
+_PATIENCE = 60.0
+# Of a small run: a family of those that take a second each.
+_QUICK = ("hand", "nan-vertices", "empty")
+# Longer messages end in dots [characters].
+_MESSAGE = 110
+_HEADINGS = ("case", "what is wrong", "ending", "load s", "plan s", "peak MB", "held/tried", "again", "true", "told")
+
+
+@dataclass(frozen=True)
+class StressRun(study.Case):
+    """A stress case by its name, planned with a preset."""
+
+    name: str
+    preset: str
+
+
+def stress_runs(request: Request) -> tuple[StressRun, ...]:
+    """Cases by their names or families, all of them for no name. Raises ConfigError: there is no such case."""
+    families = sorted({case.family for case in CASES.values()})
+    names = request.cases or (_QUICK if request.quick else ())
+    if unknown := [name for name in names if name not in CASES and name not in families]:
+        raise ConfigError(f"unknown case {unknown[0]!r}; valid: {', '.join(families)}, {', '.join(sorted(CASES))}")
+    chosen = [case.name for case in CASES.values() if not names or case.name in names or case.family in names]
+    return tuple(StressRun(name, request.preset()) for name in chosen)
+
+
+def run_stress(run: StressRun) -> Record:
+    """What a case ends in."""
+    return asdict(run_case(CASES[run.name], run.preset))
+
+
+def stress_patience(run: StressRun) -> float:
+    """Seconds until a case is called hung. It is loaded twice: for the second trial, too."""
+    case = CASES[run.name]
+    return 2 * case.loading + case.deadline + _PATIENCE
+
+
+def ending_of(record: Record) -> StressEnding:
+    """The ending that a record tells of; where its process failed, a crash or a hang."""
+    if record["error"]:
+        return StressEnding(record["name"], "hang" if record["failed"] == "hung" else "crash", record["error"])
+    return StressEnding(**{name: record[name] for name in StressEnding.__dataclass_fields__})
+
+
+def stress_faults(record: Record) -> tuple[str, ...]:
+    """What is wrong with the ending that a record tells of."""
+    return faults(CASES[record["name"]], ending_of(record))
+
+
+def stress_came(record: Record) -> str:
+    """The ending and its seconds."""
+    ending = ending_of(record)
+    return f"{ending.ending}, {ending.loading + ending.planning:.1f} s"
+
+
+def stress_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """What held and every fault; and the table."""
+    endings = {CASES[record["name"]]: ending_of(record) for record in records}
+    return {"stress-summary": [summary(endings)], "stress": [stress_table(endings)]}
+
+
+def stress_table(endings: Mapping[Case, StressEnding]) -> str:
+    """A table a family; faults in bold."""
+    blocks = []
+    for family in dict.fromkeys(case.family for case in endings):
+        body = [_line(case, ending) for case, ending in endings.items() if case.family == family]
+        blocks.append(f"**{family}**\n\n{markdown_table(_HEADINGS, body)}")
+    return "\n\n".join(blocks)
+
+
+def summary(endings: Mapping[Case, StressEnding]) -> str:
+    """What held of all that should, and every fault, a line each."""
+    wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
+    lines = [f"{len(endings)} cases, {len(wrong)} faults."]
+    for family in dict.fromkeys(case.family for case in endings):
+        lines.append(_share(family, [(c, e) for c, e in endings.items() if c.family == family and c.whole]))
+    verified, again = (sum(getattr(e, name) for e in endings.values()) for name in ("verified", "again"))
+    lines.append(f"{again} of {verified} verified grasps hold in a second trial.")
+    truths = [ending for ending in endings.values() if ending.true is not None]
+    if truths:
+        held = sum(ending.true or 0 for ending in truths)
+        none = [e.case for e in truths if e.verified and not e.true]
+        lines.append(
+            f"{held} of {sum(e.verified for e in truths)} verified on a cloud hold on the true object"
+            + (f" (none of {', '.join(none)})." if none else ".")
+        )
+    return "\n\n".join([" ".join(filter(None, lines)), *(["\n".join(wrong)] if wrong else [])])
+
+
+def _share(family: str, whole: Sequence[tuple[Case, StressEnding]]) -> str:
+    if not whole:
+        return ""
+    grasped = sum(ending.ending == GRASP for _, ending in whole)
+    share = f"{grasped} of {len(whole)} ({grasped / len(whole):.0%})"
+    return f"{family}: {share} with something to grasp end in a verified grasp."
+
+
+def _line(case: Case, ending: StressEnding) -> list[str]:
+    good = ending.ending in case.expect
+    # That all went well is told by the ending.
+    told = ending.message.removeprefix(Outcome.SUCCEEDED.value).removeprefix("; ")
+    told = told.replace("|", "\\|").replace("\n", " ")
+    return [
+        f"`{case.name}`",
+        case.about,
+        ending.ending if good else f"**{ending.ending}**",
+        f"{ending.loading:.1f}",
+        f"{ending.planning:.1f}",
+        f"{ending.memory:.0f}",
+        f"{ending.verified}/{ending.tried}" if ending.tried else "–",
+        str(ending.again) if ending.verified else "–",
+        "–" if ending.true is None or not ending.verified else str(ending.true),
+        told if len(told) <= _MESSAGE else f"{told[:_MESSAGE].rstrip()} …",
+    ]

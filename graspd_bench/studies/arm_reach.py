@@ -1,0 +1,288 @@
+"""What an arm costs and buys: inverse kinematics by itself, and requests with and without the filter by reach.
+
+Things stand or lie on a table; the arm's base stands 40 to 80 cm away in a random direction, turned at random. Without
+the filter the verified grasps that come back are asked afterwards whether the arm reaches them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from graspd_bench.study import Case, ObjectCase, Record, Request, Sections, find_objects
+from graspd_bench.tables import markdown_table
+from graspd_core.arms.arm import Arm, arm_links, arm_names, load_arm
+from graspd_core.arms.arm_paths import arm_paths
+from graspd_core.arms.inverse_kinematics import (
+    POSITION_TOLERANCE,
+    ROTATION_TOLERANCE,
+    nearest_postures,
+    random_postures,
+    solve,
+    start_table,
+)
+from graspd_core.arms.reach import Reach
+from graspd_core.hands.model import HandModel
+from graspd_core.optimize.restrictions import BoundRestriction, Refusal
+from graspd_core.perception.scene import Scene, build_scene
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.se3 import SE3, axis_rotation
+from graspd_core.types import ArmPath, Grasp, Plane, Progress, TriangleMesh
+
+# Authored shapes that are tried in two places each.
+SHAPES = ("box", "mug", "hammer", "bottle", "torus", "cylinder", "plate", "l_block", "sphere", "bowl")
+POSES = 1000
+NEAREST, FARTHEST = 0.4, 0.8
+# Poses at once; starts of each, one after another for those that are left, and steps of each start.
+_BATCH, _STARTS, _STEPS = 256, 12, 16
+# Of the library: starts at once and steps; fewer of either find fewer poses.
+_RETRIES, _ITERATIONS = 20, 50
+
+
+@dataclass(frozen=True)
+class ArmCase(Case):
+    """Inverse kinematics of `poses` that an arm reaches."""
+
+    arm: str
+    poses: int
+
+
+@dataclass(frozen=True)
+class ReachCase(ObjectCase):
+    """A request for `count` grasps of a thing on a table, with an arm; the seed draws where both are."""
+
+    arm: str = ""
+
+    def place(self) -> tuple[HandModel, Scene, Reach]:
+        """The hand, the thing as it stands or lies, and the arm."""
+        rng = np.random.default_rng((self.seed, sum(self.object.encode())))
+        hand, scene = self.load()
+        side = axis_rotation(np.eye(3)[int(rng.integers(2))], float(rng.choice([0.0, np.pi / 2])))
+        vertices = scene.object.mesh.vertices @ side.T
+        vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))
+        support = Plane(np.array([0.0, 0.0, 1.0]), float(vertices[:, 2].min()))
+        mesh = TriangleMesh(vertices, scene.object.mesh.faces)
+        scene = build_scene(mesh, source=self.object, resolution=self.config.resolution, support=support)
+        away, where, turn = rng.uniform(NEAREST, FARTHEST), *rng.uniform(-np.pi, np.pi, 2)
+        base = (float(away * np.cos(where)), float(away * np.sin(where)), support.offset)
+        quaternion = (float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2)))
+        return hand, scene, Reach(load_arm(self.arm), base, quaternion)
+
+
+def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
+    """Every arm alone, and every arm at every thing."""
+    arms = [ArmCase(arm, 256 if request.quick else POSES) for arm in arm_names()]
+    things = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
+    seeds = request.seeds or ((0,) if request.objects else (0, 1))
+    cases = [
+        ReachCase(thing, request.preset(), request.hand or "allegro_right", seed, request.count or 4, arm)
+        for thing in things
+        for seed in seeds
+        for arm in arm_names()
+    ]
+    return (*arms[:1], *cases[:1]) if request.quick else (*arms, *cases)
+
+
+def run_reach(case: ArmCase | ReachCase) -> Record:
+    """What the case asks for."""
+    return measure_arm(load_arm(case.arm), case.poses) if isinstance(case, ArmCase) else _run_request(case)
+
+
+def _run_request(case: ReachCase) -> Record:
+    """The request with the filter, and without; both on libraries and caches in use."""
+    hand, scene, reach = case.place()
+    request: dict[str, Any] = {"count": case.count, "seed": case.seed, "preset": case.config, "measure": False}
+    plan_grasps(scene, hand, count=1, measure=False, restrictions=[reach])
+    timed = _Timed(reach, [])
+    plain = _Found([])
+    plan_grasps(scene, hand, **request, progress=plain)
+    filtered = _Found(timed.seconds)
+    result = plan_grasps(scene, hand, **request, progress=filtered, restrictions=[timed])
+    task = reach.bind(scene, hand).task
+    reached = [isinstance(path, ArmPath) for path in arm_paths(task, [grasp for _, _, grasp in plain.found])]
+    return {
+        "plain": {
+            "verified": len(reached),
+            "reached": sum(reached),
+            "best": bool(reached and reached[0]),
+            "first_s": next((at for (at, *_), good in zip(plain.found, reached, strict=True) if good), None),
+        },
+        "filtered": {
+            "verified": len(filtered.found),
+            "first_s": filtered.found[0][0] if filtered.found else None,
+            "filter_s": filtered.found[0][1] if filtered.found else sum(timed.seconds),
+            "refused": dict(result.refused),
+        },
+    }
+
+
+class _Found:
+    """Notes each verified grasp, the CPU seconds until it came, and those of them that the filter took."""
+
+    def __init__(self, seconds: Sequence[float]) -> None:
+        self.found: list[tuple[float, float, Grasp]] = []
+        self._seconds, self._began = seconds, time.process_time()
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.found is not None:
+            self.found.append((time.process_time() - self._began, sum(self._seconds), progress.found))
+
+
+@dataclass(frozen=True, eq=False)
+class _Timed(BoundRestriction):
+    """A reach, and the CPU seconds of each call to it."""
+
+    reach: Any
+    seconds: list[float]
+
+    def bind(self, scene: Scene, hand: HandModel) -> _Timed:
+        return _Timed(self._timed(self.reach.bind, scene, hand), self.seconds)
+
+    def starts(self, positions: np.ndarray, quaternions: np.ndarray, joints: np.ndarray) -> np.ndarray:
+        return self._timed(self.reach.starts, positions, quaternions, joints)
+
+    def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
+        return self._timed(self.reach.admit, grasps)
+
+    def _timed(self, call: Any, *values: Any) -> Any:
+        began = time.thread_time()
+        try:
+            return call(*values)
+        finally:
+            self.seconds.append(time.thread_time() - began)
+
+
+def came(record: Record) -> str:
+    """What came of a case, in a few words."""
+    if "own" in record:
+        return f"{record['own']['reached']:.1%} of the poses reached"
+    return f"{record['filtered']['verified']} verified in reach, without the filter {record['plain']['reached']}"
+
+
+def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Both tables as Markdown."""
+    alone, asked = ([r for r in records if key in r] for key in ("own", "filtered"))
+    return {
+        "inverse-kinematics": [_alone_table(alone)] if alone else [],
+        "reach": [_asked_table(asked), _reasons(asked)] if asked else [],
+    }
+
+
+def _alone_table(records: Sequence[Record]) -> str:
+    headings = ["arm", "solver", "reached", "CPU ms a pose"]
+    rows = [
+        [record["arm"], solver, f"{record[key]['reached']:.1%}", f"{record[key]['ms']:.2f}"]
+        for record in records
+        for key, solver in (("own", "graspd"), ("library", "pytorch-kinematics"))
+        if record[key]
+    ]
+    return markdown_table(headings, rows)
+
+
+def _asked_table(records: Sequence[Record]) -> str:
+    headings = ["arm", "requests", "filter", "with a verified grasp in reach", "the best one is", "CPU s to the first"]
+    headings += ["filter's share of that time"]
+    rows: list[list[str]] = []
+    for arm in sorted({record["arm"] for record in records}):
+        mine = [record for record in records if record["arm"] == arm]
+        plain, filtered = ([record[key] for record in mine] for key in ("plain", "filtered"))
+        shares = [one["filter_s"] / one["first_s"] for one in filtered if one["verified"]]
+        some, best = sum(one["reached"] > 0 for one in plain), sum(one["best"] for one in plain)
+        good = sum(one["verified"] > 0 for one in filtered)
+        share = f"{median(shares):.1%}, at most {max(shares):.1%}" if shares else "–"
+        rows.append([arm, str(len(mine)), "without", str(some), str(best), _seconds(plain), "–"])
+        rows.append(["", "", "with", str(good), str(good), _seconds(filtered), share])
+    return markdown_table(headings, rows)
+
+
+def _seconds(ones: Sequence[Record]) -> str:
+    known = [one["first_s"] for one in ones if one["first_s"] is not None]
+    return f"{median(known):.2f}" if known else "–"
+
+
+def _reasons(records: Sequence[Record]) -> str:
+    """How many candidates were refused, and the kinds of reason."""
+    kinds: dict[str, int] = {}
+    for record in records:
+        for reason, count in record["filtered"]["refused"].items():
+            kind = next((kind for kind in _KINDS if kind in reason), reason)
+            kinds[kind] = kinds.get(kind, 0) + count
+    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+    return f"Refused before any trial: {told or 'none'}."
+
+
+# What reasons have in common, whatever link or joint they name.
+_KINDS = ("limit on the way", "limit", "in the table", "in the object", "against the hand", "against", "jump")
+
+
+def measure_arm(arm: Arm, poses: int) -> Record:
+    """graspd and, if installed, pytorch-kinematics on the same poses, made from joint values within the limits."""
+    q = random_postures(arm, poses, torch.Generator().manual_seed(11))
+    target = arm_links(arm, q)[:, arm.tip]
+    start_table(arm)
+    library = _library(arm) if importlib.util.find_spec("pytorch_kinematics") else None
+    return {
+        "own": _measured(lambda tip: _own(arm, tip), target),
+        "library": library and _measured(library, target),
+    }
+
+
+def _measured(solver: Callable[[SE3], Bool[Tensor, "batch"]], target: SE3) -> Record:
+    """Share of poses that are reached, and CPU milliseconds of each."""
+    solver(target[:_BATCH])
+    began, reached = time.process_time(), 0
+    for first in range(0, len(target.translation), _BATCH):
+        reached += int(solver(target[first : first + _BATCH]).sum())
+    count = len(target.translation)
+    return {"reached": reached / count, "ms": 1e3 * (time.process_time() - began) / count}
+
+
+def _own(arm: Arm, target: SE3) -> Bool[Tensor, "batch"]:
+    reached = torch.zeros(len(target.translation), dtype=torch.bool)
+    for starts in nearest_postures(start_table(arm), target, _STARTS).unbind(1):
+        rows = torch.nonzero(~reached).flatten()
+        if not len(rows):
+            break
+        reached[rows] = solve(arm, target[rows], starts[rows], _STEPS).reached
+    return reached
+
+
+def _library(arm: Arm) -> Callable[[SE3], Bool[Tensor, "batch"]]:
+    """The library's damped least squares within the arm's limits, to the same tolerances."""
+    import pytorch_kinematics
+
+    # Its reader knows no capsules.
+    text = re.sub(r"<collision>.*?</collision>", "", Path(arm.chain.urdf).read_text(), flags=re.DOTALL)
+    tip = arm.chain.link_names[arm.tip]
+    chain = pytorch_kinematics.build_serial_chain_from_urdf(text.encode(), tip).to(dtype=torch.float64)
+    limits = torch.stack([torch.as_tensor(arm.lower), torch.as_tensor(arm.upper)], 1)
+    solver = pytorch_kinematics.PseudoInverseIK(
+        chain,
+        max_iterations=_ITERATIONS,
+        num_retries=_RETRIES,
+        joint_limits=limits,
+        pos_tolerance=POSITION_TOLERANCE,
+        rot_tolerance=ROTATION_TOLERANCE,
+        early_stopping_any_converged=True,
+        early_stopping_no_improvement="all",
+    )
+
+    def solved(target: SE3) -> Bool[Tensor, "batch"]:
+        matrix = torch.eye(4, dtype=torch.float64).repeat(len(target.translation), 1, 1)
+        matrix[:, :3, :3], matrix[:, :3, 3] = target.rotation, target.translation
+        found = solver.solve(pytorch_kinematics.Transform3d(matrix=matrix))
+        inside = ((found.solutions >= limits[:, 0]) & (found.solutions <= limits[:, 1])).all(-1)
+        return (found.converged & inside).any(1)
+
+    return solved

@@ -1,0 +1,131 @@
+"""Frames of a real depth camera: segmentation against a reference cloud, reconstruction, verified grasps.
+
+    graspd bench frames --objects DIR ...
+
+Each folder holds */depth_mm.png, camera.json (K, width, height) and object_cloud.xyz, the reference [m].
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graspd_bench.study import Case, Record, Request, Sections
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.hands.library import load_hand
+from graspd_core.mesh.topology import is_closed
+from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth, depth_in_metres
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.segment.segment import Target, segment
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Verdict
+
+# Clouds are compared by the cubes of this side that they touch [m].
+CUBE = 0.005
+
+
+@dataclass(frozen=True)
+class Frame(Case):
+    """A folder with one frame, and the grasps asked for."""
+
+    folder: str
+    content: str
+    count: int
+    preset: str
+    hand: str
+
+    @property
+    def label(self) -> str:
+        return f"{Path(self.folder).name} {self.preset}"
+
+    def asked(self) -> Record:
+        return {**super().asked(), "folder": Path(self.folder).name}
+
+
+def frame_cases(request: Request) -> tuple[Frame, ...]:
+    """Every frame below the folders, in order of name. Raises ConfigError: there is none."""
+    found = sorted(path.parent for folder in request.objects for path in Path(folder).glob("*/depth_mm.png"))
+    if not found:
+        raise ConfigError("objects: no */depth_mm.png in the folders; valid: --objects DIR, as docs/clouds.md has it")
+    count, hand = request.count or 8, request.hand or "allegro_right"
+    return tuple(Frame(str(folder), _content(folder), count, request.preset(), hand) for folder in found)
+
+
+def run_frame(case: Frame) -> Record:
+    """The object nearest the view axis; where that is not the reference's, the one at the reference's centre."""
+    cloud, reference = read_frame(Path(case.folder))
+    hand = load_hand(case.hand)
+    target, found = None, {}
+    try:
+        for picked in ("view axis", "point"):
+            target = Target(point=np.median(reference, axis=0)) if picked == "point" else None
+            seen = np.vstack([view.points for view in segment([cloud], target=target).views])
+            found = {"picked_by": picked, "object_points": len(seen), "iou": overlap(seen, reference)}
+            if found["iou"] > 0.5:
+                break
+        began = time.perf_counter()
+        scene = scene_from_views([cloud], target=target, source=Path(case.folder).name)
+        scene_s = time.perf_counter() - began
+        result = plan_grasps(scene, hand, count=case.count, preset=case.preset)
+    except GraspdError as error:
+        return {**found, "refused": str(error)}
+    timing = result.timing
+    first = None if timing.first_verified is None else scene_s + timing.first_verified - timing.load - timing.sdf
+    return {
+        **found,
+        "watertight": bool(is_closed(scene.object.mesh)),
+        "scene_s": scene_s,
+        "first_s": first,
+        "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
+        "outcome": result.outcome.name,
+        "warnings": list(result.warnings),
+    }
+
+
+def read_frame(folder: Path) -> tuple[PointCloud, np.ndarray]:
+    """The cloud of a depth image in its camera's frame, and the reference cloud of its object [m]."""
+    from PIL import Image
+
+    info = json.loads((folder / "camera.json").read_text())
+    k = info["K"]
+    camera = PinholeCamera(info["width"], info["height"], k[0][0], k[1][1], k[0][2], k[1][2])
+    depth = depth_in_metres(np.asarray(Image.open(folder / "depth_mm.png")).astype(np.uint16), "16UC1")
+    return cloud_from_depth(depth, camera), np.loadtxt(folder / "object_cloud.xyz")
+
+
+def overlap(found: np.ndarray, reference: np.ndarray) -> float:
+    """Intersection over union of the 5 mm cubes that two clouds touch."""
+    a, b = ({tuple(c) for c in np.floor(points / CUBE).astype(int)} for points in (found, reference))
+    return len(a & b) / max(len(a | b), 1)
+
+
+def frame_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """A row a frame."""
+    headings = ["frame", "object picked by", "points", "IoU with the reference", "closed", "verified grasps", "scene"]
+    return {"frames": [markdown_table([*headings, "first verified grasp"], [_line(r) for r in records])]}
+
+
+def _line(r: Record) -> list[str]:
+    name = Path(r["folder"]).name
+    if "verified" not in r:
+        return [name, r.get("picked_by", "–"), r["error"] or r["refused"], *[""] * 5]
+    first = f"{r['first_s']:.1f} s" if r["first_s"] is not None else "none"
+    closed = "yes" if r["watertight"] else "no"
+    return [
+        name, r["picked_by"], str(r["object_points"]), f"{r['iou']:.2f}", closed, f"{r['verified']} of {r['count']}",
+        f"{r['scene_s']:.1f} s", first,
+    ]  # fmt: skip
+
+
+def _content(folder: Path) -> str:
+    """Hash of the frame's files."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

@@ -1,0 +1,201 @@
+"""Contact area and intersection volume of a hand that is given as one closed surface: a skinned human hand.
+
+The same definitions as for hands of solids (docs/metrics.md), on the skin itself instead of the hulls that stand for it
+while planning.
+
+Human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
+
+    graspd bench mano --hand MANO_RIGHT.pkl
+
+The model is the user's (https://mano.is.tue.mpg.de; never shipped). All grasps go through the hold trial, and the two
+best ranked of every object are measured, as the paper does, once with rigid flesh and once with flesh that gives by a
+millimetre. Area and volume are those of the skinned mesh; the trials use the convex hulls that stand for it.
+The paper's row is of 57 ShapeNet objects: these are other objects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
+from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, object_hash, raw_grasps, thing_name
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import ConfigError
+from graspd_core.hands.mano.mano_hand import load_mano
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.surface_queries import DistanceQuery, inside, make_distance_query, signed_distance
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, to_mapping
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import object_parts
+from graspd_core.types import TriangleMesh
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.world import PROTOCOLS, build_world
+
+# Distances within which skin counts as touching [m]: the project's own, and two that others use.
+CONTACT_DISTANCES = (0.002, 0.005, 0.010)
+VOXEL = 0.001
+# About 1 mm between samples on an adult's hand.
+_SAMPLES, _SEED = 40_000, 7
+
+
+@dataclass(frozen=True)
+class SkinMetrics:
+    """Figures of one placed skin.
+
+    Attributes:
+        contact_area: skin within each of `CONTACT_DISTANCES` of the object's surface, on either side of it [m²].
+        intersection_volume: of the skin's inside and the object, in 1 mm voxels [m³].
+        penetration: greatest depth of the skin in the object [m].
+    """
+
+    contact_area: tuple[float, ...]
+    intersection_volume: float
+    penetration: float
+
+
+def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
+    """Measure a closed skin in the object's frame against an object (`make_distance_query` of its mesh)."""
+    points, _ = surface_samples(skin, _SAMPLES, _SEED)
+    distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
+    corners = skin.vertices[skin.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    each = 0.5 * float(np.linalg.norm(cross, axis=1).sum()) / len(points)
+    return SkinMetrics(
+        contact_area=tuple(float((np.abs(distance) <= within).sum()) * each for within in CONTACT_DISTANCES),
+        intersection_volume=_shared_volume(query, skin),
+        penetration=float(max(0.0, -distance.min())),
+    )
+
+
+def _shared_volume(query: DistanceQuery, skin: TriangleMesh) -> float:
+    """Volume inside both [m³]: 1 mm voxels over the box that the two share, counted by their middles."""
+    low = np.maximum(query.tree.low, skin.vertices.min(0))
+    high = np.minimum(query.tree.high, skin.vertices.max(0))
+    if (high <= low).any():
+        return 0.0
+    axes = [_middles(a, b) for a, b in zip(low, high, strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    cells = cells[inside(query, cells)]
+    if len(cells) == 0:
+        return 0.0
+    return float(inside(make_distance_query(skin), cells).sum()) * VOXEL**3
+
+
+def _middles(low: float, high: float) -> Float[np.ndarray, "n"]:
+    return (np.arange(np.floor(low / VOXEL), np.ceil(high / VOXEL)) + 0.5) * VOXEL
+
+
+SHAPES = ("shape:sphere", "shape:cylinder", "shape:box")
+BEST = 2
+# Turpin et al. 2022, table 1, MANO: mean over 57 ShapeNet objects of the two best grasps each.
+PAPER = {"Grasp'D": (43.0, 5.70, 7.55, 0.59), "ObMan / GraspIt!": (9.4, 1.28, 7.37, 1.95)}
+# How deep flesh gives while planning [m]: not at all, as in the paper, and less than a finger pad does.
+SOFTNESS = (0.0, 0.001)
+# What is planned with, and how often, unless asked otherwise.
+_PRESET, _SEEDS = "contact_rich", (0, 1, 2)
+_HEADINGS = [
+    "object, flesh gives",
+    "held, raw",
+    "contact area cm² within 2 mm (5, 10)",
+    "intersection cm³",
+    "CA/IV 1/cm",
+    "displacement cm",
+    "penetration mm",
+    "CPU s per grasp",
+]
+
+
+@dataclass(frozen=True)
+class HumanGrasps(ObjectCase):
+    """Grasps of an object with the model in a file."""
+
+    content: str = ""
+    softness: float = 0.0
+
+    @property
+    def config(self) -> PlanConfig:
+        return override(load_preset(self.preset), {"problem.softness": self.softness})
+
+    def asked(self) -> Record:
+        return {**asdict(self), "hand": "", "object": object_hash(self.object), "settings": to_mapping(self.config)}
+
+
+def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
+    """One an object, seed and softness. Raises ConfigError: the hand is not a file."""
+    model = Path(request.hand)
+    if not model.is_file():
+        raise ConfigError(f"hand: {request.hand or 'none given'}; valid: MANO_RIGHT.pkl or MANO_LEFT.pkl, as a path")
+    content = hashlib.sha256(model.read_bytes()).hexdigest()
+    request = replace(request, presets=request.presets or (_PRESET,), seeds=request.seeds or _SEEDS)
+    cases = object_cases(request, SHAPES, 8)
+    return tuple(HumanGrasps(**vars(case), content=content, softness=soft) for soft in SOFTNESS for case in cases)
+
+
+def run_mano(case: HumanGrasps) -> Record:
+    """Plan on one object, try every grasp, measure the best."""
+    config = case.config
+    mano = load_mano(Path(case.hand), [], candidates=config.problem.fine_candidates)
+    scene = load_scene(case.object, resolution=config.resolution)
+    began = time.process_time()
+    grasps = raw_grasps(scene, mano.model, config, case.count, case.seed)
+    seconds = (time.process_time() - began) / case.count
+    parts = object_parts(scene.object)
+    world = build_world(mano.model, scene.object, parts, PROTOCOLS["standard"])
+    holds = [hold_trial(world, grasp, PROTOCOLS["standard"]) for grasp in grasps]
+    query = make_distance_query(scene.object.mesh)
+    skins = [measure_skin(query, mano.skinned_mesh(grasp.grasp)) for grasp in grasps[:BEST]]
+    bullet = build_bullet_world(mano.model, scene.object, parts) if bullet_available() else None
+    return {
+        "held": sum(hold.passed for hold in holds),
+        "reasons": [hold.reason for hold in holds if not hold.passed],
+        "contact_area_cm2": [[area * 1e4 for area in skin.contact_area] for skin in skins],
+        "intersection_volume_cm3": [skin.intersection_volume * 1e6 for skin in skins],
+        "penetration_mm": [skin.penetration * 1e3 for skin in skins],
+        "displacement_cm": [bullet_displacement(bullet, g.grasp) * 100 for g in grasps[:BEST]] if bullet else [],
+        "cpu_seconds_per_grasp": seconds,
+    }
+
+
+def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The objects, their mean, and the paper's rows, as Markdown."""
+    body = []
+    for softness in dict.fromkeys(r["softness"] for r in records):
+        alike = [r for r in records if r["softness"] == softness]
+        for thing in dict.fromkeys(r["object"] for r in alike):
+            body.append(_row(thing_name(thing), softness, [r for r in alike if r["object"] == thing]))
+        body.append(_row("**mean**", softness, alike))
+    for name, (area, volume, ratio, moved) in PAPER.items():
+        body.append([f"{name}, as published", "", f"{area}", f"{volume:.2f}", f"{ratio}", f"{moved}", "", ""])
+    return {"mano": [markdown_table(_HEADINGS, body)]}
+
+
+def _row(name: str, softness: float, records: Sequence[Record]) -> list[str]:
+    """Means over cases; without a grasp there is nothing to measure."""
+    name = f"{name}, {1e3 * softness:g} mm" if softness else f"{name}, rigid"
+    held = f"{sum(r['held'] for r in records)}/{sum(r['count'] for r in records)}"
+    if not any(r["contact_area_cm2"] for r in records):
+        return [name, "no grasp found", *[""] * 6]
+
+    def mean(key: str) -> float | None:
+        values = [value for record in records for value in record[key]]
+        return float(np.mean(values)) if values else None
+
+    area = np.mean([areas for record in records for areas in record["contact_area_cm2"]], axis=0)
+    volume, moved, depth = (mean(k) for k in ("intersection_volume_cm3", "displacement_cm", "penetration_mm"))
+    return [
+        name,
+        held,
+        f"{area[0]:.1f} ({area[1]:.1f}, {area[2]:.1f})",
+        f"{volume:.2f}",
+        f"{area[0] / volume:.2f}" if volume else "none",
+        "no pybullet" if moved is None else f"{moved:.2f}",
+        f"{depth:.1f}",
+        f"{np.mean([record['cpu_seconds_per_grasp'] for record in records]):.3f}",
+    ]

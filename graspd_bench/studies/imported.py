@@ -1,0 +1,186 @@
+"""Somebody else's grasps beside ours: the same objects, hand, trials and metrics, in one table.
+
+    graspd bench --import FOLDER --hand NAME
+
+What a file says of its grasps counts for nothing. A grasp that was refused has failed, as has one that ours did not
+find: shares are of all grasps of an object, or of the first `--count` of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.measurement import TRIALS, Tried
+from graspd_bench.study import ObjectCase, Record, Request, Sections, raw_grasps, thing_name
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import ConfigError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Grasp, Verdict
+from graspd_core.verify.metrics import METRICS, measure
+from graspd_core.verify.prepared_grasp import make_metrics_context
+from graspd_dataset.complete_grasps import by_object, complete_grasps
+from graspd_dataset.foreign_grasps import ImportedGrasp, foreign_files, read_foreign
+
+# Whose grasps, in the order of the table.
+SOURCES = {"imported": "imported", "ranked": "graspd, as ranked", "planned": "graspd, verified"}
+# Trials of which a grasp passes or does not, and those of which there is a figure: heading, key, digits.
+_PASSED = {"standard": "holds", "hard": "holds hard", "bullet": "holds in PyBullet"}
+_FIGURES = {
+    "noisy": ("noisy", "share", 2),
+    "gravity": ("gravity cm", "displacement_cm", 2),
+    "sd": ("SD cm", "displacement_cm", 2),
+}
+
+
+@dataclass(frozen=True)
+class ImportedCase(ObjectCase):
+    """The grasps of one object; `count` of them.
+
+    Attributes:
+        scale: factor on the object's coordinates.
+        files: that hold them.
+        mesh: given instead of what the files name; empty where none is.
+        order: of the joints in npy files.
+        trials: their names.
+        content: hash of the files.
+    """
+
+    scale: float
+    files: tuple[str, ...]
+    mesh: str
+    order: tuple[str, ...]
+    trials: tuple[str, ...]
+    content: str
+
+    @property
+    def label(self) -> str:
+        return f"{_name(self.object)} scale {self.scale:g} {thing_name(self.hand)} seed {self.seed}"
+
+    def asked(self) -> Record:
+        """Where the files lie does not count, what they hold does."""
+        return {name: value for name, value in super().asked().items() if name not in ("files", "mesh")}
+
+    def shown(self) -> Record:
+        return {name: value for name, value in super().shown().items() if name != "files"}
+
+
+def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
+    """One an object and seed. Raises GraspdError: no folder or hand is given, or a file is malformed."""
+    if not request.imported or not request.hand:
+        raise ConfigError("imported: give --import FOLDER, and --hand: whose grasps these are")
+    if len(request.objects) > 1:
+        raise ConfigError(f"objects: {', '.join(request.objects)}; one mesh stands for what the files name")
+    if unknown := [name for name in request.trials if name not in TRIALS]:
+        raise ConfigError(f"trials: {unknown[0]!r}; valid: {', '.join(TRIALS)}")
+    hand, mesh = load_hand(request.hand, candidates=1), "".join(request.objects)
+    files: dict[tuple[str, float], dict[Path, int]] = {}
+    for path in foreign_files(Path(request.imported)):
+        imported = read_foreign(path, hand, mesh=mesh or None, order=request.joint_order)
+        for target, grasps in by_object(imported).items():
+            files.setdefault(target, {})[path] = len(grasps)
+    most = request.count or (2 if request.quick else 1024)
+    return tuple(
+        ImportedCase(
+            *(thing, request.preset(), request.hand, seed, min(most, sum(own.values())), scale),
+            files=tuple(map(str, own)),
+            mesh=mesh,
+            order=request.joint_order,
+            trials=request.trials or tuple(TRIALS),
+            content=hashlib.sha256(b"".join(path.read_bytes() for path in own)).hexdigest(),
+        )
+        for seed in request.seeds or (0,)
+        for (thing, scale), own in files.items()
+    )
+
+
+def run_imported(case: ImportedCase) -> Record:
+    """Theirs, the first of our own ranking, and verified ones: all tried and measured alike."""
+    config, hand = case.config, load_hand(case.hand, candidates=case.config.problem.fine_candidates)
+    scene = load_scene(case.object, scale=case.scale, resolution=config.resolution)
+    completed = complete_grasps(scene, hand, _theirs(case, hand), config)
+    planned = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).grasps
+    grasps = {
+        "imported": completed.grasps,
+        "ranked": raw_grasps(scene, hand, config, case.count, case.seed),
+        "planned": tuple(grasp for grasp in planned if grasp.verdict is Verdict.VERIFIED)[: case.count],
+    }
+    figures = {name: tried(scene, hand, some, case.trials) for name, some in grasps.items()}
+    held = sum(bool(r.get("standard", {}).get("passed")) for r in figures["imported"])
+    return {"held": held, "refused": completed.refused, "grasps": figures}
+
+
+def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:
+    imported: list[ImportedGrasp] = []
+    for path in case.files:
+        imported += read_foreign(Path(path), hand, mesh=case.mesh or None, order=case.order)
+    return by_object(imported)[case.object, case.scale][: case.count]
+
+
+def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequence[str]) -> list[dict[str, Any]]:
+    """Figures of every grasp: metrics, and trials by name."""
+    context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
+    results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
+    for name in trials if grasps else ():
+        trial = TRIALS[name](Tried(hand, scene.object, parts))
+        for grasp, result in zip(grasps, results, strict=True):
+            result[name] = trial(grasp)
+    return results
+
+
+def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """One table, a row for every object and source and for all objects together, as Markdown."""
+    trials = [name for name in TRIALS if any(name in record["trials"] for record in records)]
+    metrics = [row for row in METRICS.values() if row.measure is not None]
+    headings = ["object", "grasps of", "tried", *(_PASSED[name] for name in trials if name in _PASSED)]
+    headings += [_FIGURES[name][0] for name in trials if name in _FIGURES] + [row.title for row in metrics]
+    groups = [(_name(record["object"]), [record]) for record in records]
+    if len(records) > 1:
+        groups.append(("**all**", list(records)))
+    body = [_row(name, some, source, trials) for name, some in groups for source in SOURCES]
+    whys: dict[str, int] = {}
+    for record in records:
+        for why, count in record["refused"].items():
+            whys[why] = whys.get(why, 0) + count
+    refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
+    told = "Shares are of all grasps of an object, also of those that were refused or not found; others are medians."
+    return {"imported": [markdown_table(headings, body), f"{told} {refused}".strip()]}
+
+
+def _name(source: str) -> str:
+    """What an object goes by, in short; DexGraspBench calls every mesh "simplified", in a folder named after it."""
+    path = Path(source)
+    return (path.parents[1].name if path.stem == "simplified" else thing_name(source))[:16]
+
+
+def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str]) -> list[str]:
+    asked = sum(record["count"] for record in records)
+    grasps = [grasp for record in records for grasp in record["grasps"][source]]
+
+    def median(values: Sequence[float | None], digits: int) -> str:
+        there = [value for value in values if value is not None]
+        return f"{np.median(there):.{digits}f}" if there else "–"
+
+    cells = [name, SOURCES[source], f"{len(grasps)} of {asked}"]
+    for trial in trials:
+        if trial in _PASSED:
+            passed = [grasp[trial]["passed"] for grasp in grasps if grasp[trial]]
+            cells.append(f"{sum(passed) / asked:.0%}" if passed or not grasps else "–")
+    for trial in trials:
+        if trial in _FIGURES:
+            _, key, digits = _FIGURES[trial]
+            cells.append(median([grasp[trial].get(key) for grasp in grasps], digits))
+    for row in METRICS.values():
+        if row.measure is not None:
+            values = [grasp["metrics"].get(row.name) for grasp in grasps]
+            cells.append(median([None if value is None else value * row.scale for value in values], row.digits))
+    return cells

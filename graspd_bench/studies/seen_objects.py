@@ -1,0 +1,249 @@
+"""What a camera sees of a thing on a table, to grasps that are tried on the truth: study `rgbd`.
+
+Every case is rendered with the sensor noise of a D415 and goes through segmentation, reconstruction and `plan_grasps`
+as a user's clouds do; every grasp that was verified on the reconstruction is tried again on the true mesh.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
+from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, thing_name
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import GraspdError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import load_mesh, surface_samples
+from graspd_core.mesh.sdf import build_sdf
+from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
+from graspd_core.mesh.topology import is_closed
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.scene import Obstacle, Scene, build_scene, object_parts
+from graspd_core.perception.segment.target_selection import Target
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime import disk_cache
+from graspd_core.types import Grasp, GraspResult, Verdict
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.lift_trial import lift_trial
+from graspd_core.verify.world import PROTOCOLS, build_world
+
+SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
+# Cameras; 0 plans on the true mesh.
+VIEWS = (0, 1, 3, 15)
+# Elevation of the camera at each start: a robot looks at its table from half above; from a wrist, from above [deg].
+ELEVATIONS, ABOVE = (40.0, 50.0, 30.0), (75.0, 88.0, 60.0)
+YAW = 0.3
+# Room between the object and each thing beside it [m].
+CLEAR = 0.04
+# Where a sphere of 5 mm about a true point meets the reconstruction, that point counts as found.
+FOUND, SAMPLES = 0.005, 20_000
+# By number of views, and how they see the object: from half above, with other things beside, from above.
+PLAIN, CROWDED, FROM_ABOVE = "plain", "crowded", "from above"
+NAMES = {
+    (1, PLAIN): "1 view", (1, CROWDED): "1 view, crowded", (1, FROM_ABOVE): "1 view, from above", (3, PLAIN): "3 views",
+    (15, PLAIN): "15 views", (0, PLAIN): "full mesh",
+}  # fmt: skip
+_HEADINGS = [
+    "planned on", "first grasp holds on the truth", "of the full mesh's figure", "verified grasps that hold",
+    "that lift too", "cases without a grasp", "first verified grasp, median (worst)", "Chamfer", "within 5 mm",
+    "beyond 10 mm", "closed",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Seen(ObjectCase):
+    """Grasps of what `views` cameras see; 0 plans on the true mesh. The seed is of noise and grasps, and of the place
+    of the first camera. Where it is crowded, two other things stand beside and hide a part."""
+
+    views: int = 1
+    sight: str = PLAIN
+
+
+def seen_cases(request: Request) -> tuple[Seen, ...]:
+    """Every object from every number of views, by default from two places."""
+    request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
+    cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
+    seen = [(views, PLAIN) for views in VIEWS[: 2 if request.quick else None]] + [(1, CROWDED), (1, FROM_ABOVE)]
+    return tuple(Seen(**vars(case), views=views, sight=sight) for case in cases for views, sight in seen)
+
+
+def seen_seconds(case: Seen) -> float:
+    """CPU seconds of a case, roughly."""
+    return 4.0 + 0.4 * case.count + 0.6 * case.views
+
+
+def run_seen(case: Seen) -> Record:
+    """Everything that is reported of one case; a refusal is a result with its message."""
+    hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
+    stage = _stage(case)
+    clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
+    _load_libraries()
+    # Or the full mesh would be met again at its next start.
+    disk_cache.forget()
+    began = time.perf_counter()
+    try:
+        middle = Target(point=0.5 * (stage.truth.vertices.min(0) + stage.truth.vertices.max(0)))
+        target = middle if case.sight == CROWDED else None
+        scene = scene_from_views(clouds, target=target) if case.views else _true_scene(stage, case.object)
+    except GraspdError as error:
+        return {"refused": str(error), "scene_s": time.perf_counter() - began, "verified": 0, "held": 0}
+    scene_s = time.perf_counter() - began
+    return {"scene_s": scene_s, **reconstruction_error(scene, stage), **_grasps(case, scene, stage, hand)}
+
+
+def _stage(case: Seen) -> TabletopScene:
+    """The object on its table, and what stands `CLEAR` beside it, one of them towards the camera."""
+    thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)
+    alone = tabletop(thing, yaw=YAW)
+    if case.sight != CROWDED:
+        return alone
+    low, high = alone.truth.vertices.min(0), alone.truth.vertices.max(0)
+    beside = (("box", float(high[0]) + CLEAR + 0.03, 0.02), ("cylinder", -0.03, float(low[1]) - CLEAR - 0.033))
+    return tabletop(thing, yaw=YAW, obstacles=beside)
+
+
+def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
+    """One camera, three around, or two rings of eight and seven."""
+    azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
+    places = ABOVE if case.sight == FROM_ABOVE else ELEVATIONS
+    elevation = np.deg2rad(places[case.seed % len(places)])
+    if case.views <= 3:
+        return ring_poses(case.views, elevation=elevation, azimuth=azimuth)
+    upper = ring_poses(case.views // 2, elevation=np.deg2rad(60.0), azimuth=azimuth + 0.2)
+    return (*ring_poses(case.views - case.views // 2, elevation=np.deg2rad(30.0), azimuth=azimuth), *upper)
+
+
+@lru_cache(maxsize=1)
+def _load_libraries() -> None:
+    """Load what makes scenes of views, by a view of a ball."""
+    scene_from_views(views_of(tabletop("sphere"), CAMERA, ring_poses(1, elevation=0.8)))
+
+
+def _true_scene(stage: TabletopScene, source: str) -> Scene:
+    obstacles = tuple(Obstacle(mesh, build_sdf(mesh, resolution=32, padding=0.02)) for mesh in stage.obstacles)
+    return replace(build_scene(stage.truth, source=source), support=stage.support, obstacles=obstacles)
+
+
+def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
+    """Plan one grasp against the clock, then `count`; try all that were verified on the truth."""
+    first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
+    many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
+    protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
+    parts = object_parts(truth.object)
+    world = build_world(hand, truth.object, parts, protocol)
+    table = build_world(hand, truth.object, parts, protocol, stage.support, truth.obstacles)
+    one = [hold_trial(world, grasp, protocol) for grasp in _verified(first)]
+    holds = [(grasp, hold_trial(world, grasp, protocol)) for grasp in _verified(many)]
+    lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]
+    # Those that hold on the likeliest shape and are less sure, too: how far is the probability right?
+    guessed = [grasp for grasp in many.grasps if grasp.probability is not None]
+    told = [(grasp.probability, hold_trial(world, grasp, protocol).passed) for grasp in guessed]
+    timing = first.timing
+    return {
+        "first_s": None if timing.first_verified is None else timing.first_verified - timing.load - timing.sdf,
+        "outcome": many.outcome.name,
+        "first_held": bool(one and one[0].passed),
+        "verified": len(holds),
+        "held": sum(hold.passed for _, hold in holds),
+        "lifted": sum(lift.passed for lift in lifts),
+        "reasons": [trial.reason for trial in (*(hold for _, hold in holds), *lifts) if not trial.passed],
+        "warnings": list(many.warnings),
+        "told": told,
+    }
+
+
+def _verified(result: GraspResult) -> list[Grasp]:
+    return [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+
+
+def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
+    """Distances between the reconstruction's surface and the true one, and whether it is closed.
+
+    chamfer_mm: mean of the mean distances either way [mm]; completeness: share of the true surface within 5 mm of the
+    reconstruction; beyond_10mm: share of the reconstruction farther than 10 mm from the truth.
+    """
+    points, normals = surface_samples(stage.truth, SAMPLES, 0)
+    # Bodies that overlap have surfaces that nobody could see.
+    outer = points[~winding_inside(stage.truth, points + 1e-4 * normals)]
+    found = surface_samples(scene.object.mesh, SAMPLES, 0)[0]
+    missing = surface_distance(make_surface(scene.object.mesh), outer)
+    stray = surface_distance(make_surface(stage.truth), found)
+    return {
+        "chamfer_mm": 500 * float(missing.mean() + stray.mean()),
+        "completeness": float((missing < FOUND).mean()),
+        "beyond_10mm": float((stray > 0.01).mean()),
+        "watertight": bool(is_closed(scene.object.mesh)),
+    }
+
+
+def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Both tables."""
+    rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["sight"]) == row])}
+    full = _share(rows[0, PLAIN], "first_held") if (0, PLAIN) in rows else 0.0
+    body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
+    shown = [views for views in NAMES if views in rows]
+    objects = [
+        [thing_name(thing), *(_marks([r for r in rows[views] if r["object"] == thing]) for views in shown)]
+        for thing in dict.fromkeys(r["object"] for r in records)
+    ]
+    told = "Verified grasps that hold on the truth, by object (* first grasp holds, one mark a case):"
+    return {
+        "rgbd": [
+            markdown_table(_HEADINGS, body),
+            told,
+            markdown_table(["object", *(NAMES[views] for views in shown)], objects),
+            *_calibration([pair for r in records for pair in r.get("told", ())]),
+        ]
+    }
+
+
+def _row(own: Sequence[Record], full: float) -> list[str]:
+    seconds = [r["scene_s"] + r["first_s"] for r in own if r.get("first_s") is not None]
+    verified, held = sum(r["verified"] for r in own), sum(r["held"] for r in own)
+    first, scene = _share(own, "first_held"), np.median([r["scene_s"] for r in own])
+    times = f"{np.median(seconds):.1f} s ({max(seconds):.1f} s), of it scene {scene:.1f} s" if seconds else "–"
+    solids = [r for r in own if "chamfer_mm" in r]
+    errors = [
+        np.mean([r[name] for r in solids]) for name in ("chamfer_mm", "completeness", "beyond_10mm", "watertight")
+    ]
+    return [
+        f"{first:.0%} of {len(own)}",
+        f"{first / full:.0%}" if full else "–",
+        f"{held}/{verified} ({held / max(verified, 1):.0%})",
+        str(sum(r.get("lifted", 0) for r in own)),
+        str(sum(not r["verified"] for r in own)),
+        times,
+        *((f"{errors[0]:.1f} mm", *(f"{share:.0%}" for share in errors[1:])) if solids else "––––"),
+    ]
+
+
+def _share(own: Sequence[Record], name: str) -> float:
+    return float(np.mean([r.get(name, False) for r in own]))
+
+
+def _marks(own: Sequence[Record]) -> str:
+    marks = "".join("\\*" if r.get("first_held") else "." for r in own)
+    return f"{sum(r['held'] for r in own)}/{sum(r['verified'] for r in own)} {marks}"
+
+
+def _calibration(told: Sequence[tuple[float, bool]]) -> list[str]:
+    """How often grasps of each stated probability held on the truth, and the mean square of what that was off."""
+    if not told:
+        return []
+    levels = sorted({probability for probability, _ in told}, reverse=True)
+    held = {level: [hold for probability, hold in told if probability == level] for level in levels}
+    body = [[f"{level:.0%}", f"{np.mean(holds):.0%} of {len(holds)}"] for level, holds in held.items()]
+    brier = float(np.mean([(probability - hold) ** 2 for probability, hold in told]))
+    return [
+        f"Stated probability against what held on the truth, less sure grasps among them; Brier score {brier:.3f}:",
+        markdown_table(["stated", "held"], body),
+    ]

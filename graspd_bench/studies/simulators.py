@@ -1,0 +1,92 @@
+"""Does the second simulator agree? Hold and displacement trials of the same grasps in MuJoCo and PyBullet.
+
+The first grasps of the optimiser's own ranking, none filtered by a trial, and each of them once more with the hand out
+of place by up to 5 mm and 5°, as in the noisy trial, so that failures are among them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from graspd_bench.bullet.bullet_hold import bullet_hold_trial
+from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
+from graspd_bench.study import ObjectCase, Record, Request, Sections, all_shapes, object_cases, raw_grasps, thing_name
+from graspd_bench.tables import markdown_table
+from graspd_bench.trials import build_frozen_world, displacement_trial
+from graspd_core.errors import ConfigError
+from graspd_core.perception.scene import object_parts
+from graspd_core.verify.hold_trial import displaced, hold_trial, pose_error
+from graspd_core.verify.world import PROTOCOLS, build_world
+
+# Seconds of each pull, in both simulators; MuJoCo tries the full length as well.
+PULL = 0.5
+
+
+def simulator_cases(request: Request) -> tuple[ObjectCase, ...]:
+    """One a shape and seed. Raises ConfigError: there is no PyBullet."""
+    if not bullet_available():
+        raise ConfigError("simulators: PyBullet is not installed; pip install -e '.[bench]', on Python 3.11")
+    return object_cases(request, all_shapes(), 4, 1)
+
+
+def run_simulators(case: ObjectCase) -> Record:
+    """Both simulators on the grasps of one object: a trial each."""
+    hand, scene = case.load()
+    first = raw_grasps(scene, hand, case.config, case.count, case.seed)
+    parts, standard = object_parts(scene.object), PROTOCOLS["standard"]
+    short = replace(standard, hold_time=PULL)
+    world = build_world(hand, scene.object, parts, standard)
+    bullet, frozen = build_bullet_world(hand, scene.object, parts), build_frozen_world(hand, scene.object, parts)
+    rng = np.random.default_rng(case.seed)
+    moved = [(True, displaced(grasp, *pose_error(rng), world.center_of_mass)) for grasp in first]
+    trials = [
+        {
+            "displaced": out_of_place,
+            "mujoco": asdict(hold_trial(world, grasp, short)),
+            "mujoco_full": asdict(hold_trial(world, grasp, standard)),
+            "bullet": asdict(bullet_hold_trial(bullet, grasp, short)),
+            "sd_bullet": bullet_displacement(bullet, grasp.grasp),
+            "sd_mujoco": displacement_trial(frozen, grasp.grasp),
+        }
+        for out_of_place, grasp in [*((False, grasp) for grasp in first), *moved]
+    ]
+    return {"trials": trials}
+
+
+def simulator_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The verdicts side by side, every disagreement with both reasons, and the displacements, as Markdown."""
+    rows = [(r["object"], trial) for r in records for trial in r["trials"]]
+    if not rows:
+        return {}
+    verdicts = [(t["mujoco"]["passed"], t["bullet"]["passed"]) for _, t in rows]
+    agreed = np.mean([a == b for a, b in verdicts])
+    same = sum(t["mujoco"]["passed"] == t["mujoco_full"]["passed"] for _, t in rows)
+    table = markdown_table(
+        ["", "PyBullet holds", "PyBullet drops"],
+        [
+            [f"**MuJoCo {name}**", *(str(verdicts.count((held, other))) for other in (True, False))]
+            for name, held in (("holds", True), ("drops", False))
+        ],
+    )
+    differ = [
+        f"* {thing_name(thing)}, {'displaced' if t['displaced'] else 'as planned'}: "
+        f"MuJoCo {_said(t['mujoco'])}; PyBullet {_said(t['bullet'])}"
+        for thing, t in rows
+        if t["mujoco"]["passed"] != t["bullet"]["passed"]
+    ]
+    pairs = np.array([[t["sd_bullet"], t["sd_mujoco"]] for _, t in rows]) * 100
+    told = f"**{agreed:.1%}** of {len(rows)} have the same verdict; MuJoCo has that of pulls of 2 s for {same}."
+    moved = (
+        f"Displacement trial: mean {pairs[:, 0].mean():.2f} cm in PyBullet, {pairs[:, 1].mean():.2f} cm in MuJoCo, "
+        f"median {np.median(pairs[:, 0]):.2f} and {np.median(pairs[:, 1]):.2f} cm; within 5 mm of each other on "
+        f"{(np.abs(pairs[:, 0] - pairs[:, 1]) < 0.5).mean():.1%}."
+    )
+    return {"simulators": [told, table, "\n".join(differ), moved]}
+
+
+def _said(hold: Record) -> str:
+    return hold["reason"] or f"holds ({hold['displacement'] * 100:.1f} cm, {hold['rotation'] * 57.3:.0f}°)"

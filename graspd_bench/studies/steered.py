@@ -1,0 +1,179 @@
+"""Does steering do what is asked of it, and what does it cost: the same request with a wish and without.
+
+Wishes are drawn at random from the case's seed, object and hand. Some cannot be met: a cone may come from where the
+object is too wide for the hand. Whether grasps keep to a wish is computed here from postures and contacts.
+"""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from graspd_bench.study import ObjectCase, Record, Request, Sections, find_objects, thing_name
+from graspd_bench.tables import markdown_table
+from graspd_core.hands.model import HandModel
+from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.planning.regions import Box, entered
+from graspd_core.planning.steering import Steering
+from graspd_core.types import Grasp, Verdict
+
+SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
+HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
+WISHES = ("cone", "cone and roll", "region", "cone and region", "avoid")
+# Half-angles of the cones [rad], share of the object that a region holds, and its least breadth [m].
+_ANGLES, _SHARES, _BREADTH = (0.35, 0.8), (0.4, 0.7), 0.05
+_ROLL_TOLERANCE = 0.35
+# How much of an end is avoided, and how far the box reaches beyond the object [m].
+_END, _BEYOND = 0.25, 0.03
+
+
+@dataclass(frozen=True)
+class SteeredCase(ObjectCase):
+    """A plan with a wish, and one without."""
+
+    wish: str = "cone"
+
+
+def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
+    """One an object, hand, wish and seed."""
+    things = find_objects(request.objects or tuple(f"shape:{s}" for s in SHAPES[: 1 if request.quick else None]))
+    hands = (request.hand,) if request.hand else HANDS[: 1 if request.quick else None]
+    count, preset = request.count or (2 if request.quick else 4), request.preset()
+    return tuple(
+        SteeredCase(thing, preset, hand, seed, count, wish)
+        for seed in request.seeds or (0,)
+        for hand in hands
+        for thing in things
+        for wish in WISHES
+    )
+
+
+def drawn_wish(case: SteeredCase, scene: Scene) -> Steering:
+    """The wish of a case, at random."""
+    rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.wish}".encode())])
+    direction, angle = rng.normal(size=3), float(rng.uniform(*_ANGLES))
+    vertices = scene.object.mesh.vertices
+    cone = {"approach_direction": direction / np.linalg.norm(direction), "approach_angle": angle}
+    if case.wish == "cone":
+        return Steering(**cone)
+    if case.wish == "cone and roll":
+        return Steering(**cone, roll=float(rng.uniform(-np.pi, np.pi)), roll_tolerance=_ROLL_TOLERANCE)
+    if case.wish == "avoid":
+        return Steering(avoid=[_end_of(vertices, rng, _END, _BEYOND)])
+    region = _end_of(vertices, rng, float(rng.uniform(*_SHARES)), 0.01)
+    return Steering(**(cone if case.wish == "cone and region" else {}), region=region)
+
+
+def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
+    """A box about a share of the object, from one of its six ends on, and no narrower than a hand can use."""
+    low, high = vertices.min(0), vertices.max(0)
+    axis, side = int(rng.integers(3)), int(rng.integers(2))
+    breadth = max(share * (high - low)[axis], _BREADTH if beyond < _BEYOND else 0.0)
+    low, high = low - beyond, high + beyond
+    if side:
+        low[axis] = high[axis] - breadth - beyond
+    else:
+        high[axis] = low[axis] + breadth + beyond
+    return Box((low + high) / 2, high - low)
+
+
+def run_steered(case: SteeredCase) -> Record:
+    """Costs of both plans, how many of the verified grasps keep to the wish, and by how much the worst misses it."""
+    hand, scene = case.load()
+    object_parts(scene.object)
+    wish = drawn_wish(case, scene)
+    plain, plain_s = _timed(case, scene, hand, ())
+    found, steered_s = _timed(case, scene, hand, (wish,))
+    good = [grasp for grasp in found.grasps if grasp.verdict is Verdict.VERIFIED]
+    return {
+        "shape": thing_name(case.object),
+        "plain_cpu_s": plain_s,
+        "steered_cpu_s": steered_s,
+        "plain": sum(grasp.verdict is Verdict.VERIFIED for grasp in plain.grasps),
+        "held": len(good),
+        "tried": len(found.grasps),
+        "refused": dict(found.refused),
+        "message": found.message,
+        # Greatest excess over each wish: negative where all keep to it.
+        "beyond_cone_rad": max((beyond_cone(hand, grasp, wish) for grasp in good), default=None),
+        "beyond_region_m": max((beyond_region(grasp, wish) for grasp in good), default=None),
+        "in_boxes": sum(_in_boxes(hand, grasp, wish) for grasp in good),
+    }
+
+
+def _timed(case: SteeredCase, scene: Scene, hand: HandModel, restrictions: Sequence[Steering]):
+    began = time.process_time()
+    found = plan_grasps(
+        scene, hand, count=case.count, seed=case.seed, preset=case.config, measure=False, restrictions=restrictions
+    )
+    return found, time.process_time() - began
+
+
+def beyond_cone(hand: HandModel, grasp: Grasp, wish: Steering) -> float:
+    """By how much a grasp's approach is outside the cone [rad]."""
+    if wish.approach_direction is None:
+        return -np.pi
+    w, x, y, z = grasp.grasp.quaternion_wxyz
+    approach = Rotation.from_quat([x, y, z, w]).apply(hand.approach)
+    return float(np.arccos(np.clip(approach @ np.asarray(wish.approach_direction), -1, 1))) - wish.approach_angle
+
+
+def beyond_region(grasp: Grasp, wish: Steering) -> float:
+    """How far the farthest contact is outside the region [m]."""
+    if not isinstance(wish.region, Box):
+        return -1.0
+    beyond = (
+        np.abs(np.array([c.position for c in grasp.contacts]) - wish.region.center) - np.array(wish.region.size) / 2
+    )
+    return float(beyond.max())
+
+
+def _in_boxes(hand: HandModel, grasp: Grasp, wish: Steering) -> bool:
+    return bool(entered(hand, [grasp.pregrasp, grasp.grasp, grasp.squeeze], wish.avoid).any())
+
+
+def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Success and cost by wish."""
+    headings = ["wish", "requests", "with a verified grasp", "without the wish", "grasps of those asked for"]
+    headings += [
+        "without the wish",
+        "CPU s, median",
+        "without the wish",
+        "beyond cone, at worst",
+        "beyond region",
+        "in boxes",
+    ]
+    body = [_row(wish, [r for r in records if wish in ("all", r["wish"])]) for wish in (*WISHES, "all")]
+    return {"steered": [markdown_table(headings, [row for row in body if row])]}
+
+
+def _row(wish: str, here: Sequence[Record]) -> list[str]:
+    if not here:
+        return []
+    share = lambda key: f"{np.mean([r[key] > 0 for r in here]):.1%}"  # noqa: E731
+    asked = sum(r["count"] for r in here)
+    grasps = lambda key: f"{sum(r[key] for r in here) / asked:.1%}"  # noqa: E731
+    seconds = lambda key: f"{np.median([r[key] for r in here]):.2f}"  # noqa: E731
+    cones = [r["beyond_cone_rad"] for r in here if r["beyond_cone_rad"] is not None and "cone" in r["wish"]]
+    regions = [r["beyond_region_m"] for r in here if r["beyond_region_m"] is not None and "region" in r["wish"]]
+    return [
+        wish,
+        str(len(here)),
+        share("held"),
+        share("plain"),
+        grasps("held"),
+        grasps("plain"),
+        seconds("steered_cpu_s"),
+        seconds("plain_cpu_s"),
+        f"{max(0.0, np.degrees(max(cones))):.2f}°" if cones else "",
+        f"{max(0.0, 1e3 * max(regions)):.1f} mm" if regions else "",
+        str(sum(r["in_boxes"] for r in here)) if wish in ("avoid", "all") else "",
+    ]

@@ -1,0 +1,79 @@
+"""How many verified grasps a second: of a known object, on one thread and on two, by the clock on the wall.
+
+Cases that run at a time share the cores: figures count with `--processes 1` on a quiet machine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, thing_name
+from graspd_bench.tables import markdown_table
+from graspd_core.mesh.shapes import SHAPES
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Verdict
+
+THREADS = (1, 2)
+# Of the plan that goes before, with another seed, so that the object is known: its grid, parts and worlds are there.
+_WARM_UP = 2
+
+
+@dataclass(frozen=True)
+class Throughput(ObjectCase):
+    """Verified grasps of an object on so many threads."""
+
+    threads: int = 1
+
+
+def throughput_cases(request: Request) -> tuple[Throughput, ...]:
+    """Every shape from three seeds, on one thread and on two."""
+    request = request if request.seeds or request.quick else replace(request, seeds=(0, 1, 2))
+    cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 64)
+    return tuple(Throughput(**vars(case), threads=threads) for case in cases for threads in THREADS)
+
+
+def run_throughput(case: Throughput) -> Record:
+    """Seconds, on the wall and of the CPU, of one plan without metrics."""
+    hand, scene = case.load()
+    before = torch.get_num_threads()
+    torch.set_num_threads(case.threads)
+    try:
+        plan_grasps(scene, hand, count=_WARM_UP, seed=case.seed + 1, preset=case.config, measure=False)
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.config, measure=False)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    finally:
+        torch.set_num_threads(before)
+    verified = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+    return {"verified": verified, "tried": len(result.grasps), "wall_s": wall, "cpu_s": cpu}
+
+
+def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Verified grasps a second and CPU time of each, by object and number of threads."""
+    rows = [record for record in records if record["verified"]]
+    if not rows:
+        return {}
+    headings = ["object", "tried for one verified"]
+    for threads in THREADS:
+        headings += [f"verified a second, {threads} thread{'s' if threads > 1 else ''}", "CPU ms each"]
+    things = list(dict.fromkeys(thing_name(row["object"]) for row in rows))
+    figures = {thing: _figures([row for row in rows if thing_name(row["object"]) == thing]) for thing in things}
+    figures["**mean**"] = np.nanmean(list(figures.values()), axis=0).tolist()
+    body = [[name, f"{tried:.2f}", *(f"{value:.1f}" for value in others)] for name, (tried, *others) in figures.items()]
+    return {"throughput": [markdown_table(headings, body)]}
+
+
+def _figures(rows: Sequence[Record]) -> list[float]:
+    """Tried for each verified; then verified a second and CPU ms of each, by number of threads; over all seeds."""
+    found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
+    for threads in THREADS:
+        here = [row for row in rows if row["threads"] == threads]
+        verified, wall, cpu = (sum(row[key] for row in here) for key in ("verified", "wall_s", "cpu_s"))
+        found += [verified / wall, 1e3 * cpu / verified] if here else [np.nan, np.nan]
+    return found

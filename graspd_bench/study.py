@@ -1,0 +1,247 @@
+"""What a benchmark is: cases, what is run for one of them, and what is made of the records.
+
+The case of most studies: grasps of an object, and what is loaded for them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from graspd_core.errors import ConfigError, MeshError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
+from graspd_core.mesh.shapes import SHAPES, make_shape
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
+from graspd_core.paths import config_dir
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene
+from graspd_core.types import Grasp
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A chart on disk, and what it shows."""
+
+    title: str
+    png: Path
+
+
+# Parts of a page's sections by the name of their marker: Markdown and pictures.
+Sections = Mapping[str, Sequence[str | Picture | None]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run. Its fields called `object`, `hand` and `preset`, where there are such, count by their content."""
+
+    @property
+    def label(self) -> str:
+        """What it is called in progress and in the name of its file: the fields that are not empty."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return " ".join(thing_name(value) for value in values if isinstance(value, str | int | float) and value != "")
+
+    def asked(self) -> Record:
+        """Everything that the run depends on but the code, JSON-ready: runs that ask for the same share a record."""
+        said = asdict(self)
+        if "object" in said:
+            said["object"] = [thing_name(said["object"]), object_hash(said["object"])]
+        if "hand" in said:
+            said["hand"] = [said["hand"], hand_hash(said["hand"])]
+        if "preset" in said:
+            said["settings"] = to_mapping(load_preset(said["preset"]))
+        return said
+
+    def shown(self) -> Record:
+        """What the record says of the case."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a caller wants run; empty and None mean the study's own choice.
+
+    Attributes:
+        presets: names or files.
+        objects: shape:NAME, mesh files, or folders of them.
+        cases: names or families of the study's own cases.
+        seeds: of every case.
+        count: grasps of a case.
+        hand: name or path.
+        trials: of raw grasps.
+        quick: a small run that takes minutes.
+        imported: file or folder of somebody else's grasps.
+        joint_order: of the joints in its npy files, by name.
+    """
+
+    presets: tuple[str, ...] = ()
+    objects: tuple[str, ...] = ()
+    cases: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+    count: int | None = None
+    hand: str = ""
+    trials: tuple[str, ...] = ()
+    quick: bool = False
+    imported: str = ""
+    joint_order: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.count is not None and not 1 <= self.count <= 1024:
+            raise ConfigError(f"count: {self.count} grasps; valid: 1 to 1024")
+        for seed in self.seeds:
+            if not 0 <= seed < 2**31:
+                raise ConfigError(f"seed: {seed}; valid: 0 to 2^31 - 1")
+
+    def preset(self, usual: str = "balanced") -> str:
+        """The only preset. Raises ConfigError: there are several, or it is unknown."""
+        if len(self.presets) > 1:
+            raise ConfigError(f"presets: {', '.join(self.presets)}; this study takes one at a time")
+        name = (self.presets or (usual,))[0]
+        load_preset(name)
+        return name
+
+
+def error_of(record: Record) -> tuple[str, ...]:
+    """The error that a case ended in."""
+    return (record["error"],) if record["error"] else ()
+
+
+def held_of(record: Record) -> str:
+    """What came of a case, in a few words."""
+    return f"{record['held']}/{record['count']} held" if "held" in record else "measured"
+
+
+@dataclass(frozen=True)
+class Study:
+    """One benchmark.
+
+    Attributes:
+        about: what it asks, one line.
+        cases: of a request. Raises GraspdError: the request names what there is not.
+        run: a case to its figures, in a process that does one case after another; a function of a module.
+        sections: records, and the path that charts begin with (None: draw none), to what pages hold of them.
+        failures: the sections are of records of cases that failed, too.
+        sources: files below `bench`, by glob, that figures depend on beside the package itself.
+        takes: names of the fields of `Request` that it looks at.
+        seconds: CPU seconds of a case, roughly.
+        faults: what is wrong with a record, a line each.
+        came: what came of a record that has no fault, in a few words.
+        alone: every case in a process of its own, cold.
+        patience: seconds until a case is called hung.
+        usual: part of `graspd bench all`, because it needs nothing that is not shipped.
+    """
+
+    about: str
+    cases: Callable[[Request], Sequence[Case]]
+    run: Callable[[Any], Record]
+    sections: Callable[[Sequence[Record], Path | None], Sections]
+    sources: tuple[str, ...]
+    takes: tuple[str, ...] = ()
+    seconds: Callable[[Any], float] = lambda case: 10.0
+    faults: Callable[[Record], tuple[str, ...]] = error_of
+    came: Callable[[Record], str] = held_of
+    alone: bool = False
+    patience: Callable[[Any], float] = lambda case: 3600.0
+    usual: bool = True
+    failures: bool = False
+
+
+def all_shapes() -> tuple[str, ...]:
+    """The authored shapes as objects."""
+    return tuple(f"shape:{name}" for name in SHAPES)
+
+
+def thing_name(source: Any) -> str:
+    """What an object goes by: the shape, or the file without its ending; other values as they are."""
+    text = f"{source:g}" if isinstance(source, float) else str(source)
+    path = Path(text)
+    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
+
+
+def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
+    """Shapes, mesh files and the meshes of folders. Raises MeshError: there is no such thing."""
+    found: list[str] = []
+    for source in sources:
+        path = Path(source)
+        if not source.startswith("shape:") and path.is_dir():
+            files = sorted(p for p in path.iterdir() if p.suffix.lower().lstrip(".") in MESH_ENDINGS)
+            if not files:
+                raise MeshError(f"{source}: no mesh in this folder; valid endings: {', '.join(MESH_ENDINGS)}")
+            found += map(str, files)
+        else:
+            object_hash(source)
+            found.append(source)
+    return tuple(found)
+
+
+def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
+    """As `object_sources`; raises MeshError also where two of them go by the same name."""
+    found = object_sources(sources)
+    names = [thing_name(source) for source in found]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise MeshError(f"two objects are called {twice[0]!r}: results go by that name")
+    return found
+
+
+@lru_cache
+def object_hash(source: str) -> str:
+    """Hash of the content of a shape or a mesh file. Raises MeshError: there is no such thing."""
+    if source.startswith("shape:"):
+        return content_hash(make_shape(source.removeprefix("shape:")))
+    path = Path(source)
+    if not path.is_file():
+        raise MeshError(f"{path}: no such mesh file; shape:NAME is an authored shape: {', '.join(sorted(SHAPES))}")
+    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
+        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@lru_cache
+def hand_hash(name: str) -> str:
+    """Hash of a hand's URDF and description. Raises HandError: there is no such hand, or it cannot be used."""
+    hand = load_hand(name, candidates=1)
+    boxed = config_dir() / "hands" / f"{name}.yaml"
+    files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+@dataclass(frozen=True)
+class ObjectCase(Case):
+    """`count` grasps of an object (a mesh file or shape:NAME) with a hand, a preset and a seed."""
+
+    object: str
+    preset: str
+    hand: str
+    seed: int
+    count: int
+
+    @property
+    def config(self) -> PlanConfig:
+        return load_preset(self.preset)
+
+    def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
+        """The hand and the scene."""
+        hand = load_hand(self.hand, candidates=self.config.problem.fine_candidates)
+        return hand, load_scene(self.object, resolution=self.config.resolution, friction=friction)
+
+
+def object_cases(request: Request, objects: Sequence[str], count: int, quick_count: int = 2) -> tuple[ObjectCase, ...]:
+    """One an object and seed; of a small run the first object, with fewer grasps."""
+    things = find_objects(request.objects or objects[: 1 if request.quick else None])
+    count, hand = request.count or (quick_count if request.quick else count), request.hand or "allegro_right"
+    seeds = request.seeds or (0,)
+    return tuple(ObjectCase(thing, request.preset(), hand, seed, count) for seed in seeds for thing in things)
+
+
+def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:
+    """The first of a method's own ranking, none filtered by a trial."""
+    return find_candidates(scene, hand, count=count, seed=seed, config=config, hooks=Hooks()).grasps[:count]

@@ -1,0 +1,201 @@
+"""All studies, a row each: `graspd bench NAME` runs one. To add one, write its file and its row."""
+
+from __future__ import annotations
+
+from graspd_bench import failure_maps as map_registry
+from graspd_bench import suites, tables
+from graspd_bench.bullet.bullet_world import bullet_available
+from graspd_bench.failure_maps import map_sections
+from graspd_bench.measurement import run_cell
+from graspd_bench.stress import stress_cases
+from graspd_bench.studies import (
+    arm_reach,
+    early_ends,
+    frames,
+    human_hand,
+    imported,
+    robust_ranking,
+    seen_objects,
+    simulators,
+    steered,
+    throughput,
+)
+from graspd_bench.studies import piles as clear_pile
+from graspd_bench.studies import piles as pile_case
+from graspd_bench.studies import piles as pile_report
+from graspd_bench.study import Study
+
+_CELLS = ("measurements/*.py", "bullet/*.py", "object_case.py")
+_IMPORTED = ("studies/imported.py", "object_case.py", "measurements/benchmark_trials.py", "bullet/*.py")
+_IMPORTED = (*_IMPORTED, "../formats/foreign/*.py")
+_RAW = ("objects", "seeds", "count", "hand", "trials", "quick")
+_PLANS = ("presets", "objects", "seeds", "count", "hand", "quick")
+
+STUDIES: dict[str, Study] = {
+    "main": Study(
+        "every preset on every object: raw, planned, pace and start cells",
+        suites.main_suite,
+        run_cell,
+        tables.main_sections,
+        _CELLS,
+        ("presets", *_RAW),
+        suites.cell_seconds,
+        failures=True,
+    ),
+    "ladder": Study(
+        "settings from poor to rich, one at a time",
+        suites.sweep_suite,
+        run_cell,
+        tables.ladder_sections,
+        _CELLS,
+        _RAW,
+        suites.cell_seconds,
+    ),
+    "decades": Study(
+        "stiffness and friction over three decades",
+        suites.decades_suite,
+        run_cell,
+        tables.decades_sections,
+        _CELLS,
+        _RAW,
+        suites.cell_seconds,
+    ),
+    "hands": Study(
+        "every built-in hand with one preset",
+        suites.hands_suite,
+        run_cell,
+        tables.hands_sections,
+        _CELLS,
+        tuple(name for name in _RAW if name != "hand"),
+        suites.cell_seconds,
+    ),
+    "rgbd": Study(
+        "what cameras see of things on a table, planned on and tried on the truth",
+        seen_objects.seen_cases,
+        seen_objects.run_seen,
+        seen_objects.rgbd_sections,
+        ("studies/seen_objects.py", "object_case.py"),
+        _PLANS,
+        seen_objects.seen_seconds,
+        came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
+    ),
+    "piles": Study(
+        "piles of things on a table, seen by a camera, grasped and lifted out one after another on the truth",
+        pile_case.pile_cases,
+        clear_pile.run_pile,
+        pile_report.pile_sections,
+        ("piles/*.py",),
+        ("presets", "objects", "cases", "seeds", "hand", "quick"),
+        pile_case.pile_seconds,
+        came=pile_report.pile_came,
+    ),
+    "robust": Study(
+        "what ranking by noisy trials buys and costs",
+        robust_ranking.robust_cases,
+        robust_ranking.run_robust,
+        robust_ranking.robust_sections,
+        ("studies/robust_ranking.py", "object_case.py"),
+        _PLANS,
+        lambda case: 2.0 + 2.5 * case.count,
+    ),
+    "maps": Study(
+        "where methods stop working: friction and mass, size, view, wall",
+        map_registry.map_cases,
+        map_registry.run_map,
+        map_sections,
+        ("failure_maps/*.py", "object_case.py"),
+        ("cases", "quick"),
+        map_registry.map_seconds,
+    ),
+    "stress": Study(
+        "what breaks methods, each case in a process of its own",
+        stress_cases.stress_runs,
+        stress_cases.run_stress,
+        stress_cases.stress_sections,
+        ("stress/*.py",),
+        ("presets", "cases", "quick"),
+        lambda case: 6.0,
+        stress_cases.stress_faults,
+        stress_cases.stress_came,
+        alone=True,
+        patience=stress_cases.stress_patience,
+        failures=True,
+    ),
+    "early": Study(
+        "trials that stop early against the full length",
+        early_ends.early_cases,
+        early_ends.run_early,
+        early_ends.early_sections,
+        ("studies/early_ends.py", "object_case.py"),
+        _PLANS,
+        lambda case: 2.0 + 1.2 * case.count,
+    ),
+    "simulators": Study(
+        "the hold and displacement trials in MuJoCo and PyBullet",
+        simulators.simulator_cases,
+        simulators.run_simulators,
+        simulators.simulator_sections,
+        ("studies/simulators.py", "object_case.py", "bullet/*.py"),
+        _PLANS,
+        lambda case: 2.0 + 2.5 * case.count,
+        usual=bullet_available(),
+    ),
+    "steered": Study(
+        "grasps with a wish for direction, place and roll against the same without",
+        steered.steered_cases,
+        steered.run_steered,
+        steered.steered_sections,
+        ("studies/steered.py", "object_case.py"),
+        _PLANS,
+        lambda case: 1.2,
+    ),
+    "reach": Study(
+        "inverse kinematics of the arms, and requests with and without an arm",
+        arm_reach.reach_cases,
+        arm_reach.run_reach,
+        arm_reach.reach_sections,
+        ("studies/arm_reach.py", "object_case.py"),
+        _PLANS,
+        lambda case: 3.0,
+        came=arm_reach.came,
+    ),
+    "throughput": Study(
+        "verified grasps a second of a known object, on one thread and two (quiet cores, --processes 1)",
+        throughput.throughput_cases,
+        throughput.run_throughput,
+        throughput.throughput_sections,
+        ("studies/throughput.py", "object_case.py"),
+        _PLANS,
+        lambda case: 3.0 + 0.06 * case.count,
+        usual=False,
+    ),
+    "imported": Study(
+        "somebody else's grasps beside ours on the same objects and hand (--import FOLDER --hand NAME)",
+        imported.imported_cases,
+        imported.run_imported,
+        imported.imported_sections,
+        _IMPORTED,
+        (*_PLANS, "trials", "imported", "joint_order"),
+        lambda case: 10.0 + 18.0 * case.count,
+        usual=False,
+    ),
+    "mano": Study(
+        "a human hand of the user's, in the units of the Grasp'D paper",
+        human_hand.mano_cases,
+        human_hand.run_mano,
+        human_hand.mano_sections,
+        ("studies/human_hand.py", "object_case.py", "bullet/*.py"),
+        _PLANS,
+        usual=False,
+    ),
+    "frames": Study(
+        "frames of a real depth camera, in folders",
+        frames.frame_cases,
+        frames.run_frame,
+        frames.frame_sections,
+        ("studies/frames.py",),
+        _PLANS,
+        usual=False,
+        failures=True,
+    ),
+}

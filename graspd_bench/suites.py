@@ -1,0 +1,180 @@
+"""The suites of cells: presets on objects, settings swept, hands compared; and the counts that they are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from graspd_bench.figures import hand_row
+from graspd_bench.measurement import TRIALS, USUAL, Cell, Kind
+from graspd_bench.study import Request, all_shapes, find_objects
+from graspd_core.errors import ConfigError
+from graspd_core.hands.library import hand_names
+from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, preset_names
+
+# Verified grasps that a planned cell asks for, and the batch that pace is taken at.
+VERIFIED, BATCH = 8, 32
+# Grasps of a raw cell by which hands are compared, and of a sweep over decades.
+HAND_COUNT = 8
+# Presets that people plan with.
+PLANNED = ("fast", "balanced", "accurate")
+# What `balanced` is compared with: the same effort in every round.
+STEADY = "balanced_steady"
+# Orders the verified grasps in another way: its raw grasps are those of `balanced`.
+_RANKED = "robust"
+# Of settings with more steps than this a raw cell is asked for fewer grasps: they take seconds each.
+_LONG, _LONG_COUNT = 2000, 4
+# A grasp of settings with more steps than this takes three times as long.
+_LONGEST = 7000
+# Trials of the settings sweeps.
+_SWEEP_TRIALS = ("standard",)
+_SWEEP_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
+_SWEEP_PRESET = "balanced"
+_QUICK_OBJECTS = ("shape:sphere", "shape:box", "shape:mug")
+_QUICK_COUNT = 4
+# The others take minutes a cell.
+_QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
+
+# CPU seconds of one grasp by method, on a quiet core; of long settings, and of other methods, below.
+_SECONDS = {"closed_form": 0.05, "graspd2022": 1.2, "annealing": 3.3, "random_closure": 0.3}
+
+_STEPS = {"explore": 50, "refine": 80, "polish": 50}
+# Sweep values: what is changed, and to what; all else stays at `balanced`.
+SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
+    "candidates": [{"problem.candidates": n} for n in (32, 64, 128, 256, 512)],
+    "directions": [{"problem.directions": n} for n in (6, 12, 24, 48, 96)],
+    "resolution": [{"resolution": n} for n in (16, 24, 32, 48, 64)],
+    "steps": [
+        {f"closed_form.{stage}_steps": round(n * share) for stage, n in _STEPS.items()}
+        for share in (0.2, 0.5, 1.0, 2.0, 4.0)
+    ],
+}
+# Three decades: title, preset, setting and its values; the preset's own is among them.
+DECADES = (
+    (
+        "Grasp'D, stiffness [N/m]",
+        "graspd2022_short",
+        "graspd2022.contact.stiffness",
+        (30, 100, 300, 1e3, 3e3, 1e4, 3e4),
+    ),
+    ("Grasp'D, friction", "graspd2022_short", "graspd2022.contact.friction", (0.02, 0.06, 0.2, 0.8, 2.0, 6.0, 20.0)),
+    ("closed form, width [mm]", "balanced", "closed_form.delta_end", (1e-4, 4e-4, 1e-3, 4e-3, 1e-2, 4e-2, 1e-1)),
+    ("closed form, friction", "balanced", "problem.friction", (0.02, 0.06, 0.2, 0.4, 2.0, 6.0, 20.0)),
+)
+
+
+def main_suite(request: Request) -> tuple[Cell, ...]:
+    """Every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
+    names = (name for name in preset_names() if name != _RANKED)
+    defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
+    presets = {name: load_preset(name) for name in request.presets or defaults}
+    planned = {name: config for name, config in presets.items() if name in PLANNED}
+    if "balanced" in planned:
+        planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
+    trials = _trials(request, USUAL)
+    cells: list[Cell] = []
+    for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
+        for name, config in presets.items():
+            cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
+        # The closed form's own presets are what `plan_grasps` is used with; the others are only compared raw.
+        for name, config in planned.items():
+            cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
+    if not request.objects:
+        for name in (name for name in PLANNED if name in presets):
+            cells += _cells(request, "pace", name, presets[name], "shape:cylinder", BATCH)[:1]
+        if "balanced" in presets:
+            cells += _cells(request, "start", "balanced", presets["balanced"], "shape:mug", 1)[:1]
+    return tuple(dict.fromkeys(cells))
+
+
+def sweep_suite(request: Request) -> tuple[Cell, ...]:
+    """Each of four settings from poor to rich, one at a time."""
+    base = load_preset(_SWEEP_PRESET)
+    count, trials = _count(request, base), _trials(request, _SWEEP_TRIALS)
+    return tuple(
+        cell
+        for thing in find_objects(request.objects or (_SWEEP_OBJECTS[:2] if request.quick else _SWEEP_OBJECTS))
+        for sweep, values in SWEEPS.items()
+        for changes in values
+        for cell in _cells(request, "raw", sweep_name(sweep, changes), override(base, changes), thing, count, trials)
+    )
+
+
+def decades_suite(request: Request) -> tuple[Cell, ...]:
+    """Stiffness and friction over three decades: how far they can be wrong before a method stops working."""
+    count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
+    return tuple(
+        cell
+        for thing in find_objects(request.objects or _SWEEP_OBJECTS[:2])
+        for _, preset, setting, values in DECADES
+        for value in (values[:2] if request.quick else values)
+        for cell in _cells(
+            request,
+            "raw",
+            f"{setting}={value:g}",
+            override(load_preset(preset), {setting: value}),
+            thing,
+            count,
+            trials,
+        )
+    )
+
+
+def hands_suite(request: Request) -> tuple[Cell, ...]:
+    """Every built-in hand with one preset."""
+    base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
+    trials = _trials(request, _SWEEP_TRIALS)
+    return tuple(
+        cell
+        for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
+        for hand in hand_names()
+        for cell in _cells(request, "raw", hand_row(hand), base, thing, count, trials, hand=hand)
+    )
+
+
+def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
+    """Name of a sweep value's cells: the sweep and its value (steps: all of them together)."""
+    return f"{sweep}={sum(changes.values()):g}"
+
+
+def cell_seconds(cell: Cell) -> float:
+    """CPU seconds of a cell, roughly; measured on one thread of a quiet core."""
+    if cell.kind != "raw":
+        return {"verified": 1.5, "pace": 8.0, "start": 6.0}[cell.kind]
+    each = _SECONDS.get(cell.settings.method, 1.0)
+    if _steps(cell.settings) > _LONG:
+        each = 25.0 if _steps(cell.settings) > _LONGEST else 8.0
+    return 1.0 + cell.count * (each + 0.075 * len(cell.trials))
+
+
+def _steps(config: PlanConfig) -> int:
+    return getattr(config.settings, "steps", 0)
+
+
+def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
+    for name in request.trials:
+        if name not in TRIALS:
+            raise ConfigError(f"unknown trial {name!r}; valid trials: {', '.join(TRIALS)}")
+    return request.trials or usual
+
+
+def _count(request: Request, config: PlanConfig) -> int:
+    usual = _LONG_COUNT if _steps(config) > _LONG else METHODS[config.method].benchmark_count
+    return request.count or (_QUICK_COUNT if request.quick else usual)
+
+
+def _cells(
+    request: Request,
+    kind: Kind,
+    name: str,
+    config: PlanConfig,
+    thing: str,
+    count: int,
+    trials: tuple[str, ...] = (),
+    *,
+    hand: str = "",
+) -> list[Cell]:
+    """Cells of a request's hand and seeds."""
+    label = Path(name).stem if Path(name).suffix in (".yaml", ".yml") else name
+    hand = hand or request.hand or "allegro_right"
+    return [Cell(kind, label, config, thing, hand, seed, count, trials) for seed in request.seeds or (0,)]

@@ -1,0 +1,254 @@
+"""Texts into the marked sections of documents; tables in Markdown; where figures come from.
+
+Records of cells as Markdown tables, and the sections of pages that they fill.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from graspd_bench.figures import FEW, Row, by_name, is_hand, is_preset, per_verified, rows, spread
+from graspd_bench.study import Picture, Record, Sections
+from graspd_bench.suites import DECADES
+from graspd_core.errors import ConfigError
+from graspd_core.io.grasps_json import save_text
+from graspd_core.verify.metrics import METRICS
+
+
+def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown; cells must not have bars of their own."""
+    lines = [headings, ["---"] * len(headings), *body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")
+
+
+def provenance(command: str, records: Sequence[Record]) -> str:
+    """One line on where figures come from: the command, the days, the commits, the code, the machine, what it took."""
+
+    def of(name: str) -> str:
+        return ", ".join(sorted({str(record.get(name) or "unknown") for record in records}))
+
+    failed = sum(bool(record["error"]) for record in records)
+    minutes = sum(record.get("case_cpu", 0.0) for record in records) / 60
+    told = f"Made {of('made')} by `{command}` at commit {of('commit')} (code {of('code')}): "
+    told += f"{len(records)} cases, {minutes:.0f} CPU minutes on {of('machine')}."
+    return told + (f" {failed} cases failed and are in no figure." if failed else "")
+
+
+def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict[str, Sequence[str | Picture]]:
+    """Sections that have anything in them, each with the line that says where its figures come from."""
+    filled = {name: [part for part in parts if part] for name, parts in sections.items()}
+    return {name: [*parts, provenance(command, records)] for name, parts in filled.items() if parts}
+
+
+def written(parts: Sequence[str | Picture], document: Path | None = None) -> str:
+    """The parts of a section as Markdown; pictures are links from the document, and left out where there is none."""
+    texts = []
+    for part in parts:
+        if isinstance(part, str):
+            texts.append(part)
+        elif document is not None:
+            link = Path(os.path.relpath(part.png.resolve(), document.resolve().parent)).as_posix()
+            texts.append(f"![{part.title}]({link})")
+    return "\n\n".join(texts)
+
+
+def fill(document: Path, sections: Mapping[str, Sequence[str | Picture]]) -> list[str]:
+    """Rewrite the marked sections of a document; others stay. Returns the names of those rewritten.
+
+    A section stands between `<!-- NAME:begin -->` and `<!-- NAME:end -->`.
+
+    Raises:
+        ConfigError: the document cannot be read, or has none of the sections.
+    """
+    try:
+        text = document.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{document}: {error.strerror or error}") from None
+    filled = []
+    for name, parts in sections.items():
+        # On lines of their own: a document may also speak of its markers.
+        section = re.compile(rf"^(<!-- {name}:begin -->\n).*?^(<!-- {name}:end -->)$", re.DOTALL | re.MULTILINE)
+        if section.search(text):
+            new = written(parts, document)
+            text = section.sub(lambda found, new=new: f"{found[1]}{new}\n{found[2]}", text, count=1)
+            filled.append(name)
+    if not filled:
+        raise ConfigError(f"{document}: has none of the sections {', '.join(sections)}; valid: <!-- bench:begin --> …")
+    save_text(document, text)
+    return filled
+
+
+_PLANNED = ("first_wall", "cpu_per_verified", "rounds")
+_TITLES = {
+    "speed": "Speed against accuracy",
+    "short": "Speed against accuracy",
+    "planned": "Planned grasps",
+    "ladder": "Settings sweeps",
+}
+_SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "cpu_per_grasp", "cpu_per_verified")
+
+
+def _columns() -> list[tuple[str, str, str]]:
+    """Columns of both tables: heading, figure, format; a summary takes means over objects."""
+    return [
+        ("held", "standard", "{:.0%}"),
+        ("held, hard", "hard", "{:.0%}"),
+        ("held, noisy", "noisy", "{:.0%}"),
+        ("SD cm", "sd_cm", "{:.2f}"),
+        ("under gravity cm", "gravity_cm", "{:.2f}"),
+        *((row.title, row.key, f"{{:.{row.digits}f}}") for row in METRICS.values()),
+        ("CPU s per grasp", "cpu_per_grasp", "{:.3g}"),
+        ("CPU s per verified", "cpu_per_verified", "{:.3g}"),
+    ]
+
+
+def summary_table(records: Sequence[Record]) -> str:
+    """A row a preset: means over its objects, of raw grasps."""
+    return _summary("preset", by_name(row for row in rows(records) if is_preset(row.name)))
+
+
+def hands_table(records: Sequence[Record]) -> str:
+    """A row a hand: likewise, all with the same preset; and the object on which fewest held."""
+    found = by_name(row for row in rows(records) if is_hand(row.name))
+    worst = [min(group, key=lambda row: row.held / row.asked) for group in found.values()]
+    hands = {name.removeprefix("hand:"): group for name, group in found.items()}
+    return _summary("hand", hands, ("fewest held", [f"{row.object} {row.held}/{row.asked}" for row in worst]))
+
+
+def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, list[str]] | None = None) -> str:
+    """A row a name, with a last column if there is one to add; nothing where there are no names."""
+    if not found:
+        return ""
+    columns = [column for column in _columns() if column[1] in _SUMMARY and _known(found, column[1])]
+    body = [
+        [f"`{name}`", *(_mean(group, figure, form) for _, figure, form in columns)] for name, group in found.items()
+    ]
+    headings = [kind, *(heading for heading, _, _ in columns)]
+    if last is not None:
+        headings.append(last[0])
+        body = [[*line, cell] for line, cell in zip(body, last[1], strict=True)]
+    return markdown_table(headings, body)
+
+
+def object_tables(records: Sequence[Record]) -> str:
+    """A table a preset: medians over each object's grasps, and their means."""
+    blocks = []
+    for name, group in by_name(row for row in rows(records) if is_preset(row.name)).items():
+        columns = [column for column in _columns() if _known({name: group}, column[1])]
+        body = [
+            [row.object, *(_form(row.values[f], form) if f != "standard" else f"{row.held}/{row.asked}"
+                           for _, f, form in columns)]
+            for row in group
+        ]  # fmt: skip
+        body.append(["**mean**", *(_mean(group, figure, form) for _, figure, form in columns)])
+        blocks.append(f"`{name}`:\n\n{markdown_table(['object', *(heading for heading, _, _ in columns)], body)}")
+    return "\n\n".join(blocks)
+
+
+def planned_table(records: Sequence[Record]) -> str:
+    """A row a preset of planned runs: verified grasps and what they cost, trials and all."""
+    body = []
+    for name, group in by_name(rows(records, "verified")).items():
+        held, asked = sum(row.held for row in group), sum(row.asked for row in group)
+        first, worst = spread(group, "first_cpu"), max((r.values["first_cpu"] or 0.0 for r in group), default=0.0)
+        body.append([
+            f"`{name}`", f"{held}/{asked}",
+            f"{first.median:.2f} ({worst:.2f})" if first else "–",
+            *(_mean(group, figure, "{:.3g}") for figure in _PLANNED),
+            f"{max(row.values['peak_mb'] or 0.0 for row in group):.0f}",
+        ])  # fmt: skip
+    headings = ["preset", "verified", "first verified CPU s, median (worst)", "first verified s", "CPU s per verified"]
+    return markdown_table([*headings, "rounds", "peak MB"], body) if body else ""
+
+
+def pace_table(records: Sequence[Record]) -> str:
+    """The optimiser alone, and a fresh process."""
+    body = []
+    for r in records:
+        if r["error"]:
+            continue
+        if r["kind"] == "pace":
+            cost = r["cpu"]["optimise"]
+            steps = f", {cost / r['grasp_steps'] * 1e6:.0f} µs a grasp-step" if r["grasp_steps"] else ""
+            what = f"raw grasps, `{r['name']}`, {r['object']}, batch {r['count']}"
+            body.append([what, f"{cost / r['count']:.3f} CPU s each{steps}; {r['peak_mb']:.0f} MB at the peak"])
+        elif r["kind"] == "start":
+            what = f"first verified grasp of a fresh process without a cache, `{r['name']}`, {r['object']}"
+            body.append([what, f"{r['wall']['total']:.1f} s, {r['cpu']['total']:.1f} CPU s"])
+    return markdown_table(["speed and size", ""], body) if body else ""
+
+
+def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The few rows of a first page, the whole table, planned runs, and every object."""
+    drawn = drawn_charts(records, chart)
+    few = [record for record in records if record["name"] in FEW]
+    return {
+        "bench": [drawn.get("short"), summary_table(few)],
+        "bench-all": [drawn.get("speed"), summary_table(records), missing(records)],
+        "bench-planned": [drawn.get("planned"), planned_table(records), pace_table(records)],
+        "bench-objects": [object_tables(records)],
+    }
+
+
+def ladder_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The chart of the settings sweeps."""
+    return {"bench-ladder": [drawn_charts(records, chart).get("ladder")]}
+
+
+def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """A table a setting: raw grasps held, of those asked for, all objects together."""
+    groups = by_name(rows(records))
+    blocks = []
+    for title, _, setting, values in DECADES:
+        scale = 1e3 if "[mm]" in title else 1.0
+        found = [groups.get(f"{setting}={value:g}", []) for value in values]
+        share = [f"{sum(r.held for r in group)}/{sum(r.asked for r in group)}" if group else "–" for group in found]
+        blocks.append(markdown_table([title, *(f"{v * scale:g}" for v in values)], [[f"`{setting}`", *share]]))
+    return {"decades": blocks}
+
+
+def hands_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """The table of the hands."""
+    return {"bench-hands": [hands_table(records)]}
+
+
+def drawn_charts(records: Sequence[Record], chart: Path | None) -> Mapping[str, Picture]:
+    """The charts that the records have figures for, by name; none without a path."""
+    if chart is None:
+        return {}
+    from graspd_bench.charts import draw_charts
+
+    return {name: Picture(_TITLES[name], png) for name, png in draw_charts(records, chart).items()}
+
+
+def metrics_table() -> str:
+    """A row a metric: its name, unit and definition."""
+    return markdown_table(
+        ["metric", "unit in files", "definition"],
+        [[f"`{name}`", row.unit, row.description] for name, row in METRICS.items()],
+    )
+
+
+def missing(records: Sequence[Record]) -> str:
+    """What the means leave out: objects that some presets have not been tried on."""
+    found = by_name(row for row in rows(records) if is_preset(row.name))
+    objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
+    fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]
+    return f"Means are over {len(objects)} objects, but {', '.join(fewer)} only." if fewer else ""
+
+
+def _known(groups: Mapping[str, Sequence[Row]], figure: str) -> bool:
+    return any(row.values.get(figure) is not None for group in groups.values() for row in group)
+
+
+def _mean(group: Sequence[Row], figure: str, form: str) -> str:
+    over = spread(group, figure)
+    value = per_verified(group) if figure == "cpu_per_verified" else over and over.mean
+    return _form(value, form)
+
+
+def _form(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)

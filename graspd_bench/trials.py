@@ -1,0 +1,336 @@
+"""The displacement trial's numbers in MuJoCo: does the figure come from the grasp, or from the engine?
+
+The same frozen hand, 1 kg, 35 steps of 1/240 s under 9.8 m/s². What MuJoCo knows in another way: friction is per pair
+here and is what Bullet makes of two 3s, and nothing bounces, as in Bullet, where a hand of restitution 0 stops that.
+
+The drop trial: how far gravity moves an object in a hand that squeezes it, after 2 s in MuJoCo.
+
+Stands beside the papers' displacement (`displacement`), which knows neither motors nor effort limits: its hand is
+frozen, and 0.15 s are over before a slow slip shows. Same hand, object and physics as the hold trial.
+
+Things that lie free on a table: dropped until they rest, and one of them lifted out by a hand.
+
+The lift is the lift trial in a world where nothing is simplified: the object rests on the support and on the others,
+which are as free as it is. Where all of them are afterwards is kept, so that the next lift goes on from there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.model import HandModel
+from graspd_core.perception.scene import ObjectModel, moved_grasp
+from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_quaternion
+from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh
+from graspd_core.verify.early_stop import CHECK_EVERY, CREEPING, ObjectState
+from graspd_core.verify.hold_trial import DIRECTIONS, close_hand, diverged, moved, object_state
+from graspd_core.verify.lift_trial import LiftSettings, lift_trial
+from graspd_core.verify.world import (
+    OBJECT,
+    PROTOCOLS,
+    FreeBody,
+    Protocol,
+    World,
+    add_object,
+    add_others,
+    add_plane,
+    add_primitive,
+    build_world,
+    set_physics,
+    trial_data,
+)
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+TIMESTEP, STEPS = 1 / 240, 35
+GRAVITY, MASS, FRICTION = 9.8, 1.0, 3.0
+# Bullet multiplies the coefficients of the two bodies.
+_PAIR_FRICTION = (FRICTION**2, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenWorld:
+    """A hand without joints and a free object of 1 kg, compiled.
+
+    Attributes:
+        model: the `mujoco.MjModel`; every link of the hand is a body that is put where a posture says.
+        hand: the hand.
+        object_body: body id of the object.
+        center_of_mass: of the object, in its own frame [m].
+    """
+
+    model: Any
+    hand: HandModel
+    object_body: int
+    center_of_mass: Float[np.ndarray, "3"]
+
+
+def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh]) -> FrozenWorld:
+    """Compile the world of one hand and one object; `parts` are the object's convex parts, object frame [m]."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    spec.option.gravity = [0.0, 0.0, 0.0]
+    links = [spec.worldbody.add_body(name=f"link:{name}", mocap=True) for name in hand.link_names]
+    for index, primitive in enumerate(hand.primitives):
+        add_primitive(spec, links[primitive.link], primitive, f"hand:{index}", _PAIR_FRICTION)
+    heavy = replace(target, mass=MASS, inertia=target.inertia * (MASS / target.mass))
+    add_object(spec, heavy, parts, _PAIR_FRICTION)
+    model = spec.compile()
+    return FrozenWorld(model, hand, int(model.body(OBJECT).id), target.center_of_mass)
+
+
+def displacement_trial(
+    world: FrozenWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
+) -> float:
+    """Displacement of the object's centre of mass [m] after 35 steps of 1/240 s, mean over gravity's directions."""
+    import mujoco
+
+    moved = []
+    for direction in directions:
+        data = mujoco.MjData(world.model)
+        _place_links(world, data, posture)
+        data.xfrc_applied[world.object_body, :3] = GRAVITY * MASS * direction
+        mujoco.mj_step(world.model, data, STEPS)
+        mujoco.mj_kinematics(world.model, data)
+        moved.append(np.linalg.norm(data.xipos[world.object_body] - world.center_of_mass))
+    return float(np.mean(moved))
+
+
+def _place_links(world: FrozenWorld, data: Any, posture: Posture) -> None:
+    place, quaternion, joints = (
+        torch.as_tensor(part, dtype=torch.float64)
+        for part in (posture.position, posture.quaternion_wxyz, posture.joint_positions)
+    )
+    links = forward(make_kinematics(world.hand, "cpu", torch.float64), joints[None])[0]
+    base = SE3(rotation_from_quaternion(quaternion), place)
+    data.mocap_pos[:] = base.apply(links.translation).numpy()
+    data.mocap_quat[:] = quaternion_from_rotation(base.rotation @ links.rotation).numpy()
+
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+DROP_GRAVITY, DURATION = 9.8, 2.0
+# A trial along one direction ends here, and what never was in the hand counts as this too [m].
+LOST = 0.1
+# A direction ends when its displacement is known to this [m].
+TOLERANCE = 1e-4
+# Checks that a speed is taken over; how many times the change of what it foretells has to fit into the tolerance.
+_WINDOW, _SAFETY = 2, 4
+
+
+def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False) -> float:
+    """Displacement [m] of the object's centre of mass from the start of the trial, mean over six gravity directions.
+
+    The hand closes and squeezes as in the hold trial; then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
+    At most 10 cm: an object that moved so far is lost, and one that the hold trial would refuse is lost from the start.
+    A direction ends when what its speed foretells for 2 s no longer changes, to 0.1 mm, and the figure is what it
+    foretells, unless the protocol asks for the full length.
+    Directions that `stop` cut short count with what they came to.
+    """
+    import mujoco
+
+    grasp = moved_grasp(grasp, -world.origin)
+    with trial_data(world) as data:
+        if close_hand(world, data, grasp, protocol, np.zeros(2)):
+            return LOST
+        held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+        mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+        weight = DROP_GRAVITY * float(world.model.body_mass[world.object_body])
+        displaced = np.empty(len(DIRECTIONS))
+        for index, direction in enumerate(DIRECTIONS):
+            mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+            data.xfrc_applied[world.object_body, :3] = weight * direction
+            displaced[index] = _fall(world, data, protocol, stop)
+        return float(displaced.mean())
+
+
+def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool]) -> float:
+    """Simulate 2 s, or until the displacement is known or the object lost; returns the displacement then [m]."""
+    import mujoco
+
+    checks, states = round(DURATION / protocol.timestep / CHECK_EVERY), list[ObjectState]()
+    travel = 0.0
+    for _ in range(checks):
+        if stop():
+            break
+        mujoco.mj_step(world.model, data, CHECK_EVERY)
+        states.append(object_state(world, data))
+        travel = moved(world, states[-1])[0]
+        if diverged(data) or not travel < LOST:
+            return LOST
+        if not protocol.full_length and (end := _end(states, checks)) is not None:
+            return min(math.dist(end, world.center_of_mass), LOST)
+    return travel
+
+
+def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | None:
+    """Where the centre of mass will be at the end, as soft contacts creep evenly; None where that is not known."""
+    recent = states[-2 * _WINDOW - 1 :]
+    if len(recent) <= 2 * _WINDOW or not all(s.speed < CREEPING.speed and s.spin < CREEPING.spin for s in recent):
+        return None
+    first, middle, last = (np.asarray(state.center) for state in (recent[0], recent[_WINDOW], recent[-1]))
+    left = (checks - len(states)) / _WINDOW
+    end, before = last + left * (last - middle), middle + (left + 1) * (middle - first)
+    return end if _SAFETY * np.linalg.norm(end - before) < TOLERANCE else None
+
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+_FLOOR, _WALL = "floor", "wall"
+_GRAVITY = 9.81
+# What falls slowly neither bounces nor passes through thin walls: as in honey, it falls at 0.6 m/s [1/s], and turns as
+# slowly [1/s]; what has fallen is left in thinner honey, or balls would roll for minutes.
+_FALLING, _RESTING = (16.0, 16.0), (1.0, 4.0)
+# At rest for so many steps in a row, all of them slower than this [m/s], [rad/s].
+_SPEED, _SPIN, _STILL = 0.002, 0.05, 50
+Pose = Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """What came of a lift.
+
+    Attributes:
+        result: of the lift trial.
+        poses: of all things afterwards, in their order, seen from the table [m].
+        hand: where the hand ended, likewise; None where it never moved.
+    """
+
+    result: TrialResult
+    poses: tuple[Pose, ...]
+    hand: Posture | None
+
+
+def settle(
+    bodies: Sequence[FreeBody], *, wall: float | None = None, seconds: float = 4.0, protocol: Protocol | None = None
+) -> tuple[Pose, ...]:
+    """Let things come to rest on the table z = 0.
+
+    Args:
+        bodies: where they begin, not in each other.
+        wall: half the side of a square fence about the origin, within which they fall slowly; without it they lie
+            where they are and come to rest [m].
+        seconds: the most of simulated time.
+        protocol: physics.
+
+    Returns:
+        The poses at the end, the same for the same bodies.
+    """
+    import mujoco
+
+    if not bodies:
+        return ()
+    protocol = protocol or PROTOCOLS["standard"]
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    set_physics(spec.option, protocol)
+    spec.option.gravity = [0.0, 0.0, -_GRAVITY]
+    spec.memory = 2**27
+    add_plane(spec, _FLOOR, Plane(np.eye(3)[2], 0.0), protocol.friction)
+    for index, normal in enumerate(np.vstack([np.eye(3)[:2], -np.eye(3)[:2]]) if wall is not None else ()):
+        add_plane(spec, f"{_WALL} {index}", Plane(normal, -float(wall or 0.0)), protocol.friction)
+    names = add_others(spec, bodies, protocol.friction, np.zeros(3))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    _damp(model, names, *(_RESTING if wall is None else _FALLING))
+    still = 0
+    for _ in range(round(seconds / protocol.timestep)):
+        mujoco.mj_step(model, data)
+        speed = np.abs(data.qvel.reshape(-1, 6))
+        still = still + 1 if speed[:, :3].max() < _SPEED and speed[:, 3:].max() < _SPIN else 0
+        if still == _STILL:
+            break
+    return tuple(_pose(data, int(model.body(name).id)) for name in names)
+
+
+def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
+    """Let everything be slowed as in a liquid, whatever its mass and size."""
+    for name in names:
+        body = int(model.body(name).id)
+        first = int(model.joint(name).dofadr[0])
+        model.dof_damping[first : first + 3] = slow * model.body_mass[body]
+        model.dof_damping[first + 3 : first + 6] = turn * model.body_inertia[body].max()
+
+
+def lift_out(
+    hand: HandModel, bodies: Sequence[FreeBody], index: int, grasp: Grasp, protocol: Protocol, settings: LiftSettings
+) -> Lifted:
+    """Close the hand on one of the things, all of them as they lie on the table z = 0, and lift it.
+
+    Args:
+        grasp: in the frame of the table.
+        protocol: physics, and how far the thing may slip in the hand.
+    """
+    target, others = bodies[index], [body for k, body in enumerate(bodies) if k != index]
+    model, parts = placed(target)
+    world = build_world(hand, model, parts, protocol, Plane(np.eye(3)[2], 0.0), others=others)
+    watch = _Watch(world)
+    result = lift_trial(replace(world, watch=watch, spare=deque()), hand, grasp, protocol, settings=settings)
+    if watch.end is None:
+        return Lifted(result, tuple(body.pose for body in bodies), None)
+    moved, rest, posture = watch.end
+    poses = [*rest[:index], moved @ target.pose, *rest[index:]]
+    return Lifted(result, tuple(poses), posture)
+
+
+class _Watch:
+    """Remembers where all was at the last step, seen from the table, which sinks in a lift (lift_trial.py)."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.end: tuple[Pose, list[Pose], Posture] | None = None
+
+    def __call__(self, data: Any) -> None:
+        world, up = self._world, self._world.origin - data.mocap_pos[1]
+        body = int(world.model.body(OBJECT).id)
+        object_pose, rest = _pose(data, body), [_pose(data, other) for other in world.others]
+        for pose in (object_pose, *rest):
+            pose[:3, 3] += up
+        # The object's parts are where it lay, in a frame about the world's origin.
+        object_pose[:3, 3] -= object_pose[:3, :3] @ world.origin
+        posture = Posture(data.mocap_pos[0] + up, data.mocap_quat[0].copy(), data.qpos[world.joint_addresses])
+        self.end = object_pose, rest, posture
+
+
+def placed(body: FreeBody) -> tuple[ObjectModel, tuple[TriangleMesh, ...]]:
+    """A thing with its parts as it lies, in the world frame."""
+    turn, place = body.pose[:3, :3], body.pose[:3, 3]
+
+    def there(mesh: TriangleMesh) -> TriangleMesh:
+        return TriangleMesh(mesh.vertices @ turn.T + place, mesh.faces)
+
+    model = replace(
+        body.model,
+        mesh=there(body.model.mesh),
+        center_of_mass=turn @ body.model.center_of_mass + place,
+        inertia=turn @ body.model.inertia @ turn.T,
+    )
+    return model, tuple(there(part) for part in body.parts)
+
+
+def _pose(data: Any, body: int) -> Pose:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(data.xquat[body])).numpy()
+    pose[:3, 3] = data.xpos[body]
+    return pose

@@ -1,0 +1,101 @@
+"""The restriction that an arm can bring the hand there: which starts are drawn, which candidates are tried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from graspd_core.arms.arm import Arm, tip_hand
+from graspd_core.arms.arm_paths import LIFT, RETREAT, ArmTask, arm_paths, make_task, tip_poses
+from graspd_core.arms.inverse_kinematics import start_table, within_reach
+from graspd_core.errors import ConfigError
+from graspd_core.hands.model import HandModel
+from graspd_core.optimize.restrictions import BoundRestriction, Refusal
+from graspd_core.perception.scene import Scene
+from graspd_core.se3 import SE3, rotation_from_quaternion
+from graspd_core.types import Grasp
+
+# A base farther away than this is in another unit [m].
+_FARTHEST = 100.0
+# Fingers reach past the base link by no more than this [m].
+_HAND_LENGTH = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """An arm that stands somewhere: only grasps that it can come to, take and lift are tried (docs/arms.md).
+
+    Each grasp gets the arm's joint values along its way, `Grasp.arm`.
+
+    Attributes:
+        arm: from `load_arm`.
+        position: origin of the arm's base in the object frame [m].
+        quaternion_wxyz: turn of the arm's base there, unit.
+    """
+
+    arm: Arm
+    position: tuple[float, float, float]
+    quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    def bind(self, scene: Scene, hand: HandModel) -> BoundReach:
+        """See `Restriction`. Raises ConfigError: the base's pose is none, or nobody says how the hand is mounted."""
+        position, quaternion = (np.asarray(v, dtype=float) for v in (self.position, self.quaternion_wxyz))
+        if position.shape != (3,) or not np.isfinite(position).all() or np.abs(position).max() > _FARTHEST:
+            raise ConfigError(f"arm base: position {list(self.position)}; valid: three numbers up to {_FARTHEST:g} m")
+        length = float(np.linalg.norm(quaternion)) if quaternion.shape == (4,) else np.nan
+        if not abs(length - 1.0) <= 1e-2:
+            raise ConfigError(f"arm base: quaternion {list(self.quaternion_wxyz)}; valid: w x y z of length 1")
+        tip_hand(self.arm, hand)
+        base = SE3(rotation_from_quaternion(torch.as_tensor(quaternion)), torch.as_tensor(position))
+        return BoundReach(make_task(self.arm, hand, scene, base))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundReach(BoundRestriction):
+    """The reach of an arm in one scene with one hand."""
+
+    task: ArmTask
+
+    @property
+    def impossible(self) -> str:
+        """That the base is so far away that no posture comes near the object, or nothing where one may."""
+        task = self.task
+        longest = float(start_table(task.arm).features[:, :3].norm(dim=-1).max())
+        longest += float(tip_hand(task.arm, task.hand).translation.norm())
+        target = task.scene.object
+        away = float(np.linalg.norm(target.center_of_mass - task.base.translation.numpy())) - target.radius
+        if away <= longest + _HAND_LENGTH:
+            return ""
+        return (
+            f"the object is {away:.2f} m from the base of {task.arm.name}, which brings {task.hand.name} "
+            f"{longest:.2f} m far"
+        )
+
+    def starts(
+        self,
+        positions: Float[np.ndarray, "batch 3"],
+        quaternions: Float[np.ndarray, "batch 4"],
+        joints: Float[np.ndarray, "batch joints"],
+    ) -> Bool[np.ndarray, "batch"]:
+        """Which initial poses are no farther away than the arm reaches, nor nearer; retreated and lifted ones too."""
+        task, at = self.task, torch.as_tensor(positions)
+        rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
+        retreat = at - RETREAT * (rotation @ torch.as_tensor(task.hand.approach))
+        lift = at + LIFT * torch.as_tensor(task.up)
+        allowed = torch.arange(len(at))
+        for there in (at, retreat, lift):
+            tip = tip_poses(task, SE3(rotation[allowed], there[allowed]))
+            allowed = allowed[within_reach(start_table(task.arm), task.bounds, tip)]
+        return np.isin(np.arange(len(at)), allowed.numpy())
+
+    def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
+        """Each candidate with the arm's way, or why there is none."""
+        paths = arm_paths(self.task, grasps)
+        return [
+            Refusal(path) if isinstance(path, str) else replace(grasp, arm=path)
+            for grasp, path in zip(grasps, paths, strict=True)
+        ]

@@ -1,1 +1,0 @@
-"""Recordings: rosbag2 bags read without ROS, and what their messages hold as arrays."""

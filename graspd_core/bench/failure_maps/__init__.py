@@ -1,1 +1,0 @@
-"""Failure maps: success over two things that make grasping hard, a picture each."""

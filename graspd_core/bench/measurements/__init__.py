@@ -1,1 +1,0 @@
-"""One measurement each: what is asked, how it runs, what comes of it."""

@@ -1,0 +1,342 @@
+"""What every command that plans has in common: its options, what they stand for, and the lines at its end.
+
+Clouds for commands: out of files or bags, and into scenes.
+
+Options that restrict grasps: where a hand comes from, what it touches and keeps away from, what an arm reaches.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
+from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
+from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
+from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
+from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, preset_names
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.types import GraspResult, Outcome, Timing
+
+if TYPE_CHECKING:
+    from graspd_core.arms.reach import Reach
+    from graspd_core.optimize.restrictions import Restriction
+    from graspd_core.planning.regions import Region
+    from graspd_core.planning.steering import Steering
+
+
+# Metrics in the summary of a run.
+_SHOWN = ("penetration", "contact_area", "epsilon", "robustness")
+# Grasps that it lists; the others it counts.
+_FIRST = 3
+
+
+def add_planning_options(parser: argparse.ArgumentParser) -> None:
+    """Hand, number, method and trial of the grasps, and what is known of the object."""
+    parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="graspd hands lists the names")
+    parser.add_argument("-n", "--count", type=int, default=16, help="verified grasps wanted (default 16)")
+    parser.add_argument("--method", choices=METHODS, default=None)
+    parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--mass", type=float, default=0.1, metavar="KG", help="of the object (default 0.1)")
+    parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
+    parser.add_argument(
+        "--deadline", type=float, default=None, metavar="SEC", help="end with what there is then; loading counts"
+    )
+    parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
+    parser.add_argument("--robust", action="store_true", help="grasps that hold out of place too come first")
+    parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
+    parser.add_argument("--threads", type=int, default=1, help="of the optimiser and the trials (default 1)")
+
+
+def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:
+    """The settings, and the arguments of `plan_grasps` but for the deadline; sets torch's threads.
+
+    Raises:
+        ConfigError: an option is out of range, or the preset is unknown or malformed.
+    """
+    import torch
+
+    from graspd_core.planning.plan_grasps import check_request
+
+    request = {key: getattr(options, key) for key in ("count", "seed", "verify", "device")}
+    check_request(**request, deadline=options.deadline)
+    if options.threads < 1:
+        raise ConfigError(f"threads: {options.threads}; at least 1")
+    torch.set_num_threads(options.threads)
+    config = load_preset(options.preset)
+    if options.method:
+        config = config.with_method(options.method)
+    if options.robust:
+        config = dataclasses.replace(config, robust=dataclasses.replace(config.robust, rank=True))
+    return config, request
+
+
+def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> GraspResult:
+    """What a run comes to whose deadline passed while its object was loaded, from `began` on."""
+    taken = time.perf_counter() - began
+    return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
+
+
+def summary(result: GraspResult, wanted: int, different: int) -> str:
+    """A few lines for a person; so many of the good grasps are `different`."""
+    from graspd_core.verify.metrics import METRICS
+
+    good = good_grasps(result)
+    kind = "unverified" if any(not grasp.trials for grasp in result.grasps) else "verified"
+    ending = result.message or result.outcome.value
+    copies = f", {different} of them different" if different < good else ""
+    lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.grasps)} tried): {ending}"]
+    timing = result.timing
+    lines.append(
+        f"load {timing.load:.2f} s, sdf {timing.sdf:.2f} s, optimise {timing.optimise:.2f} s, "
+        f"verify {timing.verify:.2f} s, total {timing.total:.2f} s"
+        + (f", first verified after {timing.first_verified:.2f} s" if timing.first_verified else "")
+    )
+    for rank, grasp in enumerate(result.grasps[: min(good, _FIRST)]):
+        figures = [
+            METRICS[name].text(value) for name in _SHOWN if (value := (grasp.metrics or {}).get(name)) is not None
+        ]
+        lines.append(f"  #{rank}: {', '.join([f'{len(grasp.contacts)} contacts', *figures])}")
+    if good > _FIRST:
+        lines.append(f"  and {good - _FIRST} more")
+    return "\n".join(lines)
+
+
+def good_grasps(result: GraspResult) -> int:
+    """How many grasps are as sure as was asked for; they come first."""
+    return sum(grasp.usable for grasp in result.grasps)
+
+
+def exit_status(result: GraspResult) -> int:
+    """Enough grasps, fewer, or interrupted."""
+    if result.outcome is Outcome.CANCELLED:
+        return EXIT_INTERRUPTED
+    return EXIT_OK if result.outcome is Outcome.SUCCEEDED else EXIT_TOO_FEW
+
+
+# Views that are fused unasked: all are held in memory at once.
+MOST_VIEWS = 100
+
+
+def add_bag_options(parser: argparse.ArgumentParser) -> None:
+    """Which messages of a bag to take, and the frame to have them in."""
+    parser.add_argument("--topic", default=None, help="of clouds or depth images, where a bag has several")
+    parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="of the depth images' camera")
+    parser.add_argument("--frame", default=None, help="put clouds into this frame by the bag's /tf and /tf_static")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="take one cloud of N")
+    parser.add_argument("--limit", type=int, default=None, metavar="N", help="end after N clouds")
+
+
+def add_object_options(parser: argparse.ArgumentParser) -> None:
+    """Which of the things that a cloud shows is meant, and how clouds become scenes."""
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
+        help="a point on the object, in metres; else what is nearest the axis of view",
+    )  # fmt: skip
+    which.add_argument("--alone", action="store_true", help="the clouds show the object and nothing else")
+    parser.add_argument(
+        "--scene", type=Path, default=None, metavar="FILE.yaml",
+        help="settings of segmentation, reconstruction and obstacles (docs/clouds.md)",
+    )  # fmt: skip
+
+
+def target_of(options: argparse.Namespace):
+    """The `Target` that the options name, if any."""
+    from graspd_core.perception.segment.target_selection import Target
+
+    return Target(point=np.array(options.target)) if options.target else None
+
+
+def scene_config_of(options: argparse.Namespace) -> SceneConfig:
+    """The settings in the file that the options name, else the defaults. Raises ConfigError."""
+    return load_scene_config(options.scene) if options.scene else SceneConfig()
+
+
+def check_bag_options(options: argparse.Namespace) -> None:
+    """Refuse what `bag_views` could not use. Raises ConfigError."""
+    for name in ("every", "limit"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ConfigError(f"{name}: {value} clouds; at least 1")
+
+
+def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
+    """The clouds that the options choose, each with what it shows or why it cannot be used.
+
+    Raises:
+        BagError: nothing can be read, or the frame wanted is not in the bag.
+    """
+    transforms = None
+    frames = read_frames(
+        path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit
+    )
+    for frame in frames:
+        if transforms is None and options.frame and options.frame.removeprefix("/") != frame.frame.removeprefix("/"):
+            transforms = read_transforms(path)
+            if options.frame.removeprefix("/") not in transforms.frames():
+                known = ", ".join(transforms.frames())
+                raise BagError(f"{path}: no frame {options.frame!r}; its transforms know: {known}")
+        try:
+            yield frame, frame.view(transforms, options.frame)
+        except (CloudError, TransformError) as error:
+            yield frame, str(error)
+
+
+def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
+    """The chosen clouds as views of one scene, less those that cannot be used, which stderr counts.
+
+    Raises:
+        BagError: nothing can be read, none can be used, they are not in one frame, or they are too many and no limit
+            is set.
+    """
+    views, names, refusals = [], set(), []
+    for frame, seen in bag_views(path, options):
+        if isinstance(seen, str):
+            refusals.append(f"cloud {frame.index}: {seen}")
+            continue
+        if len(views) == MOST_VIEWS and options.limit is None:
+            raise BagError(f"{path}: more than {MOST_VIEWS} clouds to fuse; choose some with --every or --limit")
+        views.append(seen)
+        names.add(options.frame or frame.frame)
+    if refusals and not views:
+        raise BagError(f"{path}: {refusals[0]}")
+    if refusals:
+        count = len(views) + len(refusals)
+        print(f"graspd: {len(refusals)} of {count} clouds left out, the first {refusals[0]}", file=sys.stderr)
+    if len(names) > 1:
+        raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
+    return tuple(views)
+
+
+def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
+    """The views of a cloud file, or those that the options choose from a bag; the first one unless they say more."""
+    from graspd_core.perception.cloud import cloud_files
+
+    if not is_bag(path):
+        return cloud_files.load_views(path)
+    chosen = argparse.Namespace(**{**vars(options), "limit": options.limit or 1})
+    return merged_views(path, chosen)
+
+
+_FORMS = "box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"
+
+
+def add_restriction_options(parser: argparse.ArgumentParser) -> None:
+    """Steering, and an arm."""
+    _add_steering_options(parser)
+    _add_arm_options(parser)
+
+
+def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
+    """What the options ask for; none where they ask for nothing.
+
+    Raises:
+        ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
+    """
+    return (*_steering(options), *_reach(options))
+
+
+def _add_steering_options(parser: argparse.ArgumentParser) -> None:
+    """Approach, roll, region and avoided boxes; all in the object's frame."""
+    group = parser.add_argument_group("steering (docs/usage.md)")
+    group.add_argument(
+        "--approach", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
+        help="direction that the hand moves in towards the object",
+    )  # fmt: skip
+    group.add_argument("--approach-angle", type=float, default=None, metavar="DEG", help="either way (default 30)")
+    group.add_argument("--roll", type=float, default=None, metavar="DEG", help="of the hand about its approach")
+    group.add_argument("--roll-tolerance", type=float, default=None, metavar="DEG", help="either way (default 15)")
+    group.add_argument(
+        "--region", nargs="+", default=None, metavar="REGION",
+        help=f"where contacts may be: {_FORMS}: a cloud of points and how near to them [m]",
+    )  # fmt: skip
+    group.add_argument(
+        "--avoid", type=float, nargs=6, action="append", default=[], metavar=("X", "Y", "Z", "SX", "SY", "SZ"),
+        help="a box that no link enters: middle and edges [m]; may be given again",
+    )  # fmt: skip
+
+
+def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
+    if options.approach is None:
+        _refuse_alone("approach-angle", options.approach_angle, "approach")
+    if options.roll is None:
+        _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
+    asked = (options.approach, options.roll, options.region)
+    if all(value is None for value in asked) and not options.avoid:
+        return ()
+    from graspd_core.planning.regions import Box
+    from graspd_core.planning.steering import Steering
+
+    angles = {"approach_angle": options.approach_angle, "roll": options.roll, "roll_tolerance": options.roll_tolerance}
+    wishes: dict[str, Any] = {name: float(np.radians(value)) for name, value in angles.items() if value is not None}
+    region = None if options.region is None else _region(options.region)
+    avoid = [Box(values[:3], values[3:]) for values in options.avoid]
+    return (Steering(approach_direction=options.approach, region=region, avoid=avoid, **wishes),)
+
+
+def _refuse_alone(name: str, value: float | None, other: str) -> None:
+    if value is not None:
+        raise ConfigError(f"--{name}: it needs --{other}")
+
+
+def _region(words: list[str]) -> Region:
+    from graspd_core.perception.cloud.cloud_files import load_views
+    from graspd_core.planning.regions import Box, NearPoints, Sphere
+
+    kind, values = words[0], words[1:]
+    counts = {"box": (6,), "sphere": (4,)}.get(kind, (0, 1))
+    try:
+        numbers = [float(value) for value in values]
+    except ValueError:
+        numbers = []
+    unknown = kind not in ("box", "sphere") and not Path(kind).is_file()
+    if unknown or len(values) not in counts or len(numbers) != len(values):
+        raise ConfigError(f"--region: {' '.join(words)}; valid: {_FORMS}")
+    if kind == "box":
+        return Box(numbers[:3], numbers[3:])
+    if kind == "sphere":
+        return Sphere(numbers[:3], numbers[3])
+    points = np.concatenate([view.points for view in load_views(kind)])
+    return NearPoints(points, *numbers)
+
+
+def _add_arm_options(parser: argparse.ArgumentParser) -> None:
+    """Which arm, and where it stands."""
+    parser.add_argument(
+        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
+    )
+    parser.add_argument(
+        "--arm-base",
+        type=float,
+        nargs="+",
+        default=None,
+        metavar="N",
+        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
+    )
+
+
+def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
+    if options.arm is None and options.arm_base is None:
+        return ()
+    if options.arm is None:
+        raise ConfigError("--arm-base: there is no arm; give --arm NAME or FILE")
+    from graspd_core.arms.arm import load_arm
+    from graspd_core.arms.reach import Reach
+
+    arm, base = load_arm(options.arm), options.arm_base
+    if base is None:
+        raise ConfigError("--arm: say where it stands, --arm-base X Y Z or X Y Z QW QX QY QZ")
+    if len(base) not in (3, 7):
+        raise ConfigError(f"--arm-base: {len(base)} numbers; valid: X Y Z, or X Y Z QW QX QY QZ")
+    x, y, z, *turn = base
+    w, i, j, k = turn or (1.0, 0.0, 0.0, 0.0)
+    return (Reach(arm, (x, y, z), (w, i, j, k)),)

@@ -1,1 +1,0 @@
-"""Contact forces and wrenches."""

@@ -1,1 +1,0 @@
-"""`graspd dataset` (docs/dataset.md): blocks of grasps made on Ray, kept as Parquet files."""

@@ -1,1 +1,0 @@
-"""Files that graspd writes and reads: grasps, pages."""

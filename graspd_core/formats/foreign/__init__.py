@@ -1,1 +1,0 @@
-"""Grasps in the files of others."""

@@ -1,0 +1,1 @@
+"""Files of grasps, and recordings."""

@@ -1,0 +1,421 @@
+"""What sensor messages hold, as arrays: those of a bag, and any other objects with the attributes that ROS names.
+
+Reading rosbag2 recordings (mcap and sqlite3) by the rosbags library: no ROS installation, no DDS.
+
+The order is the recording's, so that the same bag gives the same clouds every time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import BagError, CloudError, TransformError
+from graspd_core.perception.cloud.camera import (
+    ENCODINGS,
+    PinholeCamera,
+    camera_from_calibration,
+    cloud_from_depth,
+    depth_from_bytes,
+)
+from graspd_core.perception.cloud.point_cloud import (
+    CloudLayout,
+    PointCloud,
+    organised_points,
+    points_from_layout,
+    transform_cloud,
+)
+from graspd_core.transforms import SECOND, TransformBuffer
+
+
+def stamp_of(message: Any) -> int:
+    """Time of a stamped message's header [ns]."""
+    stamp = message.header.stamp
+    return stamp.sec * SECOND + stamp.nanosec
+
+
+def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
+    """The finite points of a sensor_msgs/PointCloud2, in row order, in the cloud's own frame and unit.
+
+    Raises:
+        CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
+    """
+    return points_from_layout(_layout(message))
+
+
+def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
+    """Every point of a sensor_msgs/PointCloud2 in its place, NaN and infinite ones too. Raises CloudError as above."""
+    return organised_points(_layout(message))
+
+
+def _layout(message: Any) -> CloudLayout:
+    fields = {field.name: (field.offset, field.datatype) for field in message.fields}
+    return CloudLayout(
+        width=message.width,
+        height=message.height,
+        point_step=message.point_step,
+        row_step=message.row_step,
+        is_bigendian=bool(message.is_bigendian),
+        fields=fields,
+        data=memoryview(message.data),
+    )
+
+
+def cloud_from_message(message: Any) -> PointCloud:
+    """A sensor_msgs/PointCloud2 as seen from the origin of its frame. Raises CloudError as `points_from_message`."""
+    # REP 103: the frames of cameras whose z axis is the optical axis are called so.
+    optical = message.header.frame_id.endswith("optical_frame")
+    return PointCloud(points_from_message(message), np.zeros(3), np.array([0.0, 0.0, 1.0]) if optical else None)
+
+
+def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
+    """The camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P without any for a rectified one.
+
+    Binning and region of interest count: the camera is that of the image as sent.
+
+    Raises:
+        CloudError: it is not calibrated, or of a distortion model that is not known.
+    """
+    # Drivers of cameras without distortion often leave P empty.
+    by_projection = rectified and info.p[0] > 0
+    matrix = np.array(info.p).reshape(3, 4)[:, :3] if by_projection else np.array(info.k, dtype=float).reshape(3, 3)
+    if not np.isfinite(matrix).all():
+        raise CloudError(f"camera: its {'P' if by_projection else 'K'} has numbers that are not finite")
+    roi, bins = info.roi, np.array([max(info.binning_x, 1), max(info.binning_y, 1)])
+    shown = matrix.copy()
+    shown[:2, 2] -= roi.x_offset, roi.y_offset
+    shown[:2] /= bins[:, None]
+    width, height = (roi.width or info.width) // bins[0], (roi.height or info.height) // bins[1]
+    # Once it is taken out, its model does not matter: that of a fisheye lens is not known here.
+    distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
+    return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, model)
+
+
+def depth_from_message(image: Any) -> Float[np.ndarray, "height width"]:
+    """Depth [m] of a sensor_msgs/Image, 0 where there is none. Raises CloudError: no depth image, or a broken one."""
+    return depth_from_bytes(
+        memoryview(image.data),
+        width=image.width,
+        height=image.height,
+        step=image.step,
+        encoding=image.encoding,
+        is_bigendian=bool(image.is_bigendian),
+    )
+
+
+def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
+    """What a depth image and its sensor_msgs/CameraInfo show, in the camera's optical frame.
+
+    Args:
+        image: a sensor_msgs/Image of an encoding for depth.
+        info: the camera's calibration, for an image of the same size.
+        rectified: whether distortion has been taken out of the image.
+
+    Raises:
+        CloudError: the image is no depth, is broken, shows nothing, or does not fit the calibration.
+    """
+    cloud = cloud_from_depth(depth_from_message(image), camera_from_message(info, rectified=rectified))
+    if len(cloud.points) == 0:
+        raise CloudError(f"depth image: none of its {image.width} x {image.height} pixels has a depth")
+    return cloud
+
+
+def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
+    """Put a tf2_msgs/TFMessage into a buffer; transforms that make no sense are left out and named, one line each."""
+    refused = []
+    for item in message.transforms:
+        try:
+            pose = _pose(item.transform)
+            buffer.add(item.header.frame_id, item.child_frame_id, pose, stamp_of(item), static)
+        except TransformError as error:
+            refused.append(str(error))
+    return tuple(refused)
+
+
+def _pose(transform: Any) -> Float[np.ndarray, "4 4"]:
+    """The matrix of a geometry_msgs/Transform; NaN where its quaternion is no rotation."""
+    from scipy.spatial.transform import Rotation
+
+    turn, move = transform.rotation, transform.translation
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    pose = np.eye(4)
+    pose[:3, 3] = move.x, move.y, move.z
+    # A driver that leaves the quaternion at zero, or far from unit length, says nothing that could be trusted.
+    usable = np.isfinite(quaternion).all() and abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) < 1e-2
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix() if usable else np.nan
+    return pose
+
+
+BAG_ENDINGS = ("mcap", "db3")
+CLOUD, IMAGE, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """One topic of a recording: its name, the type of its messages, and how many there are."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class BagFrame:
+    """One recorded cloud or depth image, not yet decoded.
+
+    Attributes:
+        index: its place among the topic's messages.
+        stamp: time in its header [ns].
+        frame: the frame in which it is recorded.
+        topic: the topic it was recorded on.
+        message: a PointCloud2 or a depth Image.
+        info: CameraInfo of a depth image.
+    """
+
+    index: int
+    stamp: int
+    frame: str
+    topic: str
+    message: Any
+    info: Any = None
+
+    def view(self, transforms: TransformBuffer | None = None, target: str | None = None) -> PointCloud:
+        """What the camera saw, in its own frame or in `target`.
+
+        Raises:
+            CloudError: the message is broken or shows nothing.
+            TransformError: where the frame stood in `target` is not known for that time.
+        """
+        if self.info is None:
+            cloud = cloud_from_message(self.message)
+        else:
+            # REP 118 and image_pipeline: rectified images say so in the last part of their name.
+            rectified = re.search(r"(^|_)rect(_|$)", self.topic.rsplit("/", 1)[-1]) is not None
+            cloud = cloud_from_depth_message(self.message, self.info, rectified=rectified)
+        if target is None or target.removeprefix("/") == self.frame.removeprefix("/"):
+            return cloud
+        if transforms is None:
+            raise TransformError(f"transform {self.frame} -> {target}: no transforms are given")
+        # A driver that does not stamp its messages leaves zero: then the newest transform has to do.
+        return transform_cloud(cloud, transforms.lookup(target, self.frame, self.stamp or None))
+
+
+def is_bag(path: str | Path) -> bool:
+    """Whether a path looks like a recording: a storage file, or a directory with one or its metadata in it."""
+    path = Path(path)
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or bool(_storage_files(path))
+    return path.suffix.lower().lstrip(".") in BAG_ENDINGS
+
+
+def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
+    """The topics of a recording, by name. Raises BagError: not a bag, or a broken one."""
+    with _opened(path) as reader:
+        return _topics(reader)
+
+
+def read_transforms(path: str | Path) -> TransformBuffer:
+    """All that a recording says of frames (/tf and /tf_static), from its beginning to its end.
+
+    Raises:
+        BagError: not a bag, a broken one, or one without transforms.
+    """
+    buffer = TransformBuffer(history=None)
+    with _opened(path) as reader:
+        connections = [c for c in reader.connections if c.msgtype == TRANSFORMS]
+        if not any(c.msgcount for c in connections):
+            raise BagError(f"{path}: holds no transforms (/tf, /tf_static), so nothing can be put into another frame")
+        for connection, _, raw in _messages(path, reader, connections):
+            message = _decode(path, reader, connection, raw)
+            add_transforms(buffer, message, static=connection.topic.endswith("tf_static"))
+    return buffer
+
+
+def read_frames(
+    path: str | Path,
+    *,
+    topic: str | None = None,
+    info_topic: str | None = None,
+    every: int = 1,
+    limit: int | None = None,
+) -> Iterator[BagFrame]:
+    """The clouds of a recording, or its depth images with their camera, in the order of recording.
+
+    Args:
+        path: a rosbag2 directory, or one of its storage files (.mcap, .db3).
+        topic: of PointCloud2 or of depth images; None takes the only one there is, clouds before depth images.
+        info_topic: CameraInfo of the depth images; None takes `camera_info` beside them, or the only one there is.
+        every: take one of so many.
+        limit: end after so many taken.
+
+    Raises:
+        BagError: not a bag, a broken one, or the topic is missing, ambiguous, empty or of another type.
+    """
+    with _opened(path) as reader:
+        chosen = _choose(path, reader, topic)
+        connections = [c for c in reader.connections if c.topic == chosen.name]
+        info = None
+        if chosen.type == IMAGE:
+            info_name = _info_topic(path, reader, chosen.name, info_topic)
+            infos = [c for c in reader.connections if c.topic == info_name]
+            connections += infos
+            # The calibration may be recorded a moment after the first image.
+            info = _first(path, reader, info_name)
+        index = taken = 0
+        for connection, _, raw in _messages(path, reader, connections):
+            if connection.msgtype == INFO:
+                info = _decode(path, reader, connection, raw)
+                continue
+            if index % every == 0:
+                if limit is not None and taken == limit:
+                    return
+                message = _decode(path, reader, connection, raw)
+                yield BagFrame(index, stamp_of(message), message.header.frame_id, chosen.name, message, info)
+                taken += 1
+            index += 1
+
+
+def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
+    """Recorded messages as they lie there (CDR) and their time of recording [ns]; all topics, or those named.
+
+    Raises:
+        BagError: not a bag, a broken one, or a topic that is not in it.
+    """
+    with _opened(path) as reader:
+        known = {topic.name: topic for topic in _topics(reader)}
+        for name in topics:
+            if name not in known:
+                raise BagError(f"{path}: no topic {name!r}; it has: {', '.join(known) or 'none'}")
+        connections = [c for c in reader.connections if not topics or c.topic in topics]
+        for connection, time, raw in _messages(path, reader, connections):
+            yield known[connection.topic], time, bytes(raw)
+
+
+@cache
+def jazzy_types() -> Any:
+    """The message types of ROS 2 Jazzy, for bags that do not carry their own definitions."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
+    from rosbags.highlevel import AnyReader
+
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f"{path}: no such bag")
+    if not is_bag(path):
+        kinds = "a directory of rosbag2, or a file ending in " + " or ".join(f".{e}" for e in BAG_ENDINGS)
+        raise BagError(f"{path}: not a bag; a bag is {kinds}")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        # The recorder was killed before it wrote the metadata: its storage may still be whole.
+        files = _storage_files(path)
+        if len(files) > 1:
+            raise BagError(f"{path}: no metadata.yaml and {len(files)} storage files; give one of them")
+        path = files[0]
+    reader: Any = None
+    try:
+        reader = AnyReader([path], default_typestore=jazzy_types())
+        reader.open()
+    # The library lets through whatever a spoilt file brings about in it: struct, sqlite3, yaml, assertion errors.
+    except Exception as error:
+        raise BagError(f"{path}: not a readable bag, or cut short ({_first_line(error)})") from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, Any]]:
+    """Messages in order of their times of recording; those of one time in the order of the file."""
+    if not connections:
+        return
+    messages = reader.messages(connections=connections)
+    while True:
+        try:
+            item = next(messages, None)
+        except Exception as error:
+            raise BagError(f"{path}: broken or cut short ({_first_line(error)})") from error
+        if item is None:
+            return
+        yield item
+
+
+def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
+    """The message; its type as Jazzy defines it, else as the bag does.
+
+    A bag that gives a known type other fields would else make messages that nobody here can read.
+    """
+    kind, known = connection.msgtype, jazzy_types()
+    types = known if kind in known.fielddefs else reader.typestore
+    try:
+        return types.deserialize_cdr(raw, kind)
+    except Exception as error:
+        raise BagError(f"{path}: a message on {connection.topic} is broken ({_first_line(error)})") from error
+
+
+def _topics(reader: Any) -> tuple[BagTopic, ...]:
+    counts: dict[tuple[str, str], int] = {}
+    for c in reader.connections:
+        counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
+    return tuple(BagTopic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+
+def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
+    topics = _topics(reader)
+    clouds = [t for t in topics if t.type == CLOUD and t.count]
+    images = [t for t in topics if t.type == IMAGE and t.count and (t.name == name or _is_depth(path, reader, t))]
+    offered = ", ".join(t.name for t in (*clouds, *images)) or "none"
+    if name is not None:
+        found = next((t for t in (*clouds, *images) if t.name == name), None)
+        if found is None:
+            raise BagError(f"{path}: no clouds or depth images on {name!r}; topics with some: {offered}")
+        return found
+    candidates = clouds or images
+    if not candidates:
+        have = ", ".join(f"{t.name} ({t.type.rsplit('/', 1)[-1]})" for t in topics) or "none"
+        raise BagError(f"{path}: no topic with clouds or depth images; it has: {have}")
+    if len(candidates) > 1:
+        raise BagError(f"{path}: several topics could be meant, name one: {offered}")
+    return candidates[0]
+
+
+def _is_depth(path: str | Path, reader: Any, topic: BagTopic) -> bool:
+    return _first(path, reader, topic.name).encoding in ENCODINGS
+
+
+def _first(path: str | Path, reader: Any, topic: str) -> Any:
+    """The first message of a topic that the recording says has some."""
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection, _, raw in _messages(path, reader, connections):
+        return _decode(path, reader, connection, raw)
+    raise BagError(f"{path}: its metadata counts messages on {topic}, but its storage has none")
+
+
+def _info_topic(path: str | Path, reader: Any, image: str, name: str | None) -> str:
+    known = [t.name for t in _topics(reader) if t.type == INFO and t.count]
+    wanted = name or image.rsplit("/", 1)[0] + "/camera_info"
+    if wanted in known:
+        return wanted
+    if name is None and len(known) == 1:
+        return known[0]
+    raise BagError(f"{path}: no camera info on {wanted!r} for {image}; topics with some: {', '.join(known) or 'none'}")
+
+
+def _storage_files(path: Path) -> list[Path]:
+    return sorted(file for ending in BAG_ENDINGS for file in path.glob(f"*.{ending}"))
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), "") or type(error).__name__

@@ -1,0 +1,330 @@
+"""The file format `graspd/grasps`, version 2 (docs/format.md): write a result.
+
+Read files of the format `graspd/grasps`, versions 1 and 2 (docs/format.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import tempfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from graspd_core.errors import ConfigError, FormatError, shown
+from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
+from graspd_core.optimize.plan_config import PlanConfig, to_mapping
+from graspd_core.perception.scene import ObjectModel
+from graspd_core.runtime.disk_cache import save_bytes
+from graspd_core.types import ARM_STAGES, ArmPath, Contact, Grasp, GraspMetrics, GraspResult, Posture, TrialResult
+from graspd_core.verify.metrics import METRICS
+
+FORMAT, VERSION = "graspd/grasps", 2
+_LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
+
+
+def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig) -> dict[str, Any]:
+    """A result as JSON-ready values; lengths in metres, angles in radians, forces in newtons unless a key says so."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "units": "m, rad, N",
+        "outcome": {
+            "name": result.outcome.name,
+            "message": result.message or result.outcome.value,
+            "warnings": list(result.warnings),
+            "next_view": result.next_view if result.next_view is None else result.next_view.tolist(),
+        },
+        "hand": _hand(hand),
+        "object": {
+            "source": target.source,
+            "sha256": target.sha256,
+            "center_of_mass": target.center_of_mass.tolist(),
+            "mass": target.mass,
+            "friction": target.friction,
+            "scale": target.scale,
+            "support": result.support
+            and {"normal": _list(result.support.normal), "offset": float(result.support.offset)},
+        },
+        "config": to_mapping(config),
+        "seed": result.seed,
+        "method": result.method,
+        "versions": _versions(),
+        "timing": dataclasses.asdict(result.timing),
+        "audits": dataclasses.asdict(result.audits),
+        "refused": dict(result.refused),
+        "grasps": [_grasp(rank, grasp, hand) for rank, grasp in enumerate(result.grasps)],
+    }
+
+
+def _hand(hand: HandModel) -> dict[str, Any]:
+    """Whose joints these are, which of them follow others, and where the hand sits on an arm."""
+    return {
+        "name": hand.name,
+        "urdf": hand.urdf,
+        "base_link": hand.base_link,
+        "joint_names": list(all_joint_names(hand)),
+        "mimic": [
+            {"joint": m.name, "of": hand.joint_names[m.joint], "multiplier": m.multiplier, "offset": m.offset}
+            for m in hand.mimics
+        ],
+        "mount": hand.mount and dataclasses.asdict(hand.mount),
+    }
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a path that no file can be written to, before the work that would be lost; makes missing directories.
+
+    Raises:
+        ConfigError: the path is a directory, or its directory cannot be made or written to.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a directory; give the name of a file to write")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def save_result(
+    path: str | Path,
+    result: GraspResult,
+    target: ObjectModel,
+    hand: HandModel,
+    config: PlanConfig,
+    *,
+    frame: str = "",
+    stamp: float | None = None,
+) -> None:
+    """Write a result; the file appears whole or not at all. `frame` and `stamp` [s] name what its poses are in."""
+    document = result_document(result, target, hand, config)
+    document |= {"frame": frame} if frame else {}
+    document |= {"stamp": stamp} if stamp is not None else {}
+    # NaN is not JSON: a document that held one must never be written.
+    save_text(Path(path), json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all; makes missing directories."""
+    save_bytes(path, text.encode())
+
+
+def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
+    def joints(posture: Posture) -> list[float]:
+        return _list(all_joint_positions(hand, posture.joint_positions))
+
+    return {
+        "rank": rank,
+        "verdict": str(grasp.verdict),
+        "reason": grasp.reason,
+        "score": grasp.score,
+        "probability": grasp.probability,
+        "position": _list(grasp.grasp.position),
+        "quaternion_wxyz": _list(grasp.grasp.quaternion_wxyz),
+        "joint_positions": joints(grasp.grasp),
+        "pregrasp_joint_positions": joints(grasp.pregrasp),
+        "squeeze_joint_positions": joints(grasp.squeeze),
+        "pregrasp_position": _list(grasp.pregrasp.position),
+        "pregrasp_quaternion_wxyz": _list(grasp.pregrasp.quaternion_wxyz),
+        "contacts": [{"link": c.link, "position": list(c.position), "normal": list(c.normal)} for c in grasp.contacts],
+        "arm": grasp.arm and _arm(grasp.arm),
+        **grasp_figures(grasp),
+    }
+
+
+def _arm(path: ArmPath) -> dict[str, Any]:
+    """The arm's way, and the waypoint at which it is at each stage."""
+    stages = dict(zip(ARM_STAGES, path.stages, strict=True))
+    return {"joint_names": list(path.joint_names), "positions": path.positions.tolist(), "stages": stages}
+
+
+def grasp_figures(grasp: Grasp) -> dict[str, Any]:
+    """Metrics and trials of a grasp as JSON-ready values.
+
+    Every metric of the registry has a key, which names its unit; trials are in [m] and [rad]. What was not measured and
+    what is not finite is null.
+    """
+    metrics = grasp.metrics or {}
+    return {
+        "metrics": {row.key: _finite(metrics.get(name), row.scale) for name, row in METRICS.items()},
+        "trials": [
+            {**dataclasses.asdict(t), "displacement": _finite(t.displacement), "rotation": _finite(t.rotation)}
+            for t in grasp.trials
+        ],
+    }
+
+
+def _finite(value: float | None, scale: float = 1.0) -> float | None:
+    return value * scale if value is not None and np.isfinite(value) else None
+
+
+def _list(values: np.ndarray) -> list[float]:
+    return [float(v) for v in values]
+
+
+def _versions() -> dict[str, str]:
+    versions = {}
+    for name in _LIBRARIES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
+    """Read the grasps of a file that `save_result` wrote, in rank order.
+
+    Raises:
+        FormatError: missing, not of this format or version, or a grasp in it is malformed.
+    """
+    return grasps_of(load_document(path))
+
+
+def load_document(path: str | Path) -> dict[str, Any]:
+    """Read a grasps file.
+
+    Raises:
+        FormatError: missing, not JSON, of another format or of an unknown version.
+    """
+    path = Path(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise FormatError(f"{path}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not JSON: {error}") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FormatError(f"{path}: not a {FORMAT} file")
+    if document.get("version") not in (1, VERSION):
+        version = shown(document.get("version"))
+        raise FormatError(f"{path}: version {version} is unknown; this reader knows 1 and {VERSION}")
+    return document
+
+
+def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
+    """The grasps of a document that `load_document` read, in rank order; the squeeze has the grasp's base pose.
+
+    Joint positions are those of the actuated joints, as everywhere in graspd: coupled ones follow from them. Metrics
+    that this version does not know are left out.
+
+    Raises:
+        FormatError: a grasp lacks a key, or holds something there that is of the wrong kind or not finite.
+    """
+    try:
+        hand = document["hand"]
+        # Files written before joints could be coupled have no such key.
+        coupled = {mimic["joint"] for mimic in hand.get("mimic", ())}
+        actuated = np.array([name not in coupled for name in hand["joint_names"]], dtype=bool)
+        upgrade = _from_version_1 if document.get("version") == 1 else dict
+        return tuple(_grasp_of(upgrade(values), actuated) for values in document["grasps"])
+    except KeyError as error:
+        raise FormatError(f"grasps: a grasp lacks the key {shown(error.args[0])}") from None
+    # A number of JSON may be larger than any float.
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise FormatError(f"grasps: {' '.join(str(error).split())[:300]}") from None
+
+
+def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> Grasp:
+    def posture(*keys: str) -> Posture:
+        if len(values[keys[2]]) != actuated.size:
+            raise ValueError(f"{keys[2]} has {len(values[keys[2]])} values for {actuated.size} joints")
+        sizes = (3, 4, actuated.size)
+        position, quaternion, joints = (_numbers_of(values, key, n) for key, n in zip(keys, sizes, strict=True))
+        if abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) > 0.01:
+            raise ValueError(f"{keys[1]} is no unit quaternion: {quaternion.tolist()}")
+        return Posture(position, quaternion, joints[actuated])
+
+    grasp = Grasp(
+        pregrasp=posture("pregrasp_position", "pregrasp_quaternion_wxyz", "pregrasp_joint_positions"),
+        grasp=posture("position", "quaternion_wxyz", "joint_positions"),
+        squeeze=posture("position", "quaternion_wxyz", "squeeze_joint_positions"),
+        contacts=tuple(_contact_of(contact) for contact in values["contacts"]),
+        score=float(_numbers_of(values, "score")),
+        metrics=_metrics_of(values["metrics"]),
+        trials=tuple(_trial_of(trial) for trial in values["trials"]),
+        # Files written before clouds were doubted have no such key.
+        probability=_scaled({"probability": None, **values}, "probability", 1.0),
+        # Nor those written before an arm could be given.
+        arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
+    )
+    if values["verdict"] != grasp.verdict:
+        raise ValueError(f"verdict: {shown(values['verdict'])}; by its trials the grasp is {grasp.verdict}")
+    return grasp
+
+
+def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
+    """A grasp of version 1 with its trials as version 2 writes them; the reason was that of the last trial."""
+    # Files written before there was a lift trial have no such key.
+    tried = {name: values["metrics"].get(name) for name in ("hold", "lift")}
+    tried = {name: trial for name, trial in tried.items() if trial is not None}
+    trials = [
+        {
+            "name": name,
+            "passed": passed,
+            "displacement": _scaled(trial, "max_displacement_cm", 0.01),
+            "rotation": _scaled(trial, "max_rotation_deg", math.radians(1)),
+            "reason": "" if passed else values["reason"],
+        }
+        for name, trial in tried.items()
+        for passed in [values["verdict"] == "verified" or name != list(tried)[-1]]
+    ]
+    return {**values, "trials": trials}
+
+
+def _metrics_of(values: dict[str, Any]) -> GraspMetrics | None:
+    """The metrics of the registry; None where none was measured."""
+    read = {name: _scaled(values, row.key, 1 / row.scale) for name, row in METRICS.items()}
+    return None if set(read.values()) <= {None} else GraspMetrics(read)
+
+
+def _trial_of(values: dict[str, Any]) -> TrialResult:
+    if not isinstance(values["passed"], bool):
+        raise ValueError(f"passed: {shown(values['passed'])}; expected true or false")
+    # What was not finite was written as null.
+    moved = [_scaled(values, key, 1.0) for key in ("displacement", "rotation")]
+    displacement, rotation = (math.inf if value is None else value for value in moved)
+    return TrialResult(str(values["name"]), values["passed"], displacement, rotation, str(values["reason"]))
+
+
+def _scaled(values: dict[str, Any], key: str, factor: float) -> float | None:
+    """A number times `factor`; None where there is none."""
+    return None if values.get(key) is None else float(_numbers_of(values, key)) * factor
+
+
+def _arm_of(values: dict[str, Any]) -> ArmPath:
+    names, rows = tuple(map(str, values["joint_names"])), len(values["positions"])
+    positions = _numbers_of(values, "positions", rows, len(names))
+    first, second, third, fourth = (int(values["stages"][stage]) for stage in ARM_STAGES)
+    if not 0 <= first <= second <= third <= fourth < rows:
+        raise ValueError(f"arm.stages: {shown(values['stages'])}; expected rows of its {rows} waypoints in order")
+    return ArmPath(names, positions, (first, second, third, fourth))
+
+
+def _contact_of(values: dict[str, Any]) -> Contact:
+    position, normal = (_numbers_of(values, key, 3) for key in ("position", "normal"))
+    return Contact(str(values["link"]), _triple(position), _triple(normal))
+
+
+def _numbers_of(values: dict[str, Any], key: str, *shape: int) -> Float[np.ndarray, "..."]:
+    """What a key holds, as finite numbers of a shape. Raises ValueError: it holds something else."""
+    numbers = np.array(values[key], dtype=float)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"{key}: {shown(values[key])}; expected {math.prod(shape)} finite number(s)")
+    return numbers
+
+
+def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")

@@ -1,0 +1,128 @@
+"""Drop small components: tiny pieces that float clear of a mesh, as scanners and careless exports leave them.
+
+Bodies of one mesh that stand apart: a hand grasps them as one rigid thing, which they may not be.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
+from graspd_core.types import TriangleMesh
+
+# A piece is tiny below this share of the extent of the piece with the most area, and what stays must hold this share of
+# all area: a surface that is in pieces everywhere, as loose triangles are, loses none.
+TINY, STAYS = 0.05, 0.98
+
+
+def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
+    """The mesh without its small components, and how many they were.
+
+    A small component shares no vertex with the rest, is tiny, and lies farther from all that is not tiny than it is
+    large: a bump, a screw's head or a loose triangle that touches the body stays.
+    """
+    piece = face_components(mesh)
+    count = int(piece.max()) + 1
+    if count == 1:
+        return mesh, 0
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.bincount(piece, weights=area)
+    extent = _extents(corners, piece)
+    tiny = extent < TINY * extent[area.argmax()]
+    if not tiny.any() or area[~tiny].sum() < STAYS * area.sum():
+        return mesh, 0
+    gap = np.full(count, np.inf)
+    rest = make_surface(TriangleMesh(mesh.vertices, mesh.faces[~tiny[piece]]))
+    asked = tiny[piece]
+    distance = surface_distance(rest, corners[asked].reshape(-1, 3)).reshape(-1, 3).min(1)
+    np.minimum.at(gap, piece[asked], distance)
+    small = tiny & (gap > extent)
+    used, compact = np.unique(mesh.faces[~small[piece]], return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(small.sum())
+
+
+def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
+    """Number of the piece that each face belongs to; pieces share no vertex."""
+    a, b, c = mesh.faces.T
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
+    shared = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
+    _, label = connected_components(shared, directed=False)
+    return np.unique(label[a], return_inverse=True)[1].reshape(-1)
+
+
+def _extents(corners: Float[np.ndarray, "faces 3 3"], piece: Int[np.ndarray, "faces"]) -> Float[np.ndarray, "pieces"]:
+    """Diagonal of each piece's bounding box [m]."""
+    order = np.argsort(piece, kind="stable")
+    starts = np.flatnonzero(np.diff(piece[order], prepend=-1))
+    low = np.minimum.reduceat(corners.min(1)[order], starts)
+    high = np.maximum.reduceat(corners.max(1)[order], starts)
+    return np.linalg.norm(high - low, axis=1)
+
+
+# Pieces of surface that come nearer to each other than this share of the mesh's extent are of one body: parts that were
+# modelled one by one touch, reach into each other, or miss each other by little.
+_APART = 0.05
+# Points that stand for the surface beside its vertices: from one to the next it is half of that or less.
+_SAMPLES = 4096
+
+
+def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
+    """How many bodies there are, and the gap from the largest to what is nearest to it [m]; infinite about one.
+
+    What lies within the largest, as the inside of a hollow wall does, belongs to it.
+    """
+    pieces = face_components(mesh)
+    if not pieces.any():
+        return 1, np.inf
+    points, owner = _points(mesh, pieces)
+    reach = _APART * float(np.ptp(mesh.vertices, axis=0).max())
+    largest = _grown(points, owner, np.ones(len(points), dtype=bool), reach)
+    shell = TriangleMesh(mesh.vertices, mesh.faces[np.isin(pieces, owner[largest])])
+    _, first = np.unique(owner, return_index=True)
+    apart = ~largest & ~winding_inside(shell, points[first])[owner]
+    if not apart.any():
+        return 1, np.inf
+    gap = float(KDTree(points[largest]).query(points[apart])[0].min())
+    bodies = 1
+    while apart.any():
+        apart &= ~_grown(points, owner, apart, reach)
+        bodies += 1
+    return bodies, gap
+
+
+def _points(
+    mesh: TriangleMesh, pieces: Int[np.ndarray, "faces"]
+) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
+    """Corners of all faces and points spread over them by area, and the piece that each is of."""
+    rng = np.random.default_rng(0)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = rng.choice(len(area), _SAMPLES, p=area / area.sum())
+    spread = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), _SAMPLES), corners[chosen])
+    used, first = np.unique(mesh.faces, return_index=True)
+    return np.concatenate([mesh.vertices[used], spread]), np.concatenate([pieces[first // 3], pieces[chosen]])
+
+
+def _grown(
+    points: Float[np.ndarray, "points 3"],
+    owner: Int[np.ndarray, "points"],
+    among: Bool[np.ndarray, "points"],
+    reach: float,
+) -> Bool[np.ndarray, "points"]:
+    """Those of the points `among` that belong to the most extended piece, or to pieces that are joined to it."""
+    low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
+    np.minimum.at(low, owner[among], points[among])
+    np.minimum.at(high, owner[among], -points[among])
+    start = np.where(np.isfinite(low), -high - low, 0.0).max(1).argmax()
+    body = front = among & (owner == start)
+    while front.any() and not body[among].all():
+        left = among & ~body
+        distance, _ = KDTree(points[front]).query(points[left], distance_upper_bound=reach)
+        front = left & np.isin(owner, owner[left][distance < reach])
+        body = body | front
+    return body

@@ -1,1 +1,0 @@
-"""Grasp'D as published."""

@@ -1,1 +1,0 @@
-"""Static grasp quality. It shares no code with the methods."""

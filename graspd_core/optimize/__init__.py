@@ -1,0 +1,1 @@
+"""From a scene and a hand to ranked candidates."""

@@ -1,0 +1,229 @@
+"""What every method shares: its input and output, the initial poses, and the problem that results are ranked in.
+
+Candidates: draw starts, minimise, make the three postures, rank. No trial is run here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import deepest_overlap
+from graspd_core.optimize.grasp_postures import approach_depth, find_contacts, find_pregrasp, self_overlap, squeeze
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.loop import Hooks, Poses
+from graspd_core.optimize.obstacle_distance import gap_on_the_way
+from graspd_core.optimize.plan_config import METHODS, PlanConfig
+from graspd_core.optimize.problem import Problem, build_problem
+from graspd_core.optimize.ranking import Staged, score
+from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
+from graspd_core.perception.scene import Scene
+from graspd_core.types import Contact, Grasp, Posture
+
+
+@dataclass(frozen=True)
+class PlannerOutput:
+    """What a method ended with.
+
+    Attributes:
+        problem: scene and hand as tensors, in whose terms the poses are made into grasps.
+        poses: hand poses that the method found, at most a few times as many as asked for, in any order.
+        interrupted: why it ended early: "", "cancelled" or "deadline".
+    """
+
+    problem: Problem
+    poses: Poses
+    interrupted: str = ""
+
+
+@dataclass(frozen=True)
+class PlannerInput:
+    """What a method is asked for.
+
+    Attributes:
+        scene, hand: what is to be grasped by what.
+        count: grasps asked for.
+        seed: of everything that is drawn.
+        config: settings of the run.
+        hooks: how the run is followed and ended.
+        device, dtype: of the tensors.
+        restrictions: what the initial poses must allow.
+    """
+
+    scene: Scene
+    hand: HandModel
+    count: int
+    seed: int
+    config: PlanConfig
+    hooks: Hooks
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
+    restrictions: BoundRestrictions = UNRESTRICTED
+
+
+def problem_of(task: PlannerInput) -> Problem:
+    """The problem in which every method's poses are made into grasps and ranked."""
+    scene = task.restrictions.searched(task.scene)
+    return build_problem(scene, task.hand, task.config.problem, seed=task.seed, device=task.device, dtype=task.dtype)
+
+
+def initial_poses_of(task: PlannerInput, count: int, fingertips: float = 0.0) -> Poses:
+    """`count` seeded poses on the object's hull; fewer, perhaps none, where the restrictions leave no more.
+
+    A share `fingertips` of them are put there with their fingertips, the others with their palms.
+    """
+    drawn = {"fingertips": fingertips, "restrictions": task.restrictions}
+    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, **drawn)
+
+
+def allowed_of(task: PlannerInput, starts: Poses) -> Poses:
+    """Those initial poses that the restrictions allow, for a method that draws its own."""
+    if not task.restrictions.each:
+        return starts
+    turns = starts.quaternion / starts.quaternion.norm(dim=-1, keepdim=True)
+    given = (values.double().cpu().numpy() for values in (starts.translation, turns, starts.joints))
+    return starts[torch.as_tensor(task.restrictions.starts(*given), device=starts.joints.device)]
+
+
+# A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
+_DEEPEST = 0.0015
+# Poses made into grasps at once; each takes a megabyte on the way.
+_AT_ONCE = 128
+# What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
+_KNOCK_COST = 100.0
+# A score that no candidate has.
+_WORST = -1e3
+# Share of the grasps asked for that the ranking expects to hold, below which a method searches again; and how far apart
+# the seeds of two searches are: not those of two rounds.
+_LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Grasps in rank order, best first, none tried yet; and how the optimiser ended ("" , "cancelled", "deadline")."""
+
+    grasps: tuple[Grasp, ...]
+    interrupted: str
+
+
+def find_candidates(
+    scene: Scene,
+    hand: HandModel,
+    *,
+    count: int,
+    seed: int,
+    config: PlanConfig,
+    hooks: Hooks,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float32,
+    restrictions: BoundRestrictions = UNRESTRICTED,
+) -> Candidates:
+    """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless.
+
+    Where the ranking expects too few of those asked for to hold, as many starts again are searched from: small, large
+    and long things gain by that, ordinary ones would not.
+    The restrictions shape the starts alone: who asked for them refuses candidates.
+    """
+    task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
+    found = _searched(task)
+    for again in range(1, METHODS[config.method].searches(config.settings)):
+        if found.interrupted or expected_to_hold(found.grasps[:count]) >= _LEAST_EXPECTED * count:
+            break
+        more = _searched(replace(task, seed=seed + _SEED_STEP * again))
+        found = Candidates(_best_first((*found.grasps, *more.grasps)), more.interrupted)
+    return found
+
+
+def expected_to_hold(grasps: Sequence[Grasp]) -> float:
+    """How many of the grasps the ranking expects to pass the hold trial."""
+    return sum(0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps)
+
+
+def _searched(task: PlannerInput) -> Candidates:
+    found = METHODS[task.config.method].plan(task)
+    if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
+        return Candidates((), found.interrupted)
+    return Candidates(assemble(found.problem, task.hand, found.poses, task.config, task.hooks.stop), found.interrupted)
+
+
+def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
+    return tuple(sorted(grasps, key=lambda grasp: grasp.score, reverse=True))
+
+
+def assemble(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
+) -> tuple[Grasp, ...]:
+    """Three postures and a score for every pose, best first.
+
+    Poses without a balanced squeeze are dropped, and those that reach through an obstacle on their way or at its end.
+    How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
+    to its pregrasp is refused by a trial before its first step.
+    """
+    grasps: list[Grasp] = []
+    for first in range(0, len(poses.translation), _AT_ONCE):
+        rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
+        some = staged(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+        grasps += [grasp for grasp in finished(problem, hand, some) if grasp.score > _WORST]
+    return _best_first(grasps)
+
+
+def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
+    """The grasps of staged poses with their scores, in their order."""
+    scores = score(problem, some)
+    if problem.obstacles is not None:
+        ends = (some.opened.translation, some.opened.joints), (some.poses.translation, some.poses.joints)
+        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, some.poses.quaternion, *ends)
+        knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
+        scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
+    return _grasps(hand, some, scores)
+
+
+def staged(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
+) -> Staged:
+    """Contacts, squeeze, pregrasp and what is known of them, for every pose, for so many as memory is there for."""
+    contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
+    effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
+    pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
+    opened, clearance = find_pregrasp(problem, poses, config.grasp_stages, stop)
+    adjacent = torch.as_tensor(hand.adjacent, device=problem.hand.lower.device)
+    overlap = self_overlap(problem, poses.joints, adjacent)
+    if any(primitive.kind == "hull" for primitive in hand.primitives):
+        depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
+        overlap = torch.maximum(overlap, depth.to(overlap))
+    return Staged(poses, opened, clearance, contact_set, pressed, overlap)
+
+
+def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
+    poses, opened, found = some.poses, some.opened, some.contact_set
+    quaternion = _numbers(poses.quaternion / poses.quaternion.norm(dim=-1, keepdim=True))
+    active, distance = found.active.cpu().numpy(), found.distance.abs().cpu().numpy()
+    link, position, normal = found.link.tolist(), _numbers(found.position), _numbers(found.normal)
+    places = [_numbers(x) for x in (opened.translation, poses.translation)]
+    # Rounding to float32 and back may step over a limit by an ulp.
+    joints = [np.clip(_numbers(x), hand.lower, hand.upper) for x in (opened.joints, poses.joints, some.pressed.joints)]
+    grasps = []
+    for row, odds in enumerate(scores.tolist()):
+        # One contact a link: of its active slots, the one nearest to the surface.
+        slots = np.flatnonzero(active[row])
+        nearest = {link[slot]: slot for slot in slots[np.argsort(-distance[row, slots], kind="stable")]}
+        contacts = tuple(
+            Contact(hand.link_names[of], tuple(position[row, slot].tolist()), tuple(normal[row, slot].tolist()))
+            for of, slot in sorted(nearest.items())
+        )
+        pregrasp, grasp, squeezed = (
+            Posture(place[row].copy(), quaternion[row].copy(), values[row].copy())
+            for place, values in zip((places[0], places[1], places[1]), joints, strict=True)
+        )
+        grasps.append(Grasp(pregrasp=pregrasp, grasp=grasp, squeeze=squeezed, contacts=contacts, score=odds))
+    return grasps
+
+
+def _numbers(values: Tensor) -> np.ndarray:
+    return values.double().cpu().numpy()

@@ -1,0 +1,431 @@
+"""Where a hand at rest touches the object, and how deep it lies in itself.
+
+The pregrasp: a posture near the grasp from which the hand closes without touching anything on its way.
+
+The squeeze: balanced contact forces, and the joint targets that make them.
+
+Stages by the compiled kernel: same steps as in torch, a row at a time, on as many threads as torch has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from ctypes import byref
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from graspd_core.config import GraspStagesConfig
+from graspd_core.hands.kinematics import forward, place_points
+from graspd_core.hands.link_distance import pair_distance, solid_distance
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.optimize import losses
+from graspd_core.optimize.kernel import builds as structs
+from graspd_core.optimize.kernel.builds import call
+from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
+from graspd_core.optimize.loop import Poses, pack
+from graspd_core.optimize.obstacle_distance import RETREAT, RETREAT_SHARES, ObstacleTensors, obstacle_gaps
+from graspd_core.optimize.problem import OBSTACLE_MARGIN, Problem, hand_forward
+from graspd_core.se3 import SE3, rotation_from_quaternion
+
+# Contacts of one link beyond its nearest.
+_SPREAD = 2
+
+
+@dataclass(frozen=True)
+class ContactSet:
+    """Where a batch of hands touches: some slots for every link, of which only the active ones count.
+
+    Attributes:
+        link: link of each slot.
+        position: point on the object, object frame [m].
+        normal: outward unit normal of the object there.
+        distance: signed distance of hand and object there [m].
+        active: whether it counts as a contact.
+    """
+
+    link: Int[Tensor, "slots"]
+    position: Float[Tensor, "batch slots 3"]
+    normal: Float[Tensor, "batch slots 3"]
+    distance: Float[Tensor, "batch slots"]
+    active: Bool[Tensor, "batch slots"]
+
+
+@torch.no_grad()
+def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
+    """For every link its nearest candidate, the two that spread that contact farthest, and its nearest sharp point.
+
+    Slots within `reach` [m] of the surface are active.
+    """
+    points = problem.hand.fine
+    placed = hand_forward(problem, points, poses.translation, poses.quaternion, poses.joints)
+    distance, normal = sample_sdf(problem.object.sdf, placed.points)
+    links = torch.unique(points.links)
+    members = points.links[None, :] == links[:, None]
+    near = members[None] & (distance.abs() <= reach)[:, None]
+    rows = torch.arange(len(distance), device=distance.device)[:, None]
+    chosen = [torch.where(members[None], distance[:, None], torch.inf).argmin(-1)]
+    spread = torch.full_like(near, torch.inf, dtype=distance.dtype)
+    for _ in range(_SPREAD):
+        away = torch.cdist(placed.points[rows, chosen[-1]], placed.points, compute_mode="donot_use_mm_for_euclid_dist")
+        spread = torch.minimum(spread, away)
+        chosen.append(torch.where(near, spread, -1.0).argmax(-1))
+    slots = torch.stack(chosen, -1).flatten(1)
+    gap, n = distance[rows, slots], normal[rows, slots]
+    own_link = points.links[slots] == links.repeat_interleave(_SPREAD + 1)
+    # A patch that is hardly larger than a point is one contact, not three.
+    apart = torch.cat([torch.ones_like(gap[:, :1], dtype=torch.bool).expand(-1, len(links))[..., None]] + [
+        (placed.points[rows, c] - placed.points[rows, chosen[0]]).norm(dim=-1)[..., None] > 0.004 for c in chosen[1:]
+    ], -1).flatten(1)  # fmt: skip
+    found = ContactSet(
+        links.repeat_interleave(_SPREAD + 1),
+        placed.points[rows, slots] - gap[..., None] * n,
+        n,
+        gap,
+        (gap.abs() <= reach) & own_link & apart,
+    )
+    return _with_features(problem, poses, found, reach) if len(problem.object.features) else found
+
+
+def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
+    """Add one slot per solid: the object's sharp point nearest to it, with the solid's own normal turned round."""
+    pick, nearest, outward = nearest_features(problem, poses)
+    return ContactSet(
+        torch.cat([found.link, problem.hand.solids.link]),
+        torch.cat([found.position, problem.object.features[pick]], 1),
+        torch.cat([found.normal, -outward], 1),
+        torch.cat([found.distance, nearest], 1),
+        torch.cat([found.active, nearest.abs() <= reach], 1),
+    )
+
+
+def nearest_features(
+    problem: Problem, poses: Poses
+) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
+    """Which sharp point is nearest to every solid of the hand, its signed distance [m], and the gradient of that."""
+    solids = problem.hand.solids
+    compiled = kernel_problem(problem)
+    if compiled is not None:
+        return nearest_features_compiled(compiled, poses, len(solids.link))
+    links, base = forward(problem.hand.kinematics, poses.joints), poses.base
+    in_base = base.apply_inverse(problem.object.features)
+    nearest, pick = solid_distance(solids, links, in_base).min(1)
+    rows = torch.arange(len(pick), device=pick.device)[:, None]
+    which = torch.arange(len(solids.link), device=pick.device).expand_as(pick)
+    with torch.enable_grad():
+        points = in_base[rows, pick].requires_grad_(True)
+        (directions,) = torch.autograd.grad(pair_distance(solids, links, points, which).sum(), points)
+    return pick, nearest, directions @ base.rotation.transpose(-1, -2)
+
+
+@torch.no_grad()
+def self_overlap(
+    problem: Problem, joints: Float[Tensor, "batch joints"], adjacent: Bool[Tensor, "links links"]
+) -> Float[Tensor, "batch"]:
+    """Greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
+    if len(problem.hand.solids.link) == 0:
+        return joints.new_zeros(len(joints))
+    compiled = kernel_problem(problem)
+    if compiled is not None:
+        return self_overlap_compiled(compiled, joints, ~adjacent[:, problem.hand.solids.link])
+    links = forward(problem.hand.kinematics, joints)
+    points = place_points(problem.hand.fine.matrix, links)
+    depth = -solid_distance(problem.hand.solids, links, points)
+    checked = ~adjacent[problem.hand.fine.links][:, problem.hand.solids.link]
+    return torch.where(checked, depth, 0.0).amax((-1, -2)).clamp_min(0.0)
+
+
+# Shares of the way from pregrasp to grasp that are kept clear.
+_WAY = (0.0, 0.4, 0.8)
+
+
+def find_pregrasp(
+    problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool] = lambda: False
+) -> tuple[Poses, Float[Tensor, "batch"]]:
+    """A nearby posture (base shifted, never turned) from which the hand closes without sweeping through the object.
+
+    Both the posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every
+    candidate is to be (1 − a) times the clearance away from the object, so that all that touch arrive together. All of
+    the way keeps clear of obstacles, where there are any.
+
+    Returns:
+        The postures, and the least distance on the way over what it should be there, one where all is clear.
+    """
+    compiled = kernel_problem(problem)
+    if compiled is not None:
+        return find_pregrasp_compiled(compiled, poses, config, stop)
+    return _find_pregrasp(problem, poses, config, stop)
+
+
+def _find_pregrasp(
+    problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
+) -> tuple[Poses, Float[Tensor, "batch"]]:
+    """`find_pregrasp` in torch."""
+    start = torch.cat([poses.translation, poses.joints], -1)
+    rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
+    rates, cost = _rates_and_costs(problem, config)
+    with torch.no_grad():
+        reached = hand_distance(problem, poses.base, poses.joints)
+    remaining = torch.tensor([1.0 - a for a in _WAY], dtype=start.dtype, device=start.device)[:, None, None]
+    # Where the grasp itself sinks in, the way out starts from that depth.
+    wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
+
+    def way_to(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch variables"]:
+        return (remaining * x + (1 - remaining) * start).flatten(0, 1)
+
+    def distances(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch points"]:
+        way = way_to(x)
+        return hand_distance(problem, SE3(rotation, way[:, :3]), way[:, 3:])
+
+    x, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
+    for count in range(1, config.open_steps + 1):
+        if stop():
+            break
+        x.requires_grad_(True)
+        short = ((wanted - distances(x)).clamp_min(0.0) / 0.001).unflatten(0, (len(_WAY), -1))
+        loss = (short * short).mean(-1).sum(0) + (cost * (x - start) ** 2).sum(-1)
+        if problem.obstacles is not None:
+            blocked = _obstacle_cost(problem.obstacles, problem, rotation, way_to(x))
+            loss = loss + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
+        (gradient,) = torch.autograd.grad(loss.sum(), x)
+        gradient = torch.nan_to_num(gradient)
+        mean = 0.9 * mean + 0.1 * gradient
+        square = 0.98 * square + 0.02 * gradient * gradient
+        fade = 1.0 - 0.9 * count / config.open_steps
+        x = x.detach() - fade * rates * (mean / (1 - 0.9**count)) / ((square / (1 - 0.98**count)).sqrt() + 1e-8)
+        x = torch.cat([x[:, :3], x[:, 3:].clamp(problem.hand.lower, problem.hand.upper)], -1)
+    with torch.no_grad():
+        share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
+    return Poses(x[:, :3], poses.quaternion, x[:, 3:]), share
+
+
+def _rates_and_costs(
+    problem: Problem, config: GraspStagesConfig
+) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
+    """Of base translation and joints: step sizes, and what a square of travel costs."""
+    rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), config.open_joint_rate)
+    rates[3:] *= problem.hand.joint_scale
+    rates[:3] = config.open_base_rate
+    cost = torch.full_like(rates, JOINT_COST)
+    cost[3:] /= problem.hand.joint_scale**2
+    cost[:3] = BASE_COST
+    return rates, cost
+
+
+def _obstacle_cost(
+    obstacles: ObstacleTensors,
+    problem: Problem,
+    rotation: Float[Tensor, "batch 3 3"],
+    x: Float[Tensor, "batch variables"],
+) -> Float[Tensor, "batch"]:
+    """The loss term of obstacles for rows of translation and joints."""
+    gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.hand.kinematics, x[:, 3:]))
+    return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
+
+
+@torch.no_grad()
+def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Float[Tensor, "batch"]:
+    """How deep the hand is in the object on its straight way from the retreat to the pregrasp [m], zero where clear.
+
+    What a pregrasp itself leaves is not looked at here.
+    """
+    rotation = rotation_from_quaternion(pregrasp.quaternion)
+    back = rotation @ obstacles.retreat
+    nearest = [
+        hand_distance(problem, SE3(rotation, pregrasp.translation + RETREAT * share * back), pregrasp.joints).amin(-1)
+        for share in RETREAT_SHARES
+    ]
+    return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
+
+
+def hand_distance(problem: Problem, base: SE3, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch points"]:
+    """Signed distance of every contact candidate to the object [m]."""
+    points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
+    return sample_sdf(problem.object.sdf, base.apply(points))[0]
+
+
+_CONE_EDGES = 8
+# Weights of an even spread of the load and of normal forces that sum to one, against balance.
+_RIDGE, _SUM = 0.5, 10.0
+# Newton's method ends at this squared slope; it takes ten steps at most, but for what is not a number.
+_CONVERGED, _NEWTON_STEPS = 1e-22, 60
+
+
+@dataclass(frozen=True)
+class Squeeze:
+    """Balanced contact forces and the joint targets that make them.
+
+    Attributes:
+        joints: position targets [rad] or [m].
+        forces: on the object, one per link [N].
+        imbalance: norm of the net wrench over the sum of forces; one where there is no balance to be had.
+    """
+
+    joints: Float[Tensor, "batch joints"]
+    forces: Float[Tensor, "batch slots 3"]
+    imbalance: Float[Tensor, "batch"]
+
+
+def squeeze(
+    problem: Problem, poses: Poses, contact_set: ContactSet, effort: Float[Tensor, "joints"], config: GraspStagesConfig
+) -> Squeeze:
+    """Forces in the friction cones with zero net wrench (non-negative least squares), as joint offsets JᵀF / kp."""
+    unit_forces, imbalance = balanced_forces(
+        (contact_set.position - problem.object.center).double().cpu().numpy(),
+        contact_set.normal.double().cpu().numpy(),
+        contact_set.active.cpu().numpy(),
+        problem.object.length,
+        problem.friction,
+    )
+    forces = torch.as_tensor(unit_forces).to(problem.hand.lower)
+    torque = joint_torques(problem, poses, contact_set, forces)
+    limit = (effort * config.effort_share / torque.abs().clamp_min(1e-9)).amin(-1)
+    scale = limit.clamp(max=config.grip_force)[:, None]
+    stiffness = torch.where(problem.hand.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
+    targets = (poses.joints + scale * torque / stiffness).clamp(problem.hand.lower, problem.hand.upper)
+    return Squeeze(targets, scale[..., None] * forces, torch.as_tensor(imbalance).to(problem.hand.lower))
+
+
+def joint_torques(
+    problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
+) -> Float[Tensor, "batch joints"]:
+    """τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
+    base = poses.base
+    x = base.apply_inverse(contact_set.position)
+    joints = poses.joints.detach().requires_grad_(True)
+    links = forward(problem.hand.kinematics, joints)[:, contact_set.link]
+    with torch.no_grad():
+        material = links.rotation.transpose(-1, -2) @ (x - links.translation)[..., None]
+    moved = (links.rotation @ material).squeeze(-1) + links.translation
+    (torque,) = torch.autograd.grad((moved * (forces @ base.rotation)).sum(), joints)
+    return torque
+
+
+def balanced_forces(
+    arms: Float[np.ndarray, "batch slots 3"],
+    normals: Float[np.ndarray, "batch slots 3"],
+    active: Bool[np.ndarray, "batch slots"],
+    length: float,
+    friction: float,
+) -> tuple[Float[np.ndarray, "batch slots 3"], Float[np.ndarray, "batch"]]:
+    """Contact forces on the object with normal components summing to one and the least net wrench.
+
+    Args:
+        arms: contact points about the centre of mass [m].
+        normals: outward unit normals.
+        active: which links touch.
+        length: scale of torques [m].
+        friction: Coulomb coefficient of the cones.
+
+    Returns:
+        Forces, and the norm of their net wrench (torque over `length`).
+    """
+    active = active & (active.sum(-1, keepdims=True) > 1)
+    # The active slots of every row first, as many columns as the row with most of them has.
+    order = np.argsort(~active, axis=-1, kind="stable")[:, : int(active.sum(-1).max(initial=0))]
+    rows = np.arange(len(arms))[:, None]
+    touching = active[rows, order]
+    edges = _cone_edges(normals[rows, order], friction) * touching[..., None, None]
+    torques = np.cross(arms[rows, order][:, :, None], edges) / length
+    wrenches = np.concatenate([edges, torques], -1).reshape(len(arms), -1, 6)
+    weights = _balancing_weights(wrenches, np.repeat(touching, _CONE_EDGES, -1))
+    weights /= weights.sum(-1, keepdims=True).clip(1e-9)
+    forces, imbalance = np.zeros_like(arms), np.ones(len(arms))
+    forces[rows, order] = (weights.reshape(*order.shape, _CONE_EDGES, 1) * edges).sum(2)
+    balanced = touching.any(-1)
+    imbalance[balanced] = np.linalg.norm((weights[..., None] * wrenches).sum(1), axis=-1)[balanced]
+    return forces, imbalance
+
+
+def _cone_edges(
+    normals: Float[np.ndarray, "batch slots 3"], friction: float
+) -> Float[np.ndarray, "batch slots edges 3"]:
+    """Forces with a normal component of one along the edges of every contact's friction cone."""
+    angles = np.arange(_CONE_EDGES) * 2 * np.pi / _CONE_EDGES
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True).clip(1e-12)
+    second = np.cross(normals, first)
+    tangents = np.cos(angles)[:, None] * first[:, :, None] + np.sin(angles)[:, None] * second[:, :, None]
+    return friction * tangents - normals[:, :, None]
+
+
+def _balancing_weights(
+    wrenches: Float[np.ndarray, "batch edges 6"], allowed: Bool[np.ndarray, "batch edges"]
+) -> Float[np.ndarray, "batch edges"]:
+    """The least ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖² of x ≥ 0, exactly.
+
+    With the six wrenches and the sum as rows of G and t = (0, …, 0, 10) the dual has seven unknowns, the residual
+    r = t − G x: it is the least of ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r, and x = max(Gᵀr, 0) / ridge². Newton's
+    method with halved steps ends after a few, since the second derivative changes only where an edge comes or goes.
+    """
+    batch, count, _ = wrenches.shape
+    g = np.concatenate([wrenches, np.full((batch, count, 1), _SUM)], -1) * allowed[..., None]
+    target, gain = np.array([0.0] * 6 + [_SUM]), 1 / _RIDGE**2
+    r = np.zeros((batch, 7))
+    r[:, 6] = _SUM / (1 + _SUM**2 * gain * allowed.sum(-1))
+
+    def value(r: np.ndarray) -> np.ndarray:
+        pressed = (g @ r[..., None])[..., 0].clip(0.0)
+        return 0.5 * (r * r).sum(-1) + 0.5 * gain * (pressed * pressed).sum(-1) - r @ target
+
+    for _ in range(_NEWTON_STEPS):
+        pressed = (g @ r[..., None])[..., 0].clip(0.0)
+        downhill = target - r - gain * (pressed[:, None] @ g)[:, 0]
+        if (downhill * downhill).sum(-1).max(initial=0.0) < _CONVERGED:
+            break
+        chosen = g * (pressed > 0)[..., None]
+        way = np.linalg.solve(np.eye(7) + gain * chosen.transpose(0, 2, 1) @ chosen, downhill[..., None])[..., 0]
+        now, slope, step = value(r), (downhill * way).sum(-1), np.ones(batch)
+        while (worse := (value(r + step[:, None] * way) > now - 1e-4 * step * slope + 1e-14) & (step > 1e-8)).any():
+            step[worse] /= 2
+        r = r + step[:, None] * way
+    return gain * (g @ r[..., None])[..., 0].clip(0.0)
+
+
+# What a square of travel costs: of joints per radian², of the base per metre².
+JOINT_COST, BASE_COST = 0.1, 2e3
+
+
+def find_pregrasp_compiled(
+    compiled: KernelProblem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
+) -> tuple[Poses, Float[Tensor, "batch"]]:
+    """`pregrasp.find_pregrasp` for the problem as the kernel reads it."""
+    x = pack(poses).contiguous()
+    out, share = x.new_empty(len(x), x.shape[1] - 4), x.new_empty(len(x))
+    settings = structs.Pregrasp(
+        clearance=config.clearance,
+        joint_rate=config.open_joint_rate,
+        base_rate=config.open_base_rate,
+        joint_cost=JOINT_COST,
+        base_cost=BASE_COST,
+        steps=config.open_steps,
+    )
+    arguments = len(x), x.data_ptr(), out.data_ptr(), share.data_ptr(), torch.get_num_threads()
+    call("graspd_find_pregrasps", byref(compiled.struct), byref(settings), *arguments, watch=lambda _: stop())
+    return Poses(out[:, :3], poses.quaternion, out[:, 3:]), share
+
+
+def self_overlap_compiled(
+    compiled: KernelProblem, joints: Float[Tensor, "batch joints"], checked: Bool[Tensor, "links solids"]
+) -> Float[Tensor, "batch"]:
+    """`contact_set.self_overlap` of the pairs that are `checked`."""
+    joints, asked = joints.contiguous(), checked.to(torch.int32).contiguous()
+    depth = joints.new_empty(len(joints))
+    arguments = len(joints), joints.data_ptr(), asked.data_ptr(), depth.data_ptr(), torch.get_num_threads()
+    call("graspd_self_overlap", byref(compiled.struct), *arguments)
+    return depth
+
+
+def nearest_features_compiled(
+    compiled: KernelProblem, poses: Poses, solids: int
+) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
+    """`contact_set.nearest_features` for the problem as the kernel reads it."""
+    x = pack(poses).contiguous()
+    pick = torch.zeros((len(x), solids), dtype=torch.int32)
+    distance, gradient = x.new_empty(pick.shape), x.new_zeros((*pick.shape, 3))
+    found = pick.data_ptr(), distance.data_ptr(), gradient.data_ptr()
+    call("graspd_nearest_features", byref(compiled.struct), len(x), x.data_ptr(), *found, torch.get_num_threads())
+    return pick.long(), distance, gradient

@@ -1,0 +1,1 @@
+"""Grasp'D (Turpin et al., ECCV 2022)."""

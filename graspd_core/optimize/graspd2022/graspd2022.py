@@ -1,0 +1,464 @@
+"""Desired contact forces: the variables that Grasp'D relaxes physics with (after contact-invariant optimisation).
+
+For every hand point and every simulation there is a force f̂ on the object that the pose does not have to supply.
+Whether it stops the object is a constraint, L_task; whether the pose supplies it is a cost, L_phys. Gradients are
+exact; `into_cone` is a projection and carries none.
+
+Constrained minimisation by gradient steps: the modified differential multiplier method, Adamax and Adam.
+
+For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0); x descends it while λ
+climbs it. The damping d c² / 2 makes the two settle instead of circling (Platt & Barr, NIPS 1987).
+
+The published starts of Grasp'D: palm towards a random surface point along the normal, random roll, fingers open.
+
+Grasp'D as published (Turpin et al., ECCV 2022): desired forces that stop the object, and a pose that supplies them.
+
+    min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
+
+by damped multipliers and Adamax, on contacts with the level set φ = r, r shrinking to zero (docs/method.md, §1).
+Gradients are exact, but that contacts leak (`contact.forces`), that the pose has no part in L_task, and that desired
+forces are projected into their cones where they have any.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graspd_core.hands.kinematics import place_points
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.optimize import losses
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, allowed_of, initial_poses_of, problem_of
+from graspd_core.optimize.graspd2022.contact_dynamics import (
+    FreeBody,
+    contact_forces,
+    euler_step,
+    make_body,
+    net_wrench,
+    speed_left,
+)
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
+from graspd_core.optimize.loop import Poses, minimise, pack, unpack
+from graspd_core.optimize.obstacle_distance import obstacle_gaps
+from graspd_core.optimize.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward, least_distance
+from graspd_core.perception.scene import Scene
+from graspd_core.se3 import EPSILON, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
+
+
+def actual(
+    forces: Float[Tensor, "batch points simulations 3"],
+    arms: Float[Tensor, "batch points 3"],
+    length: float,
+    components: int,
+) -> Float[Tensor, "batch points simulations components"]:
+    """Contact forces as what desired ones are compared with: forces (3), or wrenches with torques over `length` (6)."""
+    if components == 3:
+        return forces
+    torques = torch.linalg.cross(arms[:, :, None] / length, forces)
+    return torch.cat([forces, torques], -1)
+
+
+def physics(
+    desired: Float[Tensor, "batch points simulations components"],
+    supplied: Float[Tensor, "batch points simulations components"],
+) -> Float[Tensor, "batch"]:
+    """L_phys: squared differences of desired and supplied forces, over all points and simulations [N²]."""
+    difference = (desired - supplied).flatten(1)
+    return (difference * difference).sum(-1)
+
+
+def motion_left(
+    body: FreeBody,
+    forces: Float[Tensor, "batch points simulations components"],
+    arms: Float[Tensor, "batch points 3"],
+    velocities: Float[Tensor, "simulations 3"],
+    time_step: float,
+) -> Float[Tensor, "batch simulations"]:
+    """Squared speed of the object after one step, over the mean of its squares before (one: nothing was stopped).
+
+    Forces with six components bring their own torques, over the body's length.
+    """
+    if forces.shape[-1] == 3:
+        force, torque = net_wrench(forces, arms)
+    else:
+        force, torque = forces.sum(1).split(3, -1)
+        torque = torque * body.length
+    linear, angular = euler_step(body, velocities, torch.zeros_like(velocities), force, torque, time_step)
+    return speed_left(body, linear, angular) / (velocities * velocities).sum(-1).mean()
+
+
+@torch.no_grad()
+def into_cone(
+    forces: Float[Tensor, "batch points simulations 3"], normals: Float[Tensor, "batch points 3"], friction: float
+) -> Float[Tensor, "batch points simulations 3"]:
+    """The nearest forces that only push on a surface with outward `normals`, within Coulomb friction."""
+    along = -(forces * normals[:, :, None]).sum(-1)
+    across = forces + along[..., None] * normals[:, :, None]
+    side = across.norm(dim=-1)
+    # Inside the cone nothing moves; else the nearest point of its rim, or its apex.
+    rim = ((along + friction * side) / (1 + friction**2)).clamp_min(0.0)
+    inside = side <= friction * along
+    push = torch.where(inside, along, rim)
+    share = torch.where(inside, torch.ones_like(side), friction * rim / side.clamp_min(EPSILON))
+    return share[..., None] * across - push[..., None] * normals[:, :, None]
+
+
+_BETA1, _EPSILON = 0.9, 1e-8
+
+
+@dataclass(frozen=True)
+class Adamax:
+    """A variable of every start and its moments (Kingma & Ba 2015, §7.1).
+
+    Attributes:
+        value: the iterate.
+        mean: running mean of the gradient.
+        top: decaying maximum of the gradient's size; with Adam the running mean of its squares.
+    """
+
+    value: Float[Tensor, "batch *shape"]
+    mean: Float[Tensor, "batch *shape"]
+    top: Float[Tensor, "batch *shape"]
+
+
+def adamax(value: Float[Tensor, "batch *shape"]) -> Adamax:
+    """The state before the first step."""
+    return Adamax(value, torch.zeros_like(value), torch.zeros_like(value))
+
+
+def adamax_step(
+    state: Adamax, gradient: Float[Tensor, "batch *shape"], rate: float, count: int, memory: float = 0.999
+) -> Adamax:
+    """The state after step number `count`, from one; a negative rate climbs. `memory` keeps that share of `top`."""
+    mean = torch.lerp(gradient, state.mean, _BETA1)
+    top = torch.maximum(memory * state.top, gradient.abs())
+    return Adamax(torch.addcdiv(state.value, mean, top + _EPSILON, value=-rate / (1 - _BETA1**count)), mean, top)
+
+
+def adam_step(
+    state: Adamax, gradient: Float[Tensor, "batch *shape"], rate: float, count: int, memory: float = 0.999
+) -> Adamax:
+    """The state after Adam's step number `count`, from one (Kingma & Ba 2015, §2); `memory` is its β2."""
+    mean = torch.lerp(gradient, state.mean, _BETA1)
+    squares = torch.lerp(gradient * gradient, state.top, memory)
+    size = (squares / (1 - memory**count)).sqrt() + _EPSILON
+    return Adamax(torch.addcdiv(state.value, mean, size, value=-rate / (1 - _BETA1**count)), mean, squares)
+
+
+def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:
+    """By how much a constraint g < C is broken: max(g − C, 0). It is also the gradient of the Lagrangian in λ."""
+    return (value - bound).clamp_min(0.0)
+
+
+def damped(
+    broken: Float[Tensor, "*shape"], multiplier: Float[Tensor, "*shape"], damping: float
+) -> Float[Tensor, "*shape"]:
+    """What a broken constraint adds to the Lagrangian: λ c + d c² / 2."""
+    return broken * (multiplier + 0.5 * damping * broken)
+
+
+# Places drawn for each start kept: those where the hand would touch are drawn again, as the released code does.
+_POOL = 4
+
+
+@torch.no_grad()
+def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int, seed: int, standoff: float) -> Poses:
+    """`count` seeded starts with the palm `standoff` [m] off the surface; those that touch only where all do."""
+    generator = torch.Generator().manual_seed(seed)
+    # Samples come in the order of the mesh's faces: unshuffled, the first that are clear would all lie on one side.
+    order = torch.randperm(_POOL * count, generator=generator)
+    points, normals = (torch.as_tensor(x)[order] for x in surface_samples(scene.object.mesh, _POOL * count, seed))
+    roll = math.pi * (2 * torch.rand(len(points), generator=generator, dtype=torch.float64) - 1)
+    rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -normals)
+    rotation = rotation_from_axis_angle(normals, roll) @ rotation
+    palm = points + standoff * normals
+    translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
+    joints = torch.as_tensor(hand.open_posture).expand(len(points), -1)
+    drawn = Poses(*(x.to(problem.hand.lower) for x in (translation, quaternion_from_rotation(rotation), joints)))
+    placed = hand_forward(problem, problem.hand.coarse, drawn.translation, drawn.quaternion, drawn.joints)
+    touching = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1) <= 0
+    return drawn[touching.int().argsort(stable=True)[:count]]
+
+
+# L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
+_ALL_MOTION = 60.0
+
+
+class Evaluation(NamedTuple):
+    """Terms of one evaluation, one value per start, and the outward normals at the hand's points."""
+
+    physics: Float[Tensor, "batch"]
+    task: Float[Tensor, "batch"]
+    motion: Float[Tensor, "batch"]
+    limit: Float[Tensor, "batch"]
+    range: Float[Tensor, "batch"]
+    inter: Float[Tensor, "batch"]
+    normals: Float[Tensor, "batch points 3"]
+
+
+class Slope(NamedTuple):
+    """The Lagrangian's gradients at an iterate, that by the forces where there are any, and what they are made of."""
+
+    cost: Float[Tensor, "batch"]
+    broken: Float[Tensor, "batch constraints"]
+    by_pose: Float[Tensor, "batch variables"]
+    by_force: Float[Tensor, "batch points simulations components"] | None
+    normals: Float[Tensor, "batch points 3"]
+
+
+@dataclass(frozen=True)
+class RelaxedState:
+    """Iterate and best iterate of every start.
+
+    Attributes:
+        pose: rows of translation, quaternion, joints.
+        forces: desired forces [N]; of no points without relaxation.
+        multipliers: of L_task and L_limit.
+        radius: level set at the start [m].
+        best: best pose on the true surface so far.
+        best_loss: its loss.
+        loss: of the last evaluation.
+    """
+
+    pose: Adamax
+    forces: Adamax
+    multipliers: Adamax
+    radius: Float[Tensor, "batch"]
+    best: Float[Tensor, "batch variables"]
+    best_loss: Float[Tensor, "batch"]
+    loss: Float[Tensor, "batch"]
+
+
+@dataclass(frozen=True)
+class Graspd2022:
+    """The solver of docs/method.md, §1.
+
+    Attributes:
+        config: hyper-parameters.
+        body: the object as a rigid body.
+    """
+
+    config: Graspd2022Config
+    body: FreeBody
+
+    @property
+    def steps(self) -> int:
+        return self.config.steps
+
+    @property
+    def velocities(self) -> Float[Tensor, "3 3"]:
+        """Initial velocities of the object in the three simulations [m/s]."""
+        speed = self.config.simulation.speed
+        return self.body.center.new_tensor([[0.0] * 3, [speed] * 3, [-speed] * 3])
+
+    @property
+    def time_step(self) -> float:
+        """Length of the one step [s]."""
+        config = self.config
+        if config.simulation.scaling == "published":
+            return config.simulation.time_step
+        return self.body.mass * config.simulation.speed * math.sqrt(3) / config.simulation.stopping_force
+
+    def points(self, problem: Problem) -> PointSet:
+        """The hand's points that may touch."""
+        return problem.hand.fine if self.config.contact.all_candidates else problem.hand.coarse
+
+    def init(self, problem: Problem, starts: Poses) -> RelaxedState:
+        config = self.config
+        x = pack(starts)
+        points = len(self.points(problem).links) if config.relaxation.enabled else 0
+        components = 6 if config.relaxation.desired == "wrench" else 3
+        radius = x.new_full((len(x),), config.level_set.radius_start)
+        if config.level_set.schedule == "code":
+            with torch.no_grad():
+                nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
+                radius = (nearest - config.level_set.clearance).clamp_min(0.0)
+        worst = x.new_full((len(x),), torch.inf)
+        return RelaxedState(
+            adamax(x),
+            adamax(x.new_zeros(len(x), points, 3, components)),
+            adamax(x.new_zeros(len(x), 2)),
+            radius,
+            x,
+            worst,
+            worst,
+        )
+
+    def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
+        config = self.config
+        remaining = max(0.0, 1.0 - index / config.level_set.coarse_steps) if config.level_set.coarse_steps else 0.0
+        slope = self.slope(problem, state, index, remaining * state.radius)
+        loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
+        finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
+        loss = torch.where(finite, loss, torch.inf)
+        # On a padded surface no iterate is judged.
+        better = (loss < state.best_loss) & (remaining == 0.0)
+        rate = self.rate(index) * config.relaxation.force_rate
+        pulled, count = state.forces, index + 1
+        if slope.by_force is not None:
+            pulled = adamax_step(pulled, _clean(slope.by_force, finite), rate, count, config.beta2)
+            if config.relaxation.desired == "cone":
+                cone = into_cone(pulled.value, slope.normals, config.contact.friction)
+                pulled = replace(pulled, value=cone)
+        climb = -config.constraints.multiplier_rate
+        stepped = replace(
+            state,
+            pose=self.moved(problem, state.pose, _clean(slope.by_pose, finite), (index, 0)),
+            forces=pulled,
+            multipliers=adamax_step(state.multipliers, _clean(slope.broken, finite), climb, count),
+            best=torch.where(better[:, None], state.pose.value, state.best),
+            best_loss=torch.where(better, loss, state.best_loss),
+            loss=loss,
+        )
+        if config.pose_steps.in_turns:
+            by_pose = self.slope(problem, stepped, index, remaining * state.radius, pose_only=True).by_pose
+            clean = _clean(by_pose, finite & torch.isfinite(by_pose).all(-1))
+            stepped = replace(stepped, pose=self.moved(problem, stepped.pose, clean, (index, 1)))
+        return stepped
+
+    def slope(
+        self,
+        problem: Problem,
+        state: RelaxedState,
+        index: int,
+        radius: Float[Tensor, "batch"],
+        *,
+        pose_only: bool = False,
+    ) -> Slope:
+        """Cost, broken constraints and the Lagrangian's gradients at an iterate, against the level set φ = `radius`."""
+        bounds = self.config.constraints
+        pose = state.pose.value.detach().requires_grad_(True)
+        forces = state.forces.value.detach().requires_grad_(not pose_only)
+        found = self.evaluate(problem, pose, forces, radius)
+        task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
+        broken = torch.stack([task, limit], -1)
+        cost = self.cost(found)
+        lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
+        wanted = (pose,) if pose_only else (pose, forces)
+        by_pose, *by_force = torch.autograd.grad(lagrangian.sum(), wanted, allow_unused=True)
+        return Slope(cost.detach(), broken.detach(), by_pose, by_force[0] if by_force else None, found.normals.detach())
+
+    def rate(self, index: int) -> float:
+        """Share of the step sizes at a step: grown while warming up, faded along half a cosine."""
+        config = self.config
+        fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
+        return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
+
+    def moved(
+        self, problem: Problem, pose: Adamax, gradient: Float[Tensor, "batch variables"], when: tuple[int, int]
+    ) -> Adamax:
+        """The pose after a move, `when` the index of the step and the turn in it.
+
+        All moments follow the gradient, also those of variables whose turn it is not: so it is in the code.
+        """
+        config, (index, turn) = self.config, when
+        steps = config.pose_steps
+        step = adam_step if steps.optimiser == "adam" else adamax_step
+        count = 2 * index + turn + 1 if steps.in_turns else index + 1
+        after = step(pose, gradient, self.rate(index) * config.pose_rate, count, config.beta2)
+        x, shares = after.value, move_shares(steps, turn, len(problem.hand.lower))
+        if any(share != 1.0 for share in shares):
+            x = torch.lerp(pose.value, x, x.new_tensor(shares))
+        quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
+        joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper) if steps.within_limits else x[:, 7:]
+        return replace(after, value=torch.cat([x[:, :3], quaternion, joints], -1))
+
+    def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
+        if self.config.keep == "last":
+            return unpack(state.pose.value), state.loss
+        scored = torch.isfinite(state.best_loss)
+        x = torch.where(scored[:, None], state.best, state.pose.value)
+        return unpack(x), torch.where(scored, state.best_loss, state.loss)
+
+    def cost(self, found: Evaluation) -> Float[Tensor, "batch"]:
+        """What is minimised: L_phys, or the motion itself without relaxation, with L_range and L_inter."""
+        config = self.config
+        goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
+        return goal + config.weights.range * found.range + config.weights.inter * found.inter
+
+    def evaluate(
+        self,
+        problem: Problem,
+        pose: Float[Tensor, "batch variables"],
+        desired: Float[Tensor, "batch points simulations components"],
+        radius: Float[Tensor, "batch"],
+    ) -> Evaluation:
+        """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
+        config, body = self.config, self.body
+        poses = unpack(pose)
+        placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
+        distance, normals = sample_sdf(problem.object.sdf, placed.points)
+        arms = placed.points - body.center
+        velocities = self.velocities
+        supplied = contact_forces(
+            distance - radius[:, None],
+            normals,
+            velocities,
+            stiffness=config.contact.stiffness,
+            friction_stiffness=config.contact.friction_stiffness,
+            friction=config.contact.friction,
+            leak=config.contact.leak,
+        )
+        none = torch.zeros_like(radius)
+        if config.relaxation.enabled:
+            difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
+            # The pose answers to L_phys alone, as in the released code: L_task is a matter of the forces.
+            left = motion_left(body, desired, arms.detach(), velocities, self.time_step)
+            task, motion = _ALL_MOTION * left.mean(-1), none
+        else:
+            left = motion_left(body, supplied, arms, velocities, self.time_step)
+            difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
+        spheres = place_points(problem.hand.spheres.matrix, placed.links)
+        inter = losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight)
+        if problem.obstacles is not None:
+            gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
+            inter = inter + losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
+        beyond = (poses.joints - problem.hand.upper).clamp_min(0.0) + (problem.hand.lower - poses.joints).clamp_min(0.0)
+        return Evaluation(
+            difference,
+            task,
+            motion,
+            beyond.sum(-1),
+            losses.posture(poses.joints, problem.hand.lower, problem.hand.upper),
+            inter,
+            normals,
+        )
+
+
+def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
+    """Share of the step size that each variable moves by in a turn of a step: position, quaternion, joints."""
+    position, others = (1 - turn, turn) if steps.in_turns else (1, 1)
+    return [position * steps.translation_share] * 3 + [others * steps.rotation_share] * 4 + [float(others)] * joints
+
+
+def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
+    """A gradient that is zero for starts that are not finite."""
+    if finite.all():
+        return gradient
+    return torch.where(finite.view(-1, *[1] * (gradient.dim() - 1)), gradient, torch.zeros_like(gradient))
+
+
+def plan(task: PlannerInput) -> PlannerOutput:
+    """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
+    settings, thing = task.config.settings, task.scene.object
+    problem = problem_of(task)
+    drawn = max(1, round(task.count * settings.initial.starts_per_grasp))
+    if settings.initial.kind == "published":
+        starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
+        starts = allowed_of(task, starts)
+    else:
+        starts = initial_poses_of(task, drawn)
+    if len(starts.joints) == 0:
+        return PlannerOutput(problem, starts)
+    body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
+    solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
+    poses = solution.poses[torch.isfinite(solution.loss)]
+    inside = replace(poses, joints=poses.joints.clamp(problem.hand.lower, problem.hand.upper))
+    return PlannerOutput(problem, inside, solution.interrupted)

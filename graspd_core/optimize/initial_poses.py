@@ -1,0 +1,209 @@
+"""Seeded starts: the palm, fingers open, or the half-closed fingertips at a random point of the object's hull."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graspd_core.hands.fingers import find_fingers, placed_tips
+from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, points_in_base
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.optimize.loop import Poses
+from graspd_core.optimize.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
+from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions, StartPool, aimed, open_joints, uniform
+from graspd_core.perception.scene import Scene
+from graspd_core.se3 import SE3, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
+from graspd_core.types import TriangleMesh
+
+# Tilt of the palm against the hull's normal [rad]; how far the palm is put from the object [m].
+_TILT, _PALM_STANDOFF = 0.35, (0.005, 0.05)
+# How far from open to closed the fingers are whose tips are put to the object, and how far from it [m].
+_SHARE_CLOSED, _TIP_STANDOFF = (0.2, 0.8), (-0.01, 0.01)
+# Places drawn for each start kept, surface points that tell the object's width, and how much width matters [m].
+_POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
+# Among obstacles more places are drawn; how deep a hand reaches into one [m] that makes its place e times rarer, and
+# how far a hand is lifted off the support to stay above it [m].
+_POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
+# Pools drawn at most where restrictions forbid starts, and how far apart the seeds of two pools are.
+_MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
+# The slab of the object that a hand closes around [m].
+_SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
+
+
+def draw_starts(
+    scene: Scene,
+    hand: HandModel,
+    count: int,
+    seed: int,
+    device: str,
+    dtype: torch.dtype,
+    *,
+    fingertips: float = 0.0,
+    restrictions: BoundRestrictions = UNRESTRICTED,
+) -> Poses:
+    """`count` seeded starts with the palm on the object's convex hull, preferring places that the hand can span.
+
+    After the published initialisation of Grasp'D (a random surface point, palm towards it, random roll), but on the
+    hull, so that no palm starts inside a hollow, and with place and roll drawn in favour of narrow cross-sections.
+    About a share `fingertips` of them has fingers half closed and the middle between the fingertips there in place of
+    the palm: what is low on a table or small is within no open hand's reach.
+    Where there are obstacles, hands that would reach into them, or could not have come there, are drawn last.
+    Restrictions have starts drawn until there are enough that they allow, or `_MOST_POOLS` times as many were drawn:
+    then there are fewer than `count`, perhaps none.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
+    pool = (_POOL if obstacles is None else _POOL_AMONG_OBSTACLES) * count
+    hull = convex_hull(scene.object.mesh)
+    surface = torch.as_tensor(surface_samples(scene.object.mesh, _SPAN_POINTS, seed)[0])
+
+    def draw(seed: int) -> StartPool:
+        drawn = _draw_pool(hull, hand, pool, seed, generator, fingertips)
+        return drawn if restrictions.aim is None else aimed(drawn, restrictions.aim, surface, hand, generator)
+
+    drawn = _allowed(draw, pool, seed, restrictions) if restrictions.each else draw(seed)
+    blocked = torch.zeros(len(drawn.joints), dtype=torch.float64)
+    if obstacles is not None:
+        links = forward(make_kinematics(hand, dtype=torch.float64), drawn.joints)
+        raised, blocked = raise_clear(obstacles, SE3(drawn.rotation, drawn.translation), links)
+        drawn = replace(drawn, middle=drawn.middle + raised - drawn.translation, translation=raised)
+
+    half_width = half_widths(surface, drawn.middle, drawn.rotation, hand)
+    # Gumbel noise makes the best `count` a draw without replacement with weights exp(−half width / scale).
+    gumbel = -torch.log(-torch.log(uniform(1e-12, 1.0, len(drawn.joints), generator)))
+    preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE - blocked / _DEPTH_SCALE
+    chosen = preference.topk(min(count, len(preference))).indices
+    return Poses(
+        drawn.translation[chosen].to(device, dtype),
+        quaternion_from_rotation(drawn.rotation[chosen]).to(device, dtype),
+        drawn.joints[chosen].to(device, dtype),
+    )
+
+
+def _draw_pool(
+    hull: TriangleMesh, hand: HandModel, count: int, seed: int, generator: torch.Generator, fingertips: float
+) -> StartPool:
+    """Hands that face random points of the hull, rolled at random: open, or at those points with their fingertips."""
+    points, normals = surface_samples(hull, count, seed)
+    outward = torch.as_tensor(normals)
+    tilt_axis = torch.linalg.cross(outward, torch.randn(count, 3, generator=generator, dtype=torch.float64))
+    tilt_axis = tilt_axis / tilt_axis.norm(dim=-1, keepdim=True)
+    tilt = uniform(-_TILT, _TILT, count, generator)
+    facing = (rotation_from_axis_angle(tilt_axis, tilt) @ outward[..., None]).squeeze(-1)
+    rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -facing)
+    rotation = rotation_from_axis_angle(facing, uniform(-np.pi, np.pi, count, generator)) @ rotation
+    standoff = uniform(*_PALM_STANDOFF, count, generator)
+    grip = torch.as_tensor(hand.palm_center).repeat(count, 1)
+    joints = open_joints(hand, count, generator)
+    if fingertips:
+        some = uniform(0.0, 1.0, count, generator) < fingertips
+        share = torch.where(some, uniform(*_SHARE_CLOSED, count, generator), 0.0)[:, None]
+        joints = joints + share * (torch.as_tensor(hand.closed_posture) - joints)
+        standoff = torch.where(some, uniform(*_TIP_STANDOFF, count, generator), standoff)
+        grip[some] = between_fingertips(hand, joints[some])
+    middle = torch.as_tensor(points) + standoff[:, None] * outward
+    translation = middle - (rotation @ grip[..., None]).squeeze(-1)
+    return StartPool(grip, standoff, middle, rotation, translation, joints, torch.zeros(count, dtype=torch.float64))
+
+
+def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restrictions: BoundRestrictions) -> StartPool:
+    """Of the hands that are drawn by seed those that the restrictions allow, until there are `wanted`."""
+    kept: list[StartPool] = []
+    for again in range(_MOST_POOLS):
+        drawn = draw(seed + again * _POOL_SEED_STEP)
+        quaternions = quaternion_from_rotation(drawn.rotation)
+        allowed = restrictions.starts(drawn.translation.numpy(), quaternions.numpy(), drawn.joints.numpy())
+        kept.append(drawn[torch.as_tensor(allowed)])
+        if sum(len(pool.joints) for pool in kept) >= wanted:
+            break
+    columns = zip(*(vars(pool).values() for pool in kept), strict=True)
+    return StartPool(*(torch.cat(values)[:wanted] for values in columns))
+
+
+def raise_clear(
+    obstacles: ObstacleTensors, base: SE3, links: SE3
+) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
+    """Origins of hands moved off the support, within bounds; and how deep they reach into anything [m].
+
+    They are looked at where they are moved to and drawn back from there; `links` are the link poses in the base frame.
+    """
+    translation = base.translation
+    if obstacles.normal is not None:
+        depth = -obstacle_gaps(replace(obstacles, sdfs=()), base, links).amin(-1)
+        translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
+    behind = translation + RETREAT * (base.rotation @ obstacles.retreat)
+    gaps = [obstacle_gaps(obstacles, SE3(base.rotation, at), links).amin(-1) for at in (translation, behind)]
+    return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
+
+
+def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
+    """How deep the best of `count` starts is in the scene's obstacles, there or at its retreat [m]; 0 without any."""
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
+    if obstacles is None:
+        return 0.0
+    starts = draw_starts(scene, hand, count, 0, "cpu", torch.float64, restrictions=restrictions)
+    links = forward(make_kinematics(hand, dtype=torch.float64), starts.joints)
+    return float(raise_clear(obstacles, starts.base, links)[1].amin()) if len(starts.joints) else 0.0
+
+
+def half_widths(
+    surface: Float[Tensor, "points 3"],
+    middle: Float[Tensor, "batch 3"],
+    rotation: Float[Tensor, "batch 3 3"],
+    hand: HandModel,
+) -> Float[Tensor, "batch"]:
+    """How far the object reaches from a hand's middle along the direction in which the fingers close [m].
+
+    Only the slab of the object counts that the fingers close around: a hand's breadth wide, and as deep as they reach.
+    """
+    normal = torch.as_tensor(hand.palm_normal)
+    closing = torch.as_tensor(closing_axis(hand))
+    axes = (rotation @ torch.stack([closing, normal, torch.linalg.cross(normal, closing)], -1)).unbind(-1)
+    along, depth, across = (axis @ surface.T - (axis * middle).sum(-1, keepdim=True) for axis in axes)
+    within = (across.abs() < _SLAB_HALF_BREADTH) & (depth < _SLAB_DEPTH)
+    width = torch.where(within, along.abs(), 0.0).amax(-1)
+    # A palm that faces past the object has nothing to close around.
+    return torch.where(within.any(-1), width, torch.inf)
+
+
+def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
+    """Unit direction in the palm plane along which the fingertips travel most from open to closed, base frame."""
+    tips = [int(np.flatnonzero(hand.link_group == group)[-1]) for group in hand.fingertip_groups]
+    travel = (link_poses(hand, hand.closed_posture)[1] - link_poses(hand, hand.open_posture)[1])[tips]
+    in_plane = travel - np.outer(travel @ hand.palm_normal, hand.palm_normal)
+    return np.linalg.svd(in_plane)[2][0]
+
+
+def between_fingertips(hand: HandModel, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch 3"]:
+    """The middle between the fingertips that close from one side and those from the other, base frame [m]."""
+    fingers = find_fingers(hand)
+    travel = placed_tips(hand, fingers, hand.closed_posture) - placed_tips(hand, fingers, hand.open_posture)
+    along = torch.as_tensor(travel @ closing_axis(hand))
+    kinematics = make_kinematics(hand, dtype=torch.float64)
+    tips = points_in_base(kinematics, joints, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
+    sides = [tips[:, side].mean(1) for side in (along > 0, along <= 0) if side.any()]
+    return torch.stack(sides).mean(0)
+
+
+def convex_hull(mesh: TriangleMesh) -> TriangleMesh:
+    """Convex hull of a mesh; a flat mesh, which has none, is returned as it is."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(mesh.vertices)
+    except QhullError:
+        return mesh
+    corners = hull.points[hull.simplices]
+    # Qhull leaves the winding to chance; its equations point outwards.
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = (normals * hull.equations[:, :3]).sum(-1) < 0
+    faces = hull.simplices.astype(np.int64)
+    faces[inward] = faces[inward][:, ::-1]
+    used, compact = np.unique(faces, return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))

@@ -1,0 +1,250 @@
+"""A problem as the compiled kernel reads it: plain arrays of float32 and int32 in the order that they are read in.
+
+The parts of a hand and of an object are laid out once and kept, since most requests come for the same ones.
+"""
+
+from __future__ import annotations
+
+from ctypes import Structure, addressof
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from graspd_core.hands.kinematics import placed_points
+from graspd_core.mesh.sdf import GridSDF
+from graspd_core.optimize.kernel import builds as structs
+from graspd_core.optimize.kernel.builds import kernel
+from graspd_core.optimize.obstacle_distance import ObstacleTensors
+from graspd_core.optimize.problem import (
+    FEATURE_PAIRS,
+    OBSTACLE_MARGIN,
+    REACH_WHEN_SHARP,
+    TASK_POINTS,
+    HandTensors,
+    ObjectTensors,
+    PointSet,
+    Problem,
+)
+
+# Vectors of the widest target, and floats that it may read past the last that counts.
+_LANES = 16
+_KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
+
+
+@dataclass
+class Arrays:
+    """Arrays that structures point into; they live as long as this."""
+
+    kept: list[object] = field(default_factory=list)
+
+    def floats(self, values: np.ndarray | Tensor) -> int:
+        """Address of the values as float32, aligned for vectors, with a vector of zeros behind."""
+        return self._keep(values, np.float32)
+
+    def ints(self, values: np.ndarray | Tensor) -> int:
+        """Address of the values as int32."""
+        return self._keep(values, np.int32)
+
+    def rows(self, columns: np.ndarray, width: int) -> int:
+        """Address of an (n, k) array as k rows of `width` floats."""
+        padded = np.zeros((columns.shape[1], width), dtype=np.float32)
+        padded[:, : len(columns)] = columns.T
+        return self.floats(padded)
+
+    def _keep(self, values: np.ndarray | Tensor, dtype: type) -> int:
+        flat = np.asarray(values, dtype=dtype).ravel()
+        memory = np.zeros(len(flat) + 2 * _LANES, dtype=dtype)
+        first = -memory.ctypes.data % 64 // 4
+        memory[first : first + len(flat)] = flat
+        self.kept.append(memory)
+        return memory.ctypes.data + 4 * first
+
+
+@dataclass(frozen=True, eq=False)
+class KernelProblem:
+    """What the kernel's functions are called with.
+
+    Attributes:
+        struct: the problem; it points into `arrays`.
+        arrays: its memory.
+    """
+
+    struct: structs.Problem
+    arrays: tuple[Arrays, ...]
+
+
+def kernel_problem(problem: Problem) -> KernelProblem | None:
+    """The problem laid out for the kernel; None where torch evaluates it: no kernel, another device, float64."""
+    field = problem.object.sdf.field
+    fits = field.device.type == "cpu" and field.dtype == torch.float32 and field.numel() < 2**31
+    if not fits or min(field.shape[1:]) < 2 or kernel().library is None:
+        return None
+    hand, hand_arrays = _hand(problem.hand)
+    target, object_arrays = _object(problem.object)
+    own = Arrays()
+    struct = structs.Problem(
+        object=target,
+        obstacles=_obstacles(problem.obstacles, own),
+        directions=len(problem.directions),
+        task_points=TASK_POINTS,
+        feature_pairs=FEATURE_PAIRS,
+        direction=own.floats(problem.directions),
+        friction=problem.friction,
+        sharp_reach=REACH_WHEN_SHARP,
+        **hand,
+    )
+    return KernelProblem(struct, (hand_arrays, object_arrays, own))
+
+
+@lru_cache(maxsize=8)
+def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
+    """The fields of `structs.Problem` that tell of the hand."""
+    arrays = Arrays()
+    spheres, links = placed_points(hand.spheres.matrix)
+    order = np.argsort(links.numpy(), kind="stable")
+    width = _padded(len(order))
+    weight = np.zeros((len(order), width))
+    # The upper triangle has each pair once; in another order of spheres a pair may come to lie below.
+    both = hand.spheres.weight + hand.spheres.weight.T
+    weight[:, : len(order)] = np.triu(both.numpy()[np.ix_(order, order)], 1)
+    centers = _points(spheres.numpy()[order], links.numpy()[order], arrays)
+    radius = arrays.rows(hand.spheres.radii.numpy()[order, None], width)
+    parts: dict[str, Structure] = {
+        "hand": _links(hand, arrays),
+        "coarse": _candidates(hand.coarse, arrays),
+        "fine": _candidates(hand.fine, arrays),
+        "solids": _solids(hand, arrays),
+        "spheres": structs.Spheres(centers, radius, arrays.floats(weight)),
+    }
+    return parts, arrays
+
+
+def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
+    model, k = hand.model, hand.kinematics
+    count = model.num_links
+    moved = model.link_joint >= 0
+    kind = np.array([_KINDS[kind] if moves else 0 for kind, moves in zip(model.joint_kind, moved, strict=True)])
+    order = k.order.numpy()
+
+    def rows(values: Tensor | None) -> int:
+        return arrays.floats(np.zeros((count, 12)) if values is None else values.numpy()[order])
+
+    return structs.Hand(
+        links=count,
+        joints=model.num_joints,
+        groups=len(hand.reach),
+        parent=arrays.ints(model.link_parent),
+        joint=arrays.ints(np.maximum(model.link_joint, 0)),
+        kind=arrays.ints(kind),
+        constant=rows(k.constant),
+        sine=rows(k.sine),
+        cosine=rows(k.cosine),
+        slide=rows(k.slide),
+        axis=arrays.floats(model.joint_axis),
+        multiplier=arrays.floats(model.link_multiplier),
+        shift=arrays.floats(model.link_shift),
+        lower=arrays.floats(hand.lower),
+        upper=arrays.floats(hand.upper),
+        joint_scale=arrays.floats(hand.joint_scale),
+        pivot=arrays.floats(hand.pivot),
+        reach=arrays.floats(hand.reach),
+    )
+
+
+def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
+    """Candidates sorted by group and link; every group of links moves as one, so that its links lie together."""
+    at, links = (values.numpy() for values in placed_points(points.matrix))
+    group = np.zeros(len(at), dtype=int)
+    for index, members in enumerate(points.groups.numpy()):
+        group[members] = index
+    order = np.lexsort((links, group))
+    starts = np.searchsorted(group[order], np.arange(len(points.groups) + 1))
+    return _points(at[order], links[order], arrays, starts)
+
+
+def _points(
+    points: Float[np.ndarray, "points 3"],
+    links: Int[np.ndarray, "points"],
+    arrays: Arrays,
+    group_start: Int[np.ndarray, "groups"] | None = None,
+) -> structs.Points:
+    starts = np.flatnonzero(np.diff(links, prepend=-1))
+    return structs.Points(
+        count=len(points),
+        stride=_padded(len(points)),
+        runs=len(starts),
+        xyz=arrays.rows(points, _padded(len(points))),
+        run_start=arrays.ints(np.append(starts, len(points))),
+        run_link=arrays.ints(links[starts]),
+        group_start=None if group_start is None else arrays.ints(group_start),
+    )
+
+
+def _solids(hand: HandTensors, arrays: Arrays) -> structs.Solids:
+    solids = hand.solids
+    group = hand.group_of_solid.numpy()
+    return structs.Solids(
+        count=len(group),
+        pose=arrays.floats(torch.cat([solids.rotation, solids.translation[..., None]], -1)),
+        core=arrays.floats(solids.core),
+        radius=arrays.floats(solids.radius),
+        round=arrays.ints(solids.is_round),
+        link=arrays.ints(solids.link),
+        group=arrays.ints(np.where(group < len(hand.reach), group, -1)),
+    )
+
+
+@lru_cache(maxsize=4)
+def _object(target: ObjectTensors) -> tuple[structs.Object, Arrays]:
+    arrays = Arrays()
+    width = _padded(len(target.features))
+    return structs.Object(
+        grid=_grid(target.sdf, arrays),
+        confidence=None if target.confidence is None else arrays.floats(target.confidence),
+        center=tuple(target.center.tolist()),
+        length=target.length,
+        features=arrays.rows(target.features.numpy(), width),
+        feature_count=len(target.features),
+        feature_stride=width,
+        coarse_features=min(target.coarse_features, len(target.features)),
+    ), arrays
+
+
+def _grid(sdf: GridSDF, arrays: Arrays) -> structs.Grid:
+    nodes = arrays.floats(sdf.field.permute(1, 2, 3, 0))
+    return structs.Grid(nodes, *sdf.field.shape[1:], tuple(sdf.origin.tolist()), float(sdf.spacing))
+
+
+def _obstacles(obstacles: ObstacleTensors | None, arrays: Arrays) -> structs.Obstacles:
+    if obstacles is None:
+        return structs.Obstacles()
+    grids = (structs.Grid * len(obstacles.sdfs))(*(_grid(sdf, arrays) for sdf in obstacles.sdfs))
+    arrays.kept.append(grids)
+    corners, corner_radius = _balls(obstacles.corner_matrix, obstacles.corner_radii, arrays)
+    spheres, sphere_radius = _balls(obstacles.sphere_matrix, obstacles.sphere_radii, arrays)
+    return structs.Obstacles(
+        grids=len(obstacles.sdfs),
+        has_support=obstacles.normal is not None,
+        grid=addressof(grids) if obstacles.sdfs else None,
+        normal=(0.0, 0.0, 0.0) if obstacles.normal is None else tuple(obstacles.normal.tolist()),
+        offset=obstacles.offset,
+        margin=OBSTACLE_MARGIN,
+        corners=corners,
+        spheres=spheres,
+        corner_radius=corner_radius,
+        sphere_radius=sphere_radius,
+    )
+
+
+def _balls(matrix: Tensor, radii: Tensor, arrays: Arrays) -> tuple[structs.Points, int]:
+    at, links = (values.numpy() for values in placed_points(matrix))
+    order = np.argsort(links, kind="stable")
+    return _points(at[order], links[order], arrays), arrays.floats(radii.numpy()[order])
+
+
+def _padded(count: int) -> int:
+    return -(-count // _LANES) * _LANES

@@ -1,0 +1,141 @@
+"""Closed-form resistance of soft contacts against disturbance wrenches.
+
+For a unit disturbance w the friction-cone-bounded contact forces that resist it best have a closed form at every
+contact, so the support function of the grasp wrench space is a sum over contacts (docs/method.md):
+
+    v_ik = w_k,lin + w_k,ang × (x_i − c) / L
+    h_k  = Σ_i s_i · max(0, −n_i·v_ik + μ ‖v_ik − (n_i·v_ik) n_i‖)
+
+Gradients are exact, except that the square root of the tangential speed is floored at `_TANGENT_FLOOR`.
+
+Loss terms of the closed-form relaxation: pure functions of arrays, one value per start, each of order one.
+
+Weights live in `closed_form_config.LossWeights`. Gradients are exact where a term is smooth.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# Floor of the squared tangential speed, relative to the unit disturbance: keeps the square root differentiable.
+_TANGENT_FLOOR = 1e-6
+
+
+def disturbance_directions(count: int, seed: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "count 6"]:
+    """Unit wrenches spread over the sphere in R⁶: the 12 signed axes first, then farthest-of-many random ones."""
+    axes = torch.cat([torch.eye(6, dtype=dtype), -torch.eye(6, dtype=dtype)])
+    chosen = axes[:count]
+    pool = torch.randn(64 * max(count, 1), 6, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+    pool = pool / pool.norm(dim=-1, keepdim=True)
+    nearest = (pool @ chosen.T).amax(-1)
+    while len(chosen) < count:
+        pick = nearest.argmin()
+        chosen = torch.cat([chosen, pool[pick : pick + 1]])
+        nearest = torch.maximum(nearest, pool @ pool[pick])
+    return chosen
+
+
+def wrench_support(
+    arms: Float[Tensor, "batch points 3"],
+    normals: Float[Tensor, "batch points 3"],
+    activation: Float[Tensor, "batch points"],
+    directions: Float[Tensor, "directions 6"],
+    friction: float,
+) -> Float[Tensor, "batch directions"]:
+    """Support h_k of the soft grasp wrench space in each direction; force closure is h_k > 0 for all k.
+
+    Args:
+        arms: contact points about the centre of mass over the characteristic length, (x − c) / L.
+        normals: outward unit normals of the object.
+        activation: soft contact weight s_i ≥ 0 of each point.
+        directions: unit wrenches (linear, angular).
+        friction: Coulomb coefficient μ.
+    """
+    linear, angular = directions[:, :3], directions[:, 3:]
+    # n·v and |v|² are linear in small feature vectors of the contact, so both are matrix products.
+    normal_speed = torch.cat([normals, torch.linalg.cross(arms, normals)], -1) @ directions.T
+    x, y, z = arms.unbind(-1)
+    features = torch.stack([x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
+    a, b, c = angular.unbind(-1)
+    # |ω×r|² = |ω|²|r|² − (ω·r)², expanded in the six products of r.
+    quadratic = torch.stack(
+        [b * b + c * c, a * a + c * c, a * a + b * b, -2 * a * b, -2 * a * c, -2 * b * c], -1
+    )  # fmt: skip
+    weights = torch.cat([2 * torch.linalg.cross(linear, angular), quadratic], -1)
+    squared_speed = (linear * linear).sum(-1) + features @ weights.T
+    tangential = (squared_speed - normal_speed * normal_speed).clamp_min(_TANGENT_FLOOR).sqrt()
+    resistance = (friction * tangential - normal_speed).clamp_min(0.0)
+    return (activation[..., None, :] @ resistance).squeeze(-2)
+
+
+# Lengths that make a term one [m].
+_CENTIMETRE = 0.01
+_MILLIMETRE = 0.001
+# Added to h so that a start without any contact has a finite task loss.
+_SUPPORT_FLOOR = 1e-3
+
+
+def soft_contact(
+    distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"], delta: float
+) -> Float[Tensor, "batch points"]:
+    """Contact activation s = exp(−|φ − r| / δ): one on the padded surface, never with a zero gradient off it."""
+    return (-(distance - radius[:, None]).abs() / delta).exp()
+
+
+def hard_contact(
+    distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"], delta: float
+) -> Float[Tensor, "batch points"]:
+    """The ablation of `soft_contact`: one within δ of the padded surface, zero elsewhere, without any gradient."""
+    return ((distance - radius[:, None]).abs() <= delta).to(distance)
+
+
+def wrench_resistance(
+    support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0
+) -> Float[Tensor, "batch"]:
+    """Soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst disturbance is resisted."""
+    resisted = -(support / friction + _SUPPORT_FLOOR).log()
+    count = support.shape[-1]
+    return (torch.logsumexp(sharpness * resisted, -1) - torch.log(torch.tensor(float(count)))) / sharpness
+
+
+def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Float[Tensor, "batch"]:
+    """Distance of each group of links from the padded surface, either side, saturating beyond the group's reach [m].
+
+    Groups with a long reach (fingertips) are drawn from afar, the others only finish a contact that is already near.
+    """
+    size = gap.abs()
+    return (size * reach / (size + reach)).mean(-1) / _CENTIMETRE
+
+
+def penetration(distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+    """Depth below the padded surface: sum of squares in mm², tempered to grow linearly for deep points."""
+    depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
+    return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
+
+
+def self_collision(
+    centers: Float[Tensor, "batch spheres 3"],
+    radii: Float[Tensor, "spheres"],
+    weight: Float[Tensor, "spheres spheres"],
+) -> Float[Tensor, "batch"]:
+    """Overlap of proxy spheres of non-adjacent links [mm²]: depth as (R² − d²) / 2R, exact where spheres just touch.
+
+    `weight` is 1 / 2R [1/m] for each checked pair, R the sum of its radii, once, and zero for every other.
+    """
+    inner = (radii * radii - (centers * centers).sum(-1))[..., None]
+    ones, r = torch.ones_like(inner), radii.expand(len(centers), -1)[..., None]
+    # R² − |a − b|² = 2 a·b + 2 rₐr_b + (rₐ² − |a|²) + (r_b² − |b|²), one matrix product.
+    left = torch.cat([2 * centers, 2 * r, inner, ones], -1)
+    right = torch.cat([centers, r, ones, inner], -1)
+    depth = ((left @ right.transpose(-1, -2)) * (weight / _MILLIMETRE)).relu().flatten(1)
+    return (depth * depth).sum(-1) / 10.0
+
+
+def posture(
+    joints: Float[Tensor, "batch joints"], lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]
+) -> Float[Tensor, "batch"]:
+    """Squared distance of the joints from mid-range, in half ranges."""
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    return (((joints - middle) / half) ** 2).sum(-1)

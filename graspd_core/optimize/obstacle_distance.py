@@ -1,0 +1,187 @@
+"""Room for the hand: how far it is from what the object stands on and from the things around it.
+
+A solid is convex, so it is clear of a half-space exactly when its extreme points are: boxes and hulls by their corners,
+spheres and capsules by their ends less their radius, cylinders by points of their rims. Against neighbours the proxy
+spheres (`hands.proxies`), which bulge a little out of flat faces, stand in for what lies between the corners. Gradients
+are exact but for that of the neighbours' interpolated distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graspd_core.hands.kinematics import Kinematics, forward, link_poses, place_points, placement
+from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.self_collision import collision_spheres
+from graspd_core.hands.surface_points import outermost
+from graspd_core.mesh.sdf import GridSDF, sample_sdf
+from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.se3 import SE3, rotation_from_quaternion
+
+# The hand comes to the pregrasp straight along its approach, from as far as this [m]; where it is looked at on the way.
+RETREAT = 0.1
+RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
+_WAY_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+# What the optimiser makes of gaps ends below this [m].
+WIDE = 0.005
+# Points that stand for a cylinder's rim, and for a hull with more corners than this.
+_RIM, _HULL = 12, 32
+
+
+@dataclass(frozen=True)
+class ObstacleTensors:
+    """Support and neighbours, and the points of the hand that are held against them.
+
+    Attributes:
+        corner_matrix: places the extreme points of the hand's solids, see `hands.kinematics.placement`.
+        corner_radii: of the balls about them [m].
+        sphere_matrix: places the proxy spheres likewise.
+        sphere_radii: of the proxy spheres [m].
+        normal: of the support, into the free side; None without a support.
+        offset: n·x of the support's points [m].
+        sdfs: signed distances of the things that this hand can reach.
+        retreat: unit direction in which the hand leaves its pregrasp backwards, base frame.
+    """
+
+    corner_matrix: Float[Tensor, "corners columns"]
+    corner_radii: Float[Tensor, "corners"]
+    sphere_matrix: Float[Tensor, "spheres columns"]
+    sphere_radii: Float[Tensor, "spheres"]
+    normal: Float[Tensor, "3"] | None
+    offset: float
+    sdfs: tuple[GridSDF, ...]
+    retreat: Float[Tensor, "3"]
+
+
+def make_obstacle_tensors(
+    scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype
+) -> ObstacleTensors | None:
+    """The scene's obstacles as this hand meets them; None where it meets none, so that nothing is ever evaluated."""
+    obstacles = [n for n in scene.obstacles if _in_reach(n, scene, hand)]
+    if scene.support is None and not obstacles:
+        return None
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, device=device, dtype=dtype)
+
+    def placed(points: np.ndarray, links: np.ndarray) -> Tensor:
+        return placement(hand.num_links, tensor(points), torch.as_tensor(links, device=device, dtype=torch.long))
+
+    corners, radii, links = extreme_points(hand)
+    centers, sphere_radii, sphere_links = collision_spheres(hand)
+    return ObstacleTensors(
+        corner_matrix=placed(corners, links),
+        corner_radii=tensor(radii),
+        sphere_matrix=placed(centers, sphere_links),
+        sphere_radii=tensor(sphere_radii),
+        normal=None if scene.support is None else tensor(scene.support.normal),
+        offset=0.0 if scene.support is None else scene.support.offset,
+        sdfs=tuple(n.sdf.to(device, dtype) for n in obstacles),
+        retreat=tensor(-hand.approach),
+    )
+
+
+def _in_reach(neighbour: Obstacle, scene: Scene, hand: HandModel) -> bool:
+    """Whether a hand whose palm lies on the object, or comes from a retreat, could touch the neighbour."""
+    reach = hand_reach(hand) + RETREAT
+    gap, _ = sample_sdf(neighbour.sdf, torch.as_tensor(scene.object.mesh.vertices).to(neighbour.sdf.field))
+    return float(gap.min()) < reach
+
+
+def hand_reach(hand: HandModel) -> float:
+    """Distance from the middle of the palm to the farthest point of the open hand [m]."""
+    corners, radii, links = extreme_points(hand)
+    rotations, translations = link_poses(hand, hand.open_posture)
+    placed = np.einsum("pij,pj->pi", rotations[links], corners) + translations[links]
+    return float((np.linalg.norm(placed - hand.palm_center, axis=1) + radii).max())
+
+
+def extreme_points(
+    hand: HandModel,
+) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
+    """Points in link frames [m] and radii [m] of balls whose convex hull is each solid, and their links."""
+    solids = extreme_points_of_solids(hand)
+    points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
+    return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
+
+
+def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
+    """For each solid of the hand the points of `extreme_points` and their radius [m], and its link."""
+    found = []
+    for primitive in hand.primitives:
+        at, radius = _extremes(primitive)
+        found.append((at @ primitive.rotation.T + primitive.translation, radius, primitive.link))
+    return found
+
+
+def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
+    size = primitive.size
+    if primitive.kind == "sphere":
+        return np.zeros((1, 3)), size[0]
+    if primitive.kind == "capsule":
+        return np.array([[0.0, 0.0, size[1]], [0.0, 0.0, -size[1]]]), size[0]
+    if primitive.kind == "box":
+        return np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(-1, 3) * np.asarray(size), 0.0
+    if primitive.kind == "cylinder":
+        turn = 2 * np.pi * np.arange(_RIM) / _RIM
+        rim = size[0] * np.column_stack([np.cos(turn), np.sin(turn)])
+        return np.vstack([np.column_stack([rim, np.full(_RIM, s * size[1])]) for s in (1, -1)]), 0.0
+    corners = primitive.vertices
+    return outermost(corners, _HULL) if len(corners) > _HULL else corners, 0.0
+
+
+def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Float[Tensor, "batch gaps"]:
+    """Signed distances [m] of the hand's points to every obstacle, negative inside; link poses in the base frame.
+
+    A gap to a thing that is at least `wide` may be given as `wide`.
+    """
+    corners = base.apply(place_points(obstacles.corner_matrix, links))
+    gaps = []
+    if obstacles.normal is not None:
+        gaps.append(corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii)
+    if obstacles.sdfs:
+        spheres = base.apply(place_points(obstacles.sphere_matrix, links))
+        points = torch.cat([corners, spheres], 1)
+        radii = torch.cat([obstacles.corner_radii, obstacles.sphere_radii])
+        gaps.extend(_gaps_to(sdf, points, radii, wide) for sdf in obstacles.sdfs)
+    return torch.cat(gaps, -1)
+
+
+def _gaps_to(
+    sdf: GridSDF, points: Float[Tensor, "batch points 3"], radii: Float[Tensor, "points"], wide: float
+) -> Float[Tensor, "batch points"]:
+    """Gaps of balls to one thing. Of dozens of things about an object each has few balls near: these are sampled."""
+    off_grid = (points.detach() - (sdf.origin + sdf.half)).abs() - sdf.half
+    near = (off_grid < (radii + wide)[:, None]).all(-1)
+    gaps = points.new_full(near.shape, wide)
+    if bool(near.any()):
+        gaps[near] = sample_sdf(sdf, points[near])[0] - radii.expand(near.shape)[near]
+    return gaps
+
+
+@torch.no_grad()
+def gap_on_the_way(
+    obstacles: ObstacleTensors,
+    kinematics: Kinematics,
+    quaternion: Float[Tensor, "batch 4"],
+    pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
+    grasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
+    wide: float = WIDE,
+) -> Float[Tensor, "batch"]:
+    """Least signed distance [m] of the hand to any obstacle, from the retreat over the pregrasp to the grasp.
+
+    It is negative inside; one of at least `wide` may be given as `wide`. `pregrasp` and `grasp` are base translations
+    and joints; the base is turned alike in both.
+    """
+    rotation = rotation_from_quaternion(quaternion)
+    back = rotation @ obstacles.retreat
+    way = [(pregrasp[0] + RETREAT * share * back, pregrasp[1]) for share in RETREAT_SHARES]
+    way += [(a * pregrasp[0] + (1 - a) * grasp[0], a * pregrasp[1] + (1 - a) * grasp[1]) for a in _WAY_SHARES]
+    placed = [(SE3(rotation, at), forward(kinematics, joints)) for at, joints in way]
+    gaps = [obstacle_gaps(obstacles, base, links, wide).amin(-1) for base, links in placed]
+    return torch.stack(gaps).amin(0)

@@ -1,0 +1,198 @@
+"""The methods: a row each. To add one, write its folder and its row; nothing else is edited.
+
+Everything that a run of `plan_grasps` is set by, and the presets that hold it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_bench.baselines.annealing import AnnealingConfig
+from graspd_bench.baselines.random_closure import RandomClosureConfig
+from graspd_core.config import CertaintyConfig, GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
+from graspd_core.config.mapping import coerced, read_yaml
+from graspd_core.errors import ConfigError, shown
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, at_budget
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
+from graspd_core.paths import config_dir
+
+if TYPE_CHECKING:
+    from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
+
+
+def _unchanged(settings: Any, budget: float) -> Any:
+    return settings
+
+
+def _one(settings: Any) -> int:
+    return 1
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to find grasps.
+
+    Attributes:
+        module: has `plan(PlannerInput) -> PlannerOutput`; imported when the method is first used, since it needs torch.
+        config: dataclass of its settings; a preset's section of the method's name fills it.
+        label: its name in charts.
+        colour, marker: of its points in charts, as Matplotlib takes them.
+        benchmark_count: grasps of one unfiltered batch in the benchmark.
+        at_budget: its settings at a share of the usual budget; a method without one keeps its settings.
+        searches: of a round at most, by its settings: again only where too few grasps are expected to hold.
+    """
+
+    module: str
+    config: type
+    label: str
+    colour: str
+    marker: str
+    benchmark_count: int
+    at_budget: Callable[[Any, float], Any] = _unchanged
+    searches: Callable[[Any], int] = _one
+
+    def plan(self, task: PlannerInput) -> PlannerOutput:
+        """Find poses. Numerical trouble is a pose that is not there, never an exception."""
+        return importlib.import_module(self.module).plan(task)
+
+
+METHODS: dict[str, Method] = {
+    "closed_form": Method(
+        "graspd_core.optimize.closed_form.closed_form",
+        ClosedFormConfig,
+        "closed form",
+        "#0072B2",
+        "o",
+        16,
+        at_budget,
+        attrgetter("searches"),
+    ),
+    "graspd2022": Method(
+        "graspd_core.optimize.graspd2022.graspd2022", Graspd2022Config, "Grasp'D (2022)", "#D55E00", "s", 8
+    ),
+    "annealing": Method("graspd_bench.baselines.annealing", AnnealingConfig, "annealing", "#009E73", "^", 8),
+    "random_closure": Method(
+        "graspd_bench.baselines.random_closure",
+        RandomClosureConfig,
+        "random closure",
+        "#7F7F7F",
+        "D",
+        16,
+    ),
+}
+
+
+_DEFAULT_METHOD = "closed_form"
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """Settings of a run, apart from the scene, the hand and the seed.
+
+    Attributes:
+        resolution: the signed distance grid has at most the cube of it in nodes; a cube has as many along each side.
+        method: how poses are searched for, a name of `METHODS`.
+        settings: of that method, of the type that its row names; None takes the defaults.
+        problem: how scene and hand are laid out.
+        grasp_stages: pregrasp and squeeze.
+        rounds: of optimiser and trial.
+        robust: the order of the verified grasps.
+        certainty: how sure a grasp of a partly guessed object must be.
+
+    Raises:
+        ConfigError: the method is unknown, or the settings are another method's.
+    """
+
+    resolution: int = 48
+    method: str = _DEFAULT_METHOD
+    settings: Any = None
+    problem: ProblemConfig = field(default_factory=ProblemConfig)
+    grasp_stages: GraspStagesConfig = field(default_factory=GraspStagesConfig)
+    rounds: RoundsConfig = field(default_factory=RoundsConfig)
+    robust: RobustConfig = field(default_factory=RobustConfig)
+    certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
+
+    def __post_init__(self) -> None:
+        config = _row(self.method, "config").config
+        if self.settings is None:
+            object.__setattr__(self, "settings", config())
+        elif not isinstance(self.settings, config):
+            raise ConfigError(f"settings: {type(self.settings).__name__} is not {config.__name__} of {self.method}")
+
+    def at_budget(self, budget: float) -> PlanConfig:
+        """The same method with more or less effort; 1 is its settings as they are."""
+        return dataclasses.replace(self, settings=METHODS[self.method].at_budget(self.settings, budget))
+
+    def with_method(self, method: str) -> PlanConfig:
+        """The settings with another method at its defaults; unchanged where it is the same method."""
+        return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
+
+
+def _row(method: Any, where: str) -> Any:
+    if not isinstance(method, str) or method not in METHODS:
+        raise ConfigError(f"{where}.method: {shown(method)} is not one of {', '.join(METHODS)}")
+    return METHODS[method]
+
+
+def to_mapping(config: PlanConfig) -> dict[str, Any]:
+    """The settings as a preset file has them: the method's own are in the section of its name."""
+    values = dataclasses.asdict(config)
+    return {config.method if key == "settings" else key: value for key, value in values.items()}
+
+
+def plan_config(values: Any, where: str = "config") -> PlanConfig:
+    """Build the settings of a run from a preset's nested mappings.
+
+    Raises:
+        ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
+    """
+    named = values.get("method", _DEFAULT_METHOD) if isinstance(values, Mapping) else _DEFAULT_METHOD
+    row = _row(named, where)
+    others = sorted((set(values) & set(METHODS)) - {named}) if isinstance(values, Mapping) else []
+    if others:
+        raise ConfigError(f"{where}.{others[0]}: settings of another method; this one has method: {named}")
+    hints = {f.name: f.default_factory for f in dataclasses.fields(PlanConfig) if f.name not in ("settings", "method")}
+    hints |= {"resolution": int, "method": str, named: row.config}
+    found = coerced(hints, values, where)
+    return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
+
+
+def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
+    """The settings with some of a preset's values changed, each by its dotted name.
+
+    Raises:
+        ConfigError: there is no such value, or it is of another type.
+    """
+    if "method" in changes:
+        config = config.with_method(changes["method"])
+    values = to_mapping(config)
+    for name, value in changes.items():
+        *sections, last = name.split(".")
+        section = values
+        for key in sections:
+            section = section.setdefault(key, {})
+        section[last] = value
+    return plan_config(values, "settings")
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the boxed presets."""
+    return tuple(sorted(path.stem for path in (config_dir() / "presets").glob("*.yaml")))
+
+
+def load_preset(name: str) -> PlanConfig:
+    """A boxed preset by name, or a preset file by path.
+
+    Raises:
+        ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
+    """
+    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
+    return plan_config(read_yaml(path), where=path.name)

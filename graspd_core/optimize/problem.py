@@ -1,0 +1,429 @@
+"""Hand and object laid out as tensors on one device and dtype: what every evaluation of a problem reads.
+
+The assembled problem: everything a solver evaluates, as tensors on one device, and the terms of one evaluation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from graspd_core.config import ProblemConfig
+from graspd_core.hands.kinematics import (
+    Kinematics,
+    forward,
+    in_base,
+    link_poses,
+    make_kinematics,
+    place_points,
+    placement,
+)
+from graspd_core.hands.link_distance import CollisionTensors, make_collision_tensors, pair_distance, solid_bound
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import collision_spheres
+from graspd_core.mesh.sdf import GridSDF, sample_sdf
+from graspd_core.mesh.sharp_features import THIN_WALLED, neighbours_together
+from graspd_core.optimize import losses
+from graspd_core.optimize.losses import disturbance_directions, wrench_support
+from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
+from graspd_core.perception.scene import Scene, object_sharp_points, sample_confidence
+from graspd_core.se3 import SE3, rotation_from_quaternion
+
+# How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
+_REACH_OF_TIPS = 0.1
+_REACH_OF_OTHERS = 0.004
+# The same of patches of a hand that is to touch with all of itself [m].
+_REACH_OF_PATCHES = 0.03
+# A base frame this near to the middle of the palm lies in the palm [m].
+_PALM_RADIUS = 0.05
+
+
+@dataclass(frozen=True)
+class PointSet:
+    """Contact candidates of a hand.
+
+    Attributes:
+        matrix: places them by their links' poses, see `hands.kinematics.placement`.
+        links: link of each.
+        groups: candidates of each rigid group of links, or of each patch of one, padded by repetition.
+    """
+
+    matrix: Float[Tensor, "points columns"]
+    links: Int[Tensor, "points"]
+    groups: Int[Tensor, "groups members"]
+
+
+@dataclass(frozen=True)
+class SphereTensors:
+    """Spheres that fill the hand's links, for self-collision.
+
+    Attributes:
+        matrix: places their centres by their links' poses, see `hands.kinematics.placement`.
+        radii: [m].
+        weight: 1 / 2R of the checked pairs with R the sum of their radii, zero elsewhere [1/m].
+    """
+
+    matrix: Float[Tensor, "spheres columns"]
+    radii: Float[Tensor, "spheres"]
+    weight: Float[Tensor, "spheres spheres"]
+
+
+@dataclass(frozen=True, eq=False)
+class HandTensors:
+    """A hand.
+
+    Attributes:
+        model: the hand that is laid out.
+        kinematics: forward kinematics.
+        coarse: the first, evenly spread contact candidates; what most steps look at.
+        fine: all contact candidates; what the last steps look at.
+        reach: attraction range of each group of candidates [m].
+        solids: collision primitives.
+        group_of_solid: index of the group of each solid's links, the first where they have several; one past the last
+            where they have no coarse candidate.
+        spheres: for self-collision.
+        lower: joint limits [rad] or [m].
+        upper: joint limits [rad] or [m].
+        pivot: the point that a solver turns the hand about, base frame [m].
+        joint_scale: travel of each joint that counts as much as one radian, one where it turns [rad] or [m].
+    """
+
+    model: HandModel
+    kinematics: Kinematics
+    coarse: PointSet
+    fine: PointSet
+    reach: Float[Tensor, "groups"]
+    solids: CollisionTensors
+    group_of_solid: Int[Tensor, "solids"]
+    spheres: SphereTensors
+    lower: Float[Tensor, "joints"]
+    upper: Float[Tensor, "joints"]
+    pivot: Float[Tensor, "3"]
+    joint_scale: Float[Tensor, "joints"]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTensors:
+    """An object.
+
+    Attributes:
+        sdf: signed distance field.
+        features: sharp points of its surface, which candidates would not notice sinking in [m].
+        coarse_features: how many of them, from the first, the coarse steps look at too: none, but on thin walls, which
+            a finger could otherwise step through.
+        center: centre of mass [m].
+        length: characteristic length of torques [m].
+        confidence: in the surface near each node of `sdf`, raised to a floor; None: all of it is known.
+    """
+
+    sdf: GridSDF
+    features: Float[Tensor, "features 3"]
+    coarse_features: int
+    center: Float[Tensor, "3"]
+    length: float
+    confidence: Float[Tensor, "x y z"] | None
+
+
+@lru_cache(maxsize=8)
+def make_hand_tensors(
+    hand: HandModel, candidates: int, patch_size: int, device: str, dtype: torch.dtype
+) -> HandTensors:
+    """Lay a hand out; the coarse set is the first `candidates` of the contact candidates that it was loaded with.
+
+    They are grouped by rigid groups of links, or into patches of so many of them. Kept for the last few hands, which
+    are hashed by identity.
+    """
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, device=device, dtype=dtype)
+
+    def index(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, device=device, dtype=torch.long)
+
+    kinematics, of_link = make_kinematics(hand, device, dtype), hand.link_group[hand.candidate_link]
+    groups = _patches(hand, candidates, patch_size) if patch_size else of_link
+    present, first = np.unique(groups[:candidates], return_index=True)
+    reach = np.where(np.isin(of_link[first], hand.fingertip_groups), _REACH_OF_TIPS, _REACH_OF_OTHERS)
+
+    def point_set(count: int) -> PointSet:
+        links = hand.candidate_link[:count]
+        points = tensor(hand.candidate_points[:count])
+        members = _members(groups[:count], present)
+        return PointSet(placement(hand.num_links, points, index(links)), index(links), index(members))
+
+    solids = make_collision_tensors(hand, device, dtype)
+    same = hand.link_group[solids.link.cpu().numpy()][:, None] == of_link[first]
+    place = np.where(same.any(1), same.argmax(1), len(present))
+    return HandTensors(
+        model=hand,
+        kinematics=kinematics,
+        coarse=point_set(candidates),
+        fine=point_set(len(hand.candidate_link)),
+        reach=tensor(np.full(len(present), _REACH_OF_PATCHES) if patch_size else reach),
+        solids=solids,
+        group_of_solid=index(place),
+        spheres=_sphere_tensors(hand, device, dtype),
+        lower=tensor(hand.lower),
+        upper=tensor(hand.upper),
+        pivot=tensor(_pivot(hand)),
+        joint_scale=tensor(hand.joint_scale),
+    )
+
+
+def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereTensors:
+    centers, radii, links = collision_spheres(hand)
+    checked = ~hand.adjacent[np.ix_(links, links)]
+    weight = np.triu(checked, 1) * 0.5 / (radii[:, None] + radii[None, :])
+    points, radius, pairs = (torch.as_tensor(x, device=device, dtype=dtype) for x in (centers, radii, weight))
+    at = torch.as_tensor(links, device=device, dtype=torch.long)
+    return SphereTensors(placement(hand.num_links, points, at), radius, pairs)
+
+
+@lru_cache(maxsize=4)
+def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
+    """Lay the scene's object out; kept for the last few scenes, which are hashed by identity."""
+    sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
+    thin = thin_share > THIN_WALLED
+    floor, confidence = settings.confidence_floor, None
+    if scene.confidence is not None:
+        confidence = floor + (1 - floor) * scene.confidence.to(device, dtype)
+    sdf = scene.sdf.to(device, dtype)
+    if settings.softness:
+        sharp, thin = sharp[:0], False
+        sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
+    # They were chosen one by one, each the farthest from all before: the first half is spread as well.
+    coarse = max(settings.features, len(sharp) // 2) if thin else 0
+    features = [part[neighbours_together(part)] for part in (sharp[:coarse], sharp[coarse:])]
+    return ObjectTensors(
+        sdf=sdf,
+        features=torch.as_tensor(
+            np.concatenate(features) if thin else sharp[: settings.features], device=device, dtype=dtype
+        ),
+        coarse_features=coarse,
+        center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
+        length=scene.object.radius,
+        confidence=confidence,
+    )
+
+
+def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
+    """The middle of the palm, or the base frame's origin where that lies in the palm [m]."""
+    far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
+    return hand.palm_center if far else np.zeros(3)
+
+
+def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
+    """Which patch each contact candidate belongs to: the nearest of its links', each around a coarse candidate.
+
+    The coarse candidates of a rigid group of links have one patch for `size` of them, the centres far from each other.
+    """
+    posture = link_poses(hand, (hand.lower + hand.upper) / 2)
+    points = in_base(posture, hand.candidate_points, hand.candidate_link)
+    of_link, patch, count = hand.link_group[hand.candidate_link], np.zeros(len(points), dtype=int), 0
+    for group in np.unique(of_link[:candidates]):
+        members = np.flatnonzero(of_link == group)
+        coarse = members[members < candidates]
+        # Rounded, so that which of two equal ones is nearer does not depend on where the base frame is.
+        gaps = np.linalg.norm(points[members][:, None] - points[coarse], axis=-1).round(6)
+        centres = [0]
+        while len(centres) < round(len(coarse) / size):
+            centres.append(int(gaps[np.searchsorted(members, coarse)][:, centres].min(1).argmax()))
+        patch[members] = count + gaps[:, centres].argmin(1)
+        count += len(centres)
+    patch[~np.isin(of_link, of_link[:candidates])] = -1
+    return patch
+
+
+def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"]) -> Int[np.ndarray, "groups width"]:
+    """Indices that belong to each group, rows padded by repetition; a group without any repeats the first index."""
+    members = [np.flatnonzero(group_of == group) for group in present]
+    width = max(map(len, members))
+    return np.stack([np.resize(m if len(m) else [0], width) for m in members])
+
+
+REACH_WHEN_SHARP = 0.01
+# Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
+TASK_POINTS, FEATURE_PAIRS = 96, 96
+# Free space that the hand keeps to obstacles [m]; what is low on a table is held by fingertips that all but touch it.
+OBSTACLE_MARGIN = 0.001
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One hand, one object, one set of disturbances, on one device and dtype.
+
+    Attributes:
+        hand, object: laid out as tensors.
+        directions: unit disturbance wrenches.
+        friction: coefficient planned with, never above the object's own.
+        obstacles: what else is in the way, None where nothing is: then nothing is evaluated for it.
+    """
+
+    hand: HandTensors
+    object: ObjectTensors
+    directions: Float[Tensor, "directions 6"]
+    friction: float
+    obstacles: ObstacleTensors | None = None
+
+
+class Terms(NamedTuple):
+    """Loss terms of a batch of starts, unweighted; the fields are those of `LossWeights`.
+
+    `obstacle` is None where the scene has none.
+    """
+
+    wrench_resistance: Float[Tensor, "batch"]
+    distance: Float[Tensor, "batch"]
+    penetration: Float[Tensor, "batch"]
+    self_collision: Float[Tensor, "batch"]
+    posture: Float[Tensor, "batch"]
+    obstacle: Float[Tensor, "batch"] | None = None
+
+
+def build_problem(
+    scene: Scene,
+    hand: HandModel,
+    settings: ProblemConfig,
+    *,
+    seed: int,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Problem:
+    """Lay scene and hand out as tensors; `seed` spreads the disturbances beyond the signed axes."""
+    return Problem(
+        hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
+        object=make_object_tensors(scene, settings, device, dtype),
+        directions=disturbance_directions(settings.directions, seed).to(device=device, dtype=dtype),
+        friction=min(settings.friction, scene.object.friction),
+        obstacles=make_obstacle_tensors(scene, hand, device, dtype),
+    )
+
+
+class HandPlacement(NamedTuple):
+    """A batch of hands: `T_object_base`, `T_base_link` of every link, contact candidates in the object frame [m]."""
+
+    base: SE3
+    links: SE3
+    points: Float[Tensor, "batch points 3"]
+
+
+def hand_forward(
+    problem: Problem,
+    points: PointSet,
+    translation: Float[Tensor, "batch 3"],
+    quaternion: Float[Tensor, "batch 4"],
+    joints: Float[Tensor, "batch joints"],
+) -> HandPlacement:
+    """Where links and contact candidates are, for a batch of poses."""
+    base = SE3(rotation_from_quaternion(quaternion), translation)
+    links = forward(problem.hand.kinematics, joints)
+    return HandPlacement(base, links, base.apply(place_points(points.matrix, links)))
+
+
+def feature_distance(
+    problem: Problem, features: Float[Tensor, "features 3"], placed: HandPlacement
+) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
+    """Signed distance of the object's sharp points to the hand's solids [m], of the nearest pairs; their solids."""
+    in_base = placed.base.apply_inverse(features)
+    with torch.no_grad():
+        every = solid_bound(problem.hand.solids, placed.links, in_base)
+    count = len(problem.hand.solids.link)
+    pairs = every.flatten(1).topk(min(FEATURE_PAIRS, every[0].numel()), largest=False).indices
+    solids = pairs % count
+    rows = torch.arange(len(pairs), device=pairs.device)[:, None]
+    return pair_distance(problem.hand.solids, placed.links, in_base[rows, pairs // count], solids), solids
+
+
+def _nearest_of_group(
+    distance: Float[Tensor, "batch pairs"], groups: Int[Tensor, "batch pairs"], count: int
+) -> Float[Tensor, "batch groups"]:
+    """Least distance per group, infinite where no pair belongs to it; pairs of no group go to a last, dropped one."""
+    start = distance.new_full((len(distance), count + 1), torch.inf)
+    return start.scatter_reduce(1, groups, distance, "amin")[:, :count]
+
+
+def _wrench_resistance(
+    problem: Problem,
+    points: Float[Tensor, "batch points 3"],
+    distance: Float[Tensor, "batch points"],
+    normal: Float[Tensor, "batch points 3"],
+    *,
+    radius: Float[Tensor, "batch"],
+    activate: Callable[..., Tensor],
+) -> Float[Tensor, "batch"]:
+    """The loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
+    near = (distance.detach() - radius[:, None]).abs().topk(min(TASK_POINTS, distance.shape[-1]), largest=False).indices
+    rows = torch.arange(len(near), device=near.device)[:, None]
+    target, position = problem.object, points[rows, near]
+    activation = activate(distance[rows, near], radius)
+    if target.confidence is not None:
+        activation = activation * sample_confidence(target.confidence, target.sdf, position)
+    arms = (position - target.center) / target.length
+    support = wrench_support(arms, normal[rows, near], activation, problem.directions, problem.friction)
+    return losses.wrench_resistance(support, problem.friction)
+
+
+def evaluate(
+    problem: Problem,
+    translation: Float[Tensor, "batch 3"],
+    quaternion: Float[Tensor, "batch 4"],
+    joints: Float[Tensor, "batch joints"],
+    radius: Float[Tensor, "batch"],
+    delta: float,
+    *,
+    fine: bool = False,
+    sharp: bool = False,
+    activate: Callable[..., Tensor] = losses.soft_contact,
+) -> Terms:
+    """All loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
+
+    Args:
+        fine: look at all candidates.
+        sharp: look at all sharp points, and draw in only what is all but there.
+        activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
+    """
+    points = problem.hand.fine if fine else problem.hand.coarse
+    placed = hand_forward(problem, points, translation, quaternion, joints)
+    distance, normal = sample_sdf(problem.object.sdf, placed.points)
+    gap = (distance - radius[:, None])[:, points.groups].amin(-1)
+    sunk = losses.penetration(distance, radius)
+    features = problem.object.features if sharp else problem.object.features[: problem.object.coarse_features]
+    if len(features):
+        edge, solids = feature_distance(problem, features, placed)
+        sunk = sunk + losses.penetration(edge, torch.zeros_like(radius))
+        gap = torch.minimum(gap, _nearest_of_group(edge, problem.hand.group_of_solid[solids], gap.shape[-1]))
+    spheres = place_points(problem.hand.spheres.matrix, placed.links)
+    obstacle = None
+    if problem.obstacles is not None:
+        gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
+        obstacle = losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
+    return Terms(
+        wrench_resistance=_wrench_resistance(
+            problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)
+        ),
+        distance=losses.touch(
+            gap, torch.full_like(problem.hand.reach, REACH_WHEN_SHARP) if sharp else problem.hand.reach
+        ),
+        penetration=sunk,
+        self_collision=losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight),
+        posture=losses.posture(joints, problem.hand.lower, problem.hand.upper),
+        obstacle=obstacle,
+    )
+
+
+def least_distance(
+    problem: Problem,
+    translation: Float[Tensor, "batch 3"],
+    quaternion: Float[Tensor, "batch 4"],
+    joints: Float[Tensor, "batch joints"],
+) -> Float[Tensor, "batch"]:
+    """Least distance of any coarse contact candidate to the object [m]."""
+    placed = hand_forward(problem, problem.hand.coarse, translation, quaternion, joints)
+    return sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)

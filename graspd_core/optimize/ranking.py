@@ -1,0 +1,138 @@
+"""The score that candidates are tried in order of: how likely the hold trial is to pass, from what is known before it.
+
+A network of two small layers, fitted to trials by `benchmarks/ranking.py`, which writes `ranking.npz`; docs/method.md
+says on what and how well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib.resources import files
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graspd_core.optimize.grasp_postures import ContactSet, Squeeze
+from graspd_core.optimize.loop import Poses
+from graspd_core.optimize.problem import Problem
+from graspd_core.se3 import rotation_from_quaternion
+
+# Figures farther from their mean than so many deviations say no more.
+FARTHEST = 4.0
+# What a hand pays that presses on nothing: no candidate that the network was fitted to did so.
+_IDLE_COST = 20.0
+
+
+class Staged(NamedTuple):
+    """A batch of candidates before their trial.
+
+    Attributes:
+        poses: of the grasp.
+        opened: of the pregrasp.
+        clearance: share of the wanted clearance that the way from there keeps.
+        contact_set: where the grasp touches.
+        pressed: its squeeze.
+        overlap: depth of the hand in itself [m].
+    """
+
+    poses: Poses
+    opened: Poses
+    clearance: Float[Tensor, "batch"]
+    contact_set: ContactSet
+    pressed: Squeeze
+    overlap: Float[Tensor, "batch"]
+
+
+def score(problem: Problem, staged: Staged) -> Float[Tensor, "batch"]:
+    """Log-odds that a candidate passes the hold trial, less what the trial forgives and a real hand does not.
+
+    A finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself and one that presses on nothing cost; no
+    trial goes into it.
+    """
+    odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
+    idle = (staged.pressed.forces == 0.0).all(-1).all(-1)
+    odds = odds - torch.where(idle, _IDLE_COST, 0.0)
+    return odds - (_depth(staged) - 2.0).clamp_min(0.0) - 10.0 * (staged.overlap / 0.001 - 1.0).clamp_min(0.0)
+
+
+def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Float[Tensor, "batch"]:
+    """Log-odds of passing the hold trial, by a network as `benchmarks/ranking.py` fits it."""
+    x = ((figures - network["mean"]) / network["deviation"]).clamp(-FARTHEST, FARTHEST)
+    for layer in range(2):
+        x = torch.nn.functional.silu(x @ network[f"weight{layer}"] + network[f"bias{layer}"])
+    return (x @ network["weight2"] + network["bias2"])[:, 0]
+
+
+@torch.no_grad()
+def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch figures"]:
+    """What the score looks at, on the CPU; lengths over the object's own, joints over their travel."""
+    poses, opened, pressed = staged.poses, staged.opened, staged.pressed
+    hand, length = problem.hand, problem.object.length
+    normal_forces = pressed.forces.norm(dim=-1)
+    shares = normal_forces / normal_forces.sum(-1, keepdim=True).clamp_min(1e-9)
+    active = staged.contact_set.active.to(shares)
+    count = active.sum(-1).clamp_min(1.0)
+    arms = (staged.contact_set.position - problem.object.center) / length
+    middle = (active[..., None] * arms).sum(1) / count[:, None]
+    normals = active[..., None] * staged.contact_set.normal
+    margins = torch.minimum(poses.joints - hand.lower, hand.upper - poses.joints) / (hand.upper - hand.lower)
+    palm = torch.as_tensor(np.stack([hand.model.palm_center, hand.model.palm_normal])).to(poses.translation)
+    rotation = rotation_from_quaternion(poses.quaternion)
+    to_center = (problem.object.center - poses.translation - rotation @ palm[0]) / length
+    pressing = (pressed.joints - poses.joints).abs() / hand.joint_scale
+    opening = (opened.joints - poses.joints).abs() / hand.joint_scale
+    shift = (opened.translation - poses.translation).norm(dim=-1)
+    columns = [
+        (shares.amax(-1) + 0.01).log(),
+        (pressed.imbalance + 1e-3).log10(),
+        _depth(staged).clamp_max(10.0),
+        (0.8 - staged.clearance).clamp_min(0.0),
+        (staged.overlap / 0.001).clamp_max(5.0),
+        _links_touching(staged.contact_set),
+        count,
+        shares.sum(-1) ** 2 / (shares**2).sum(-1).clamp_min(1e-9),  # Contacts that share the load; 0: no force.
+        (shares[..., None] * arms).sum(1).norm(dim=-1),
+        normals.sum(1).norm(dim=-1) / count,
+        *_spread(normals, count).unbind(0),
+        *_spread(active[..., None] * (arms - middle[:, None]), count).sqrt().unbind(0),
+        margins.amin(-1),
+        (margins < 0.02).to(shares).sum(-1),
+        pressing.amax(-1),
+        pressing.mean(-1),
+        normal_forces.sum(-1).clamp_min(1e-3).log(),
+        opening.amax(-1),
+        opening.mean(-1),
+        shift / 0.01,
+        to_center.norm(dim=-1),
+        (to_center * (rotation @ palm[1])).sum(-1),
+        torch.full_like(shift, float(np.log(length))),
+    ]
+    return torch.nan_to_num(torch.stack(columns, -1).double().cpu())
+
+
+def _depth(staged: Staged) -> Float[Tensor, "batch"]:
+    """How deep the hand lies in the object [mm]."""
+    return (-staged.contact_set.distance.amin(-1)).clamp_min(0.0) / 0.001
+
+
+def _links_touching(contact_set: ContactSet) -> Float[Tensor, "batch"]:
+    """How many links touch."""
+    members = contact_set.link[None] == torch.unique(contact_set.link)[:, None]
+    return (contact_set.active[:, None] & members).any(-1).sum(-1).to(contact_set.distance)
+
+
+def _spread(rows: Float[Tensor, "batch slots 3"], count: Float[Tensor, "batch"]) -> Float[Tensor, "3 batch"]:
+    """Mean squares of some vectors along their principal axes, least first."""
+    squares = torch.linalg.eigvalsh(rows.transpose(1, 2) @ rows / count[:, None, None])
+    return squares.clamp_min(0.0).T
+
+
+@lru_cache(maxsize=1)
+def _fitted() -> dict[str, Tensor]:
+    """The network: mean and deviation of the figures, weights and biases of its layers."""
+    with files("graspd_core.methods.stages").joinpath("ranking.npz").open("rb") as file, np.load(file) as arrays:
+        return {name: torch.as_tensor(arrays[name]).double() for name in arrays.files}

@@ -1,0 +1,1 @@
+"""From what cameras and files give to a scene."""

@@ -1,0 +1,1 @@
+"""Cameras, depth images, clouds and their files."""

@@ -1,0 +1,314 @@
+"""Pinhole cameras and the lens distortion of CameraInfo: where each pixel looks, and where a point appears.
+
+Camera frames follow the optical convention: z forward, x right, y down. Distortion is that of OpenCV's camera model
+(Brown and Conrady), which ROS calls plumb_bob (k1, k2, p1, p2, k3) and rational_polynomial (k4, k5, k6 after those).
+
+Where a camera's picture ends: what reaches there may go on, and nobody saw that it does not.
+
+Depth images to points: their encodings, their bytes as a camera sends them, and the cloud they show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt16
+
+from graspd_core.errors import CloudError
+from graspd_core.perception.cloud.free_space import view_frame
+from graspd_core.perception.cloud.point_cloud import PointCloud, longest_side, transform_cloud
+
+DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
+
+_Numbers = Sequence[float | int]
+
+# Newton's method on a smooth lens doubles its digits each round: five suffice, extreme lenses take a few more.
+_NEWTON_STEPS = 20
+_NEWTON_TOLERANCE = 1e-10
+# Of a focal length and of any other number of a calibration [pixels]: beyond them rays are no longer numbers.
+_MIN_FOCAL_PX, _MAX_CALIBRATION_PX = 1e-2, 1e7
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A camera; its image is that of an ideal lens unless it has a distortion.
+
+    Attributes:
+        width, height: size of its image [pixels].
+        fx, fy: focal lengths [pixels].
+        cx, cy: where the optical axis meets the image [pixels].
+        distortion: k1, k2, p1, p2, k3, k4, k5, k6; those left out are zero.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise CloudError(f"camera: an image of {self.width} x {self.height} pixels; both must be 1 or more")
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not (
+            all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers) and min(self.fx, self.fy) >= _MIN_FOCAL_PX
+        ):
+            raise CloudError(f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration")
+        if len(self.distortion) > 8:
+            raise CloudError(f"camera: {len(self.distortion)} distortion coefficients; at most 8 are understood")
+
+
+def camera_from_calibration(
+    width: int,
+    height: int,
+    matrix: _Numbers,
+    distortion: _Numbers = (),
+    model: str = "plumb_bob",
+) -> PinholeCamera:
+    """The camera of a CameraInfo's `width`, `height`, `k` (row by row), `d` and `distortion_model`.
+
+    Raises:
+        CloudError: a model that is not known, more coefficients than it has, or no calibration at all.
+    """
+    if len(matrix) != 9:
+        raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
+    coefficients = tuple(float(value) for value in distortion)
+    if not any(coefficients) and model in (*DISTORTION_MODELS, ""):
+        coefficients = ()
+    elif model not in DISTORTION_MODELS:
+        raise CloudError(f"camera: unknown distortion model {model!r}; valid: {', '.join(DISTORTION_MODELS)}")
+    elif len(coefficients) > DISTORTION_MODELS[model]:
+        raise CloudError(
+            f"camera: {len(coefficients)} distortion coefficients; {model} has at most {DISTORTION_MODELS[model]}"
+        )
+    fx, fy, cx, cy = (float(matrix[index]) for index in (0, 4, 2, 5))
+    return PinholeCamera(int(width), int(height), fx, fy, cx, cy, coefficients)
+
+
+@lru_cache(maxsize=8)
+def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
+    """Directions of unit depth through each pixel, camera frame; NaN where no point could be seen through this lens.
+
+    Remembered for each camera, and therefore not writable.
+    """
+    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    image = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
+    rays = np.concatenate([undistort(image, camera.distortion), np.ones((*image.shape[:2], 1))], -1)
+    rays.setflags(write=False)
+    return rays
+
+
+def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> Float[np.ndarray, "*batch 2"]:
+    """Pixel coordinates (column, row) at which points in front of the camera appear; camera frame [m]."""
+    seen = distort(points[..., :2] / points[..., 2:], camera.distortion)
+    return seen * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def distort(ideal: Float[np.ndarray, "*batch 2"], coefficients: _Numbers) -> Float[np.ndarray, "*batch 2"]:
+    """Where the lens puts what an ideal one would put at `ideal`; both on the plane of unit depth."""
+    return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
+
+
+def undistort(seen: Float[np.ndarray, "*batch 2"], coefficients: _Numbers) -> Float[np.ndarray, "*batch 2"]:
+    """The inverse of `distort` on the part of the image where it has one; NaN elsewhere."""
+    if not any(coefficients):
+        return np.array(seen, dtype=float)
+    target = np.asarray(seen, dtype=float)
+    ideal = target.copy()
+    # Beyond the lens's range the iteration runs off to infinity; such pixels are sorted out below.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            image, slope = _lens(ideal, coefficients)
+            a, b, d = np.moveaxis(slope, -1, 0)
+            off = target - image
+            determinant = a * d - b * b
+            step = np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - b * off[..., 0]], -1)
+            ideal += step / determinant[..., None]
+            if np.abs(off[np.isfinite(off)]).max(initial=0.0) < 1e-3 * _NEWTON_TOLERANCE:
+                break
+        image, slope = _lens(ideal, coefficients)
+        a, b, d = np.moveaxis(slope, -1, 0)
+        # A lens model folds back at its rim: there the determinant, or the stretch along the radius, is negative.
+        found = (np.abs(target - image).max(-1) < _NEWTON_TOLERANCE) & (a * d - b * b > 0) & (a + d > 0)
+    return np.where(found[..., None], ideal, np.nan)
+
+
+def _lens(
+    ideal: Float[np.ndarray, "*batch 2"], coefficients: _Numbers
+) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 3"]]:
+    """Distorted positions, and a, b, d of their derivative, the symmetric matrix [[a, b], [b, d]]."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
+    x, y = ideal[..., 0], ideal[..., 1]
+    s = x * x + y * y
+    above, below = 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
+    radial = above / below
+    # Derivative of the radial factor by s.
+    growth = (k1 + s * (2 * k2 + s * 3 * k3) - radial * (k4 + s * (2 * k5 + s * 3 * k6))) / below
+    image = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x),
+            y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
+    )
+    a = radial + 2 * x * x * growth + 2 * p1 * y + 6 * p2 * x
+    b = 2 * x * y * growth + 2 * p1 * x + 2 * p2 * y
+    d = radial + 2 * y * y * growth + 6 * p1 * y + 2 * p2 * x
+    return image, np.stack([a, b, d], -1)
+
+
+# So many points on one side of the hull, of the object and of other things each: an object that stands out alone
+# against nothing makes a hull of its own.
+MIN_BORDER_POINTS = 8
+# Shorter sides than this share of the outline's size are no border of a picture.
+MIN_SIDE_SHARE = 0.1
+# A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
+# of a thing to the corner of the table behind it has none between.
+SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
+# Most objects are far from the outline, which the hull of so many points shows as well as that of all.
+HULL_POINTS = 2000
+
+
+def reaches_image_border(
+    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"], width: float
+) -> bool:
+    """Whether the points of an object lie on a side of the view's outline on which other points lie too.
+
+    Directions within `width` [rad] of the hull of all directions are on the outline.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    if not mine.any():
+        return False
+    local = (points - eye) @ view_frame(PointCloud(points, eye))
+    ahead = local[:, 2] > 1e-3
+    plane, mine = local[ahead, :2] / local[ahead, 2:], mine[ahead]
+    if _well_within(plane[mine], plane[:: 1 + len(plane) // HULL_POINTS], width):
+        return False
+    try:
+        hull = ConvexHull(plane)
+    except (QhullError, ValueError):
+        return False
+    ends = plane[hull.simplices]
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * longest_side(plane)
+    own, others = plane[mine], plane[~mine]
+    for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
+        # The object's few points first: most sides are none of theirs.
+        near = own[own @ np.array(normal) + offset > -width]
+        if len(near) < MIN_BORDER_POINTS:
+            continue
+        beside = others[others @ np.array(normal) + offset > -width]
+        if len(beside) < MIN_BORDER_POINTS:
+            continue
+        if _filled(np.concatenate([near, beside]), start, end) >= MIN_FILLED_SHARE:
+            return True
+    return False
+
+
+def _well_within(own: Float[np.ndarray, "own 2"], some: Float[np.ndarray, "some 2"], width: float) -> bool:
+    """Whether no point is within `width` of the hull of all, since none is of the hull of some, which lies within."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        sides = ConvexHull(some).equations
+    except (QhullError, ValueError):
+        return False
+    return all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in sides)
+
+
+def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
+    """Share of a side's parts in which points lie."""
+    side = end - start
+    part = np.floor(SIDE_PARTS * ((near - start) @ side) / (side @ side))
+    return len(np.unique(part[(part >= 0) & (part < SIDE_PARTS)])) / SIDE_PARTS
+
+
+# Encoding: type of a pixel, and metres per unit of it.
+ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
+
+
+def depth_in_metres(
+    image: UInt16[np.ndarray, "height width"] | Float[np.ndarray, "height width"], encoding: str
+) -> Float[np.ndarray, "height width"]:
+    """Depth along the optical axis [m], 0 where the image has none: zero, negative, NaN or infinite.
+
+    Raises:
+        CloudError: an encoding that is no depth, or pixels that are not of its type.
+    """
+    kind, unit = _encoding(encoding)
+    if image.dtype.kind != kind[0] or (kind[0] == "u" and image.dtype.itemsize != 2):
+        raise CloudError(f"depth image: pixels are {image.dtype}, but encoding {encoding} holds {np.dtype(kind)}")
+    if kind[0] == "u":
+        return image.astype(np.float32) * np.float32(unit)
+    return np.where(np.isfinite(image) & (image > 0), image, image.dtype.type(0))
+
+
+def depth_from_bytes(
+    data: memoryview,
+    *,
+    width: int,
+    height: int,
+    step: int,
+    encoding: str,
+    is_bigendian: bool = False,
+) -> Float[np.ndarray, "height width"]:
+    """Depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
+
+    Raises:
+        CloudError: an encoding that is no depth, an empty image, or sizes that contradict each other.
+    """
+    if width == 0 or height == 0:
+        raise CloudError(f"the depth image is empty: width={width}, height={height}")
+    dtype = np.dtype((">" if is_bigendian else "<") + _encoding(encoding)[0])
+    row = width * dtype.itemsize
+    if step < row:
+        raise CloudError(f"depth image: step={step} is smaller than width={width} pixels of {dtype.itemsize} bytes")
+    needed = (height - 1) * step + row
+    if data.nbytes < needed:
+        raise CloudError(
+            f"depth image: {data.nbytes} bytes, but height={height}, step={step} and width={width} need {needed}"
+        )
+    pixels = np.ndarray((height, width), dtype, data, 0, (step, dtype.itemsize))
+    return depth_in_metres(pixels.astype(dtype.newbyteorder("=")), encoding)
+
+
+def cloud_from_depth(
+    depth: Float[np.ndarray, "height width"],
+    camera: PinholeCamera,
+    T_frame_camera: Float[np.ndarray, "4 4"] | None = None,
+) -> PointCloud:
+    """What a camera saw, in its own frame or, where its pose is given, in that frame; pixels without depth give none.
+
+    Args:
+        depth: along the optical axis [m]; 0, NaN and infinite mean none.
+        camera: of the same size as the image.
+        T_frame_camera: pose of the camera (z forward, x right, y down).
+
+    Raises:
+        CloudError: the image is not of the camera's size.
+    """
+    if depth.shape != (camera.height, camera.width):
+        raise CloudError(
+            f"depth image: {depth.shape[1]} x {depth.shape[0]} pixels, "
+            f"but its camera has {camera.width} x {camera.height}"
+        )
+    flat = depth.reshape(-1)
+    seen = np.flatnonzero(np.isfinite(flat) & (flat > 0))
+    points = camera_rays(camera).reshape(-1, 3).take(seen, axis=0)
+    points *= flat[seen, None]
+    if camera.distortion:
+        # Pixels beyond the range of the lens model have no ray.
+        points = points[np.isfinite(points[:, 0])]
+    cloud = PointCloud(points, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    return cloud if T_frame_camera is None else transform_cloud(cloud, T_frame_camera)
+
+
+def _encoding(name: str) -> tuple[str, float]:
+    if name not in ENCODINGS:
+        raise CloudError(f"depth image: encoding {name!r} is no depth; valid: {', '.join(ENCODINGS)}")
+    return ENCODINGS[name]

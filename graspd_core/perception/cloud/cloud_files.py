@@ -1,0 +1,371 @@
+"""Points of ply files and of pcd files, text or binary.
+
+Read here and not by Open3D, which makes room for as many points as a header promises, and where the file ends before
+them hands out what happened to lie in that memory. Formats: "The PLY Polygon File Format" (Turk, 1994); "The PCD file
+format", version 0.7 (Point Cloud Library).
+
+Clouds from files: point formats, arrays, and depth images with the camera that took them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import CloudError
+from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
+from graspd_core.perception.cloud.point_cloud import PointCloud
+
+# The most that a byte of LZF, the method of compressed pcd, can stand for: 264 bytes by three.
+_DENSEST = 88
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8"},
+}
+
+
+@dataclass
+class _Element:
+    """One element of a ply header: how often it comes, its properties and their types; "" is the type of a list."""
+
+    name: str
+    count: int
+    names: list[str] = field(default_factory=list)
+    codes: list[str] = field(default_factory=list)
+
+
+def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """The vertices of a ply file, text or binary in either byte order; NaN is kept.
+
+    Raises:
+        ValueError: it is no ply file, lacks x, y or z, is cut short, or has lists before its vertices end.
+    """
+    # At the start of a line: a comment may hold the word.
+    head, *more = re.split(rb"[\r\n]end_header", path.read_bytes(), maxsplit=1)
+    rest = more[0] if more else b""
+    body = rest[rest.find(b"\n") + 1 :]
+    order, elements = _ply_header(head.decode("ascii", errors="replace").splitlines())
+    start = 0
+    for element in elements:
+        if "" in element.codes:
+            raise ValueError(f"element {element.name!r} has a list, and stands in or before the vertices")
+        if element.name == "vertex":
+            break
+        start += element.count * sum(np.dtype(code).itemsize if order else 1 for code in element.codes)
+    else:
+        raise ValueError("it has no element 'vertex'")
+    missing = [name for name in "xyz" if name not in element.names]
+    if missing:
+        raise ValueError(f"its vertices have no {missing[0]!r}")
+    if not order:
+        columns = [element.names.index(name) for name in "xyz"]
+        return _numbers_of_text(body, start, element.count, len(element.names))[:, columns]
+    sizes = [np.dtype(code).itemsize for code in element.codes]
+    places = [element.names.index(name) for name in "xyz"]
+    return _rows(body, _packed([order + element.codes[k] for k in places], places, sizes), element.count, start)
+
+
+def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
+    """The points of a pcd file, text or binary; NaN is kept. None where its data is compressed.
+
+    Raises:
+        ValueError: its header lacks what is needed, or it is cut short.
+    """
+    header: dict[str, list[str]] = {}
+    data, at = path.read_bytes(), 0
+    while at < len(data) and "DATA" not in header:
+        end = data.find(b"\n", at)
+        end = len(data) if end < 0 else end
+        words = data[at:end].decode("ascii", errors="replace").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA") if not header.get(key)]
+    if missing:
+        raise ValueError(f"its header has no {missing[0]}")
+    fields = header["FIELDS"]
+    # Not all writers say again what width and height say.
+    points = int(header["POINTS"][0]) if header.get("POINTS") else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
+    counts = [int(word) for word in header.get("COUNT", ["1"] * len(fields))]
+    if {len(counts), len(header["SIZE"]), len(header["TYPE"])} != {len(fields)} or min(counts) < 1 or points < 0:
+        raise ValueError("its header has not as many SIZE, TYPE and COUNT as FIELDS, or less than none of something")
+    lost = [name for name in "xyz" if name not in fields]
+    if lost:
+        raise ValueError(f"its points have no {lost[0]!r}")
+    places = [fields.index(name) for name in "xyz"]
+    if header["DATA"][0] == "ascii":
+        columns = [sum(counts[:place]) for place in places]
+        return _numbers_of_text(data[at:], 0, points, sum(counts))[:, columns]
+    if header["DATA"][0] not in ("binary", "binary_compressed"):
+        raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is none of ascii, binary and binary_compressed")
+    # Whatever else numpy would take for a type, or for a page of Python.
+    odd = [kind for kind in header["TYPE"] if kind.upper() not in ("F", "I", "U")]
+    if odd:
+        raise ValueError(f"its TYPE {odd[0][:40]!r} is none of F, I and U")
+    sizes = [int(word) * count for word, count in zip(header["SIZE"], counts, strict=True)]
+    if header["DATA"][0] == "binary_compressed":
+        _refuse_false_sizes(data[at:], points * sum(sizes))
+        return None
+    codes = ["<" + header["TYPE"][place].lower() + header["SIZE"][place] for place in places]
+    return _rows(data, _packed(codes, places, sizes), points, at)
+
+
+def _refuse_false_sizes(packed: bytes, needed: int) -> None:
+    """Raise ValueError where compressed points are not what the header says: Open3D would read past their end."""
+    size, unpacked = np.frombuffer(packed[:8].ljust(8, b"\0"), "<u4").tolist()
+    if unpacked != needed or size > len(packed) - 8 or unpacked > _DENSEST * size:
+        there = f"{size} bytes that unpack to {unpacked}, {max(len(packed) - 8, 0)} are there"
+        raise ValueError(f"its header promises points of {needed} bytes, its data {there}")
+
+
+def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
+    """Byte order, empty for text, and the elements in their order."""
+    order, elements = None, []
+    for words in (line.split() for line in lines[1:]):
+        match words:
+            case ["format", kind, *_]:
+                order = _ORDERS.get(kind)
+            case ["element", name, count]:
+                elements.append(_Element(name, int(count)))
+                if elements[-1].count < 0:
+                    raise ValueError(f"element {name!r} comes {count} times")
+            case ["property", "list", _, _, name] if elements:
+                elements[-1].names.append(name)
+                elements[-1].codes.append("")
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].names.append(name)
+                elements[-1].codes.append(_TYPES[kind])
+            case [("property" | "element"), *_]:
+                raise ValueError(f"header line {' '.join(words)[:80]!r} is not understood")
+    if not lines or lines[0].strip() != "ply" or order is None:
+        raise ValueError("it has no header of a ply file")
+    return order, elements
+
+
+def _packed(codes: list[str], places: list[int], sizes: list[int]) -> np.dtype:
+    """Rows whose fields have `sizes` [bytes], and x, y and z of types `codes` at `places`."""
+    starts = [sum(sizes[:place]) for place in places]
+    return np.dtype({"names": list("xyz"), "formats": codes, "offsets": starts, "itemsize": sum(sizes)})
+
+
+def _rows(data: bytes, dtype: np.dtype, count: int, start: int) -> Float[np.ndarray, "count 3"]:
+    there = max(len(data) - start, 0) // dtype.itemsize
+    if there < count:
+        raise ValueError(f"cut short: {there} of {count} points")
+    rows = np.frombuffer(data, dtype, count, start)
+    # A NaN of any kind stays one: numpy would warn of those that signal.
+    with np.errstate(invalid="ignore"):
+        return np.stack([rows[name].astype(float) for name in "xyz"], axis=1)
+
+
+def _numbers_of_text(body: bytes, start: int, rows: int, width: int) -> Float[np.ndarray, "rows width"]:
+    words = body.split()
+    there = max(len(words) - start, 0) // width
+    if not 0 <= rows <= there:
+        raise ValueError(f"cut short: {there} of {rows} points")
+    return np.array(words[start : start + rows * width], dtype=float).reshape(rows, width)
+
+
+CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
+
+_ROTATION_TOLERANCE = 1e-4
+# What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
+_MAX_UNPACKED_BYTES = 2**31
+
+
+def is_cloud_file(path: str | Path) -> bool:
+    """Whether a path names a cloud by its ending; a ply counts when its header declares no faces."""
+    path = Path(path)
+    ending = path.suffix.lower().lstrip(".")
+    if ending == "ply":
+        return path.is_file() and not _ply_has_faces(path)
+    return ending in CLOUD_ENDINGS
+
+
+def load_views(path: str | Path) -> tuple[PointCloud, ...]:
+    """Read what one or several cameras saw, in one frame.
+
+    * ply, xyz; npy (n×3 or h×w×3): points [m], seen from the origin.
+    * pcd: points [m], seen from where its `VIEWPOINT` stands; which way that looked, the format leaves open.
+    * npz with `points`, and where known `viewpoint` [m] and `forward` (the direction of the optical axis).
+    * npz with `depth` (h×w; integers are millimetres, floats metres) and the camera's matrix `K` (3×3), where known
+      also `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
+    * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), where known `distortion`.
+
+    Raises:
+        CloudError: the file is missing, of an unknown ending, unreadable, or does not hold one of these.
+    """
+    path = Path(path)
+    ending = path.suffix.lower().lstrip(".")
+    if path.is_dir():
+        raise CloudError(f"{path}: is a directory; give a cloud file ({', '.join(CLOUD_ENDINGS)})")
+    if not path.exists():
+        raise CloudError(f"{path}: no such cloud file")
+    if ending not in CLOUD_ENDINGS:
+        raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
+    if ending not in ("npy", "npz"):
+        return (PointCloud(_read_points(path, ending), _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)),)
+    arrays = _read_numpy(path)
+    try:
+        if "depth" in arrays or "depths" in arrays:
+            return _depth_views(arrays)
+        return (_points_view(arrays),)
+    except CloudError as error:
+        raise CloudError(f"{path}: {error}") from None
+
+
+def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
+    if "points" not in arrays:
+        raise CloudError(f"holds no array called 'points', 'depth' or 'depths'; it has: {', '.join(arrays) or 'none'}")
+    points, viewpoint = _numbers(arrays, "points"), np.zeros(3)
+    forward = None
+    if "viewpoint" in arrays:
+        viewpoint = _numbers(arrays, "viewpoint")
+    if "forward" in arrays:
+        forward = _numbers(arrays, "forward")
+    if points.ndim == 3 and points.shape[2] == 3:
+        points = points.reshape(-1, 3)
+    if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):
+        raise CloudError(f"shape {points.shape}, viewpoint {viewpoint.shape}; points × 3 and 3 are needed")
+    if not np.isfinite(viewpoint).all():
+        raise CloudError("'viewpoint' is NaN or infinite")
+    if forward is not None:
+        largest = np.abs(forward).max(initial=0.0)
+        if forward.shape != (3,) or not 0 < largest < np.inf:
+            raise CloudError("'forward' is no direction; 3 finite numbers are needed, not all zero")
+        forward = forward / largest
+        forward = forward / np.linalg.norm(forward)
+    return PointCloud(points, viewpoint, forward)
+
+
+def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
+    several = "depths" in arrays
+    name, place = ("depths", "poses") if several else ("depth", "T_world_camera")
+    for needed in ("K", place) if several else ("K",):
+        if needed not in arrays:
+            raise CloudError(f"holds {name!r} but no {needed!r}; it has: {', '.join(arrays)}")
+    images, poses = arrays[name], arrays.get(place)
+    if not several:
+        images, poses = images[None], None if poses is None else poses[None]
+    if images.ndim != 3 or images.size == 0:
+        raise CloudError(f"{name!r} has shape {arrays[name].shape}; {'views × ' * several}height × width is needed")
+    if poses is not None and poses.shape != (len(images), 4, 4):
+        raise CloudError(f"{place!r} has shape {arrays[place].shape}; {f'{len(images)} × ' * several}4 × 4 is needed")
+    matrix = _numbers(arrays, "K")
+    if matrix.shape != (3, 3):
+        raise CloudError(f"'K' has shape {matrix.shape}; 3 × 3 is needed")
+    distortion = _numbers(arrays, "distortion").reshape(-1).tolist() if "distortion" in arrays else ()
+    _, height, width = images.shape
+    model = "plumb_bob" if len(distortion) <= 5 else "rational_polynomial"
+    camera = camera_from_calibration(width, height, matrix.reshape(-1).tolist(), distortion, model)
+    views = []
+    for index, image in enumerate(images):
+        pose = None if poses is None else _rigid(poses[index], place)
+        views.append(cloud_from_depth(_metres(image, name), camera, pose))
+    return tuple(views)
+
+
+def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
+    if image.dtype.kind in "iu":
+        return depth_in_metres(image.astype(float).clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
+    if image.dtype.kind == "f":
+        # What is too far for a number of 32 bits is infinitely far, which means no depth.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return depth_in_metres(image.astype(np.float32), "32FC1")
+    raise CloudError(f"{name!r} holds {image.dtype}; integers (mm) or floats (m) are needed")
+
+
+def _rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
+    pose = _numbers({name: pose}, name)
+    turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
+    square = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
+    if not (np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1))):
+        raise CloudError(
+            f"{name!r} is no rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
+        )
+    return pose
+
+
+def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    if arrays[name].dtype.kind not in "biuf":
+        raise CloudError(f"{name!r} not readable as numbers: it holds {str(arrays[name].dtype)[:80]}")
+    # A NaN of any kind stays one: numpy would warn of those that signal.
+    with np.errstate(invalid="ignore", over="ignore"):
+        return arrays[name].astype(float)
+
+
+def _read_numpy(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz, or that of an npy as `points`."""
+    try:
+        # numpy leaves a spoilt file open when it is given the path.
+        with path.open("rb") as file:
+            stored = np.load(file, allow_pickle=False)
+            if isinstance(stored, np.ndarray):
+                return {"points": stored}
+            unpacked = sum(entry.file_size for entry in stored.zip.infolist())
+            if unpacked > _MAX_UNPACKED_BYTES:
+                raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are taken")
+            return {name: stored[name] for name in stored.files}
+    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals;
+    # one whose header promises more than there is as a lack of memory.
+    except Exception as error:
+        raise CloudError(f"{path}: not readable as numbers ({_first_line(error)})") from error
+
+
+def _ply_has_faces(path: Path) -> bool:
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"end_header")[0]
+    faces = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
+    return any(len(words) > 2 and words[2] != b"0" for words in faces)
+
+
+def _pcd_viewpoint(path: Path) -> Float[np.ndarray, "3"]:
+    """Where the sensor stood, by the header; the origin where it does not say."""
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"\nDATA")[0]
+    line = next((line.split()[1:4] for line in header.splitlines() if line.startswith(b"VIEWPOINT")), [b"0"] * 3)
+    try:
+        place = np.array([float(word) for word in line])
+    except ValueError:
+        place = np.zeros(0)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise CloudError(f"{path}: its VIEWPOINT is not 3 finite numbers and a quaternion")
+    return place
+
+
+def _read_points(path: Path, ending: str) -> Float[np.ndarray, "n 3"]:
+    points = None
+    try:
+        if ending == "ply":
+            points = read_ply_points(path)
+        elif ending == "pcd":
+            points = read_pcd_points(path)
+    except (ValueError, TypeError, OSError) as error:
+        raise CloudError(f"{path}: not a readable {ending} cloud ({_first_line(error)})") from error
+    points = _read_open3d(path) if points is None else points
+    if len(points) == 0:
+        raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
+    return points
+
+
+def _read_open3d(path: Path) -> Float[np.ndarray, "n 3"]:
+    import open3d as o3d
+
+    # Open3D prints its complaints and returns nothing; the error below says it once.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        try:
+            cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+        except (MemoryError, RuntimeError) as error:
+            raise CloudError(f"{path}: not a readable cloud ({_first_line(error)})") from error
+    return np.array(cloud.points).reshape(-1, 3)
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__

@@ -1,0 +1,202 @@
+"""What stands around the object, from what was seen of it: hulls that the hand keeps out of.
+
+The back of a neighbour is not seen. Each is taken for the convex hull of its points and of their shadow on the table
+(what is seen is carried straight down), so that what lies beneath overhangs counts as full, and what hides behind the
+seen face counts only as far as the hull spans it: thin, on purpose, because a guess that bulges would block free space.
+A thing that goes round the object, whose hull would hold it, is taken in parts.
+
+Things about the object whose whole shape is known, as a planning scene knows them, as obstacles of a scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, KDTree, QhullError
+
+from graspd_core.config import ObstacleConfig, SceneConfig
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import build_sdf, sample_sdf
+from graspd_core.mesh.surface_queries import winding_inside
+from graspd_core.mesh.topology import voxel_keys
+from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.se3 import perpendicular
+from graspd_core.types import Plane, TriangleMesh
+
+GRID_RESOLUTION = 32
+# Parts across a thing whose hull would hold the object.
+MAX_PARTS_ACROSS = 8
+_TARGET_SAMPLES = 2000
+
+
+def make_obstacles(
+    points: Sequence[Float[np.ndarray, "_ 3"]],
+    support: Plane | None,
+    target: TriangleMesh,
+    reach: float,
+    settings: ObstacleConfig | None = None,
+) -> tuple[Obstacle, ...]:
+    """Neighbours from their seen points, in the frame of the points [m].
+
+    Args:
+        points: those of each thing; things of too few finite points are left out.
+        support: what they stand on, if anything; their points are extruded down to it.
+        target: the object to grasp.
+        reach: things farther than this from the object are left out [m].
+        settings: of the hulls.
+    """
+    settings = settings or ObstacleConfig()
+    near = KDTree(np.vstack([target.vertices, surface_samples(target, _TARGET_SAMPLES, 0)[0]]))
+    found = []
+    for seen in points:
+        seen = seen[np.isfinite(seen).all(1)]
+        if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
+            continue
+        whole = _obstacle(seen, support, settings.padding)
+        if not _swallows(whole, target, settings.padding):
+            found.append(whole)
+            continue
+        # A tray, a box or a ring about the object: its hull is no obstacle but the object's own place.
+        parts = [part for part in _cells(seen, support, settings.part_size) if near.query(part)[0].min() <= reach]
+        found += [_obstacle(part, support, settings.padding) for part in parts]
+    return tuple(found)
+
+
+def _obstacle(points: Float[np.ndarray, "n 3"], support: Plane | None, padding: float) -> Obstacle:
+    mesh = padded_hull(points, support, padding)
+    return Obstacle(mesh, build_sdf(mesh, resolution=GRID_RESOLUTION, padding=0.02))
+
+
+def _swallows(neighbour: Obstacle, target: TriangleMesh, padding: float) -> bool:
+    """Whether a neighbour's hull holds part of the object, more than where one leans on the other."""
+    at = torch.as_tensor(target.vertices).to(neighbour.sdf.field)
+    return bool((sample_sdf(neighbour.sdf, at)[0] < -2 * padding).any())
+
+
+def _cells(points: Float[np.ndarray, "n 3"], support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
+    """The points, parted by a grid of cubes, or of columns that stand on the support."""
+    if support is None:
+        local = points
+    else:
+        right = perpendicular(support.normal)
+        local = points @ np.column_stack([right, np.cross(support.normal, right)])
+    side = max(side, float(np.ptp(local, axis=0).max()) / MAX_PARTS_ACROSS)
+    _, which = np.unique(voxel_keys(local - local.min(0), side), return_inverse=True)
+    return [points[which == part] for part in range(which.max() + 1)]
+
+
+def padded_hull(points: Float[np.ndarray, "n 3"], support: Plane | None, padding: float) -> TriangleMesh:
+    """The closed convex surface about points, their projection onto the support, and a skin of `padding` [m]."""
+    corners = points
+    if support is not None:
+        height = points @ support.normal - support.offset
+        corners = np.vstack([points, points - height[:, None] * support.normal])
+    # A flat face that stands on nothing has no hull yet: the skin gives it a body.
+    with suppress(QhullError):
+        corners = corners[ConvexHull(corners).vertices]
+    skin = padding * np.vstack([np.eye(3), -np.eye(3)])
+    return _closed((corners[:, None] + skin).reshape(-1, 3))
+
+
+def _closed(points: Float[np.ndarray, "n 3"]) -> TriangleMesh:
+    """The convex hull's surface, wound outwards."""
+    hull = ConvexHull(points)
+    a, b, c = points[hull.simplices].transpose(1, 0, 2)
+    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
+    faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64)
+    used, compact = np.unique(faces, return_inverse=True)
+    return TriangleMesh(points[used], compact.reshape(-1, 3))
+
+
+# From this share of what the hulls of a thing and of the object fill together, the thing is the object itself: a box
+# about a ball has half of it, a box a quarter too large every way still 0.5, things that only touch have nothing.
+_SAME = 0.3
+_OVERLAP_SAMPLES = 4000
+# Of what is seen of a shape near the object [m²]; and the least and most points of one.
+_AREA_OF_A_SAMPLE = 1e-4
+_FEWEST, _MOST = 200, 4000
+_CORNERS = 200
+
+
+def with_neighbours(
+    scene: Scene, things: Mapping[str, Sequence[TriangleMesh]], settings: SceneConfig | None = None
+) -> Scene:
+    """The scene with things about the object, by name, as obstacles; what is far away costs next to nothing.
+
+    A thing that fills the object's own place is the object as a planning scene holds it: it is left out, and a warning
+    of the object says so. What does not rise above the support is the support, and is left out too.
+
+    Args:
+        scene: of the object.
+        things: closed shapes of each, in the object's frame [m].
+        settings: how near things are taken (`segmentation.obstacle_range`), and the hulls (`obstacles`).
+    """
+    settings = settings or SceneConfig()
+    mesh, reach = scene.object.mesh, settings.segmentation.obstacle_range
+    low, high = mesh.vertices.min(0) - reach, mesh.vertices.max(0) + reach
+    found, same = [], []
+    for name, shapes in things.items():
+        near = [shape for shape in shapes if _meets(shape, low, high)]
+        if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
+            same.append(f"collision object {name!r} fills the object's own place: taken for the object, no obstacle")
+            continue
+        points = [_points_within(shape, low, high) for shape in near]
+        found += [p for p in points if len(p) and _rises(p, scene.support, settings.obstacles.padding)]
+    obstacles = make_obstacles(found, None, mesh, reach, settings.obstacles) if found else ()
+    warnings = (*scene.object.warnings, *same)
+    return replace(scene, object=replace(scene.object, warnings=warnings), obstacles=(*scene.obstacles, *obstacles))
+
+
+def _meets(shape: TriangleMesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> bool:
+    return bool((shape.vertices.min(0) <= high).all() and (shape.vertices.max(0) >= low).all())
+
+
+def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
+    """What the hulls of points share, of what they fill together; 0 where one is flat."""
+    try:
+        hulls = [ConvexHull(_hull_corners(a)), ConvexHull(_hull_corners(b))]
+    except QhullError:
+        return 0.0
+    low, high = b.min(0), b.max(0)
+    points = low + (high - low) * np.random.default_rng(0).random((_OVERLAP_SAMPLES, 3))
+    inside = [(points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0).all(1) for hull in hulls]
+    shared = float((inside[0] & inside[1]).mean() * np.prod(high - low))
+    return shared / (hulls[0].volume + hulls[1].volume - shared)
+
+
+def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
+    """The points, or some that span nearly the same hull where they are many: a scan has hundreds of thousands."""
+    if len(points) <= _CORNERS:
+        return points
+    rays = np.random.default_rng(0).normal(size=(_CORNERS, 3))
+    return points[np.unique([int((points @ ray).argmax()) for ray in rays])]
+
+
+def _points_within(
+    shape: TriangleMesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "_ 3"]:
+    """Points whose hull is that of the shape within a box: of its surface and of the box's corners."""
+    from trimesh.intersections import slice_faces_plane
+
+    vertices, faces = shape.vertices, shape.faces
+    for normal, corner in [*((axis, low) for axis in np.eye(3)), *((-axis, high) for axis in np.eye(3))]:
+        vertices, faces, _ = slice_faces_plane(vertices, faces, normal, corner)
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
+    corners = corners[((corners >= shape.vertices.min(0)) & (corners <= shape.vertices.max(0))).all(1)]
+    points = [corners[winding_inside(shape, corners)]] if len(corners) else []
+    if len(faces):
+        sides = np.diff(vertices[faces], axis=1)
+        area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+        count = int(np.clip(area / _AREA_OF_A_SAMPLE, _FEWEST, _MOST))
+        surface = TriangleMesh(vertices, faces.astype(np.int64))
+        points += [_hull_corners(vertices[np.unique(faces)]), surface_samples(surface, count, 0)[0]]
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def _rises(points: Float[np.ndarray, "_ 3"], support: Plane | None, margin: float) -> bool:
+    return support is None or float((points @ support.normal).max()) > support.offset + margin

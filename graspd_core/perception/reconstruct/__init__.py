@@ -1,0 +1,1 @@
+"""From points of an object to a closed mesh."""

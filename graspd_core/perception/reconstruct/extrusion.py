@@ -1,0 +1,143 @@
+"""What joins an object to the support it stands on: walls beneath the outline seen from above, skirt and base."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, facing
+from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
+
+# A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
+OUTLINE_STEP_M = 0.008
+# How level the surface must be there, and how much it must face a camera [cosines].
+MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
+# Of the object's lowest points, the share that must be of walls for it to have a base; how steep [cosine] those are.
+MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
+# The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
+MAX_FOOT_HEIGHT_M = 0.015
+# Share of an upright line of a guessed wall that the cameras may contradict.
+MAX_CONTRADICTED_WALL = 0.15
+# Share of the base's outline that walls must stand on.
+MIN_ENCLOSED_SHARE = 0.6
+
+
+def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
+    """Walls from the outline of what was seen from above, down to the support.
+
+    Only beneath outlines that are proven: outwards of them the cameras saw nothing; and only walls that they do not
+    contradict.
+    """
+    from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
+    from scipy.spatial import KDTree
+
+    margin = 6
+    low = seen.points[:, :2].min(0) - margin * step
+    index = tuple(np.floor((seen.points[:, :2] - low) / step).astype(int).T)
+    shape = tuple(int(i.max()) + margin + 1 for i in index)
+    top = np.full(shape, -np.inf)
+    np.maximum.at(top, index, seen.points[:, 2])
+    mask = np.asarray(binary_closing(np.isfinite(top), np.ones((3, 3)), iterations=3), dtype=bool)
+    _, at = distance_transform_edt(~np.isfinite(top), return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    top = np.where(mask, top[tuple(at)], -np.inf)
+    rim = mask & ~np.asarray(binary_erosion(mask), dtype=bool)
+    slope = np.stack([*np.gradient(gaussian_filter(mask.astype(float), 2.0))], -1)[rim]
+    outward = np.pad(-slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9), ((0, 0), (0, 1)))
+    height = maximum_filter(top, 3)[rim]
+    place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
+    _, nearest = KDTree(seen.points).query(place)
+    # A surface that turns away from the camera at the outline goes on behind it; one that is level there ends.
+    level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
+        facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
+    )
+    proven = (empty_depth(free_space, place + OUTLINE_STEP_M * outward) > free_space.slack) & level
+    levels = np.arange(0.5 * step, max(float(height.max()), step), step)
+    row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
+    points = np.column_stack([place[row, :2], levels[level]])
+    wrong = empty_depth(free_space, points) > free_space.slack
+    bad = np.bincount(row, wrong, len(place)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(place))
+    return take(Surfels(points, outward[row]), ~bad[row])
+
+
+def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
+    """What joins walls that end just above the support to it, and the base between them."""
+    lowest = float(np.percentile(surfels.points[:, 2], 1))
+    band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
+    wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
+    if lowest > MAX_FOOT_HEIGHT_M:
+        return _column(surfels, free_space, step)
+    if wall.mean() < MIN_WALL_SHARE or wall.sum() < 10:
+        return nothing()
+    feet = take(band, wall)
+    # Down along the wall, for each metre of height.
+    down = feet.normals[:, 2:] * feet.normals - np.array([0.0, 0.0, 1.0])
+    down /= -down[:, 2:]
+    fall = np.arange(0.5 * step, lowest + 3 * step, step)
+    points = (feet.points[:, None] + down[:, None] * fall[:, None]).reshape(-1, 3)
+    skirt = Surfels(points, np.repeat(feet.normals, len(fall), 0))
+    skirt = thin(take(skirt, (points[:, 2] > 0) & (points[:, 2] < lowest)), step)
+    return join(skirt, _base((feet.points + down * feet.points[:, 2:])[:, :2], free_space, step))
+
+
+def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
+    """Walls beneath the outlines of what was seen high above the support, where something hides what it rests on.
+
+    The outline of all goes down to the support, and what is high above the rest, as a bottle's cap, to the rest.
+    """
+    order = np.argsort(surfels.points[:, 2])
+    height = surfels.points[order, 2]
+    level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
+    walls, rim = _walls(surfels, 0.0, free_space, step)
+    for k in range(1, int(level[-1]) + 1):
+        bottom = float(height[level == k - 1].max())
+        walls = join(walls, _walls(take(surfels, order[level == k]), bottom, free_space, step)[0])
+    return join(walls, _base(rim, free_space, step)) if len(rim) > 3 else nothing()
+
+
+def _walls(
+    surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
+) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
+    """Walls beneath the outline seen from above, down to the height `bottom` [m], and where they stand."""
+    from scipy.spatial import ConvexHull, KDTree, QhullError
+
+    try:
+        hull = ConvexHull(surfels.points[:, :2])
+    except QhullError:
+        return nothing(), np.zeros((0, 2))
+    corners = surfels.points[hull.vertices, :2]
+    edges = np.roll(corners, -1, 0) - corners
+    length = np.linalg.norm(edges, axis=1)
+    edge = np.repeat(np.arange(len(corners)), np.maximum((length / step).astype(int), 1))
+    along = np.concatenate([np.arange(n) / n for n in np.bincount(edge)])
+    rim = corners[edge] + along[:, None] * edges[edge]
+    # Counter-clockwise corners: outwards is to the right.
+    outward = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])[edge] / length[edge, None]
+    top = surfels.points[KDTree(surfels.points[:, :2]).query(rim)[1], 2]
+    levels = np.arange(bottom + 0.5 * step, max(float(top.max()), bottom + step), step)
+    row, level = np.nonzero(levels[None] < top[:, None] - 0.5 * step)
+    points = np.column_stack([rim[row], levels[level]])
+    wrong = empty_depth(free_space, points) > free_space.slack
+    bad = np.bincount(row, wrong, len(rim)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(rim))
+    return take(Surfels(points, outward[row]), ~bad[row]), rim[~bad]
+
+
+def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
+    """The support within the feet's outline, facing down, where it is hidden."""
+    from scipy.spatial import ConvexHull, KDTree, QhullError
+
+    try:
+        hull = ConvexHull(feet)
+    except QhullError:
+        return nothing()
+    corners = feet[hull.vertices]
+    along = np.linspace(0, 1, 40, endpoint=False)[:, None, None]
+    rim = (corners + along * (np.roll(corners, -1, 0) - corners)).reshape(-1, 2)
+    length = np.tile(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1), 40)
+    if length[KDTree(feet).query(rim)[0] < 3 * step].sum() < MIN_ENCLOSED_SHARE * length.sum():
+        return nothing()
+    axes = [np.arange(corners[:, k].min(), corners[:, k].max(), step) for k in (0, 1)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    within = grid[(grid @ hull.equations[:, :2].T + hull.equations[:, 2] < -0.5 * step).all(1)]
+    base = np.column_stack([within, np.zeros(len(within))])
+    base = base[empty_depth(free_space, base) < free_space.slack]
+    return Surfels(base, np.tile(np.array([0.0, 0.0, -1.0]), (len(base), 1)))

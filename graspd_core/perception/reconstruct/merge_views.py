@@ -1,0 +1,203 @@
+"""Several views become one set of oriented points.
+
+Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours, and its
+normal turned to the camera that saw it. Both keep thin walls apart, which no orientation by neighbourhood does.
+
+Points and not truncated signed distances (Curless and Levoy 1996), because those wear thin walls and edges away: of 15
+rendered views, Open3D's on a grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of
+0.92, in 0.30 s instead of 0.53.
+
+Clouds that show an object from all round without saying which camera saw what.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.config import ReconstructionConfig
+from graspd_core.errors import CloudError
+from graspd_core.mesh.topology import packed_rows, voxel_keys
+from graspd_core.perception.cloud.free_space import view_frame
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, clean_cloud, least_axes
+from graspd_core.se3 import perpendicular
+
+# Points of a surface seen flatter than this flew off an edge.
+MIN_VIEW_COSINE = 0.1
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """Points of a surface and its outward unit normals.
+
+    Attributes:
+        points: [m].
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+
+
+def join(*parts: Surfels) -> Surfels:
+    """All of them."""
+    return Surfels(np.concatenate([p.points for p in parts]), np.concatenate([p.normals for p in parts]))
+
+
+def take(surfels: Surfels, kept: np.ndarray) -> Surfels:
+    """Those that a mask or an index names."""
+    return Surfels(surfels.points[kept], surfels.normals[kept])
+
+
+def nothing() -> Surfels:
+    """No points."""
+    return Surfels(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def point_step(views: Sequence[PointCloud]) -> float:
+    """The spacing that all views together are thinned to [m]: an eightieth of the object's diagonal, 1 mm at least."""
+    points = np.concatenate([view.points for view in views])
+    low, high = np.percentile(points, [2, 98], axis=0)
+    return max(float(np.linalg.norm(high - low)) / 80, 1e-3)
+
+
+def merge_views(
+    views: Sequence[PointCloud], step: float | None = None, settings: ReconstructionConfig | None = None
+) -> Surfels:
+    """The oriented points of all views, strays dropped, noise smoothed, one per cube of side `step` and side of it.
+
+    Raises:
+        CloudError: fewer than 50 points are left.
+    """
+    step, settings = point_step(views) if step is None else step, settings or ReconstructionConfig()
+    together = join(*(orient_view(view, step, settings) for view in views))
+    if len(together.points) < MIN_POINTS:
+        raise CloudError(
+            f"cloud: only {len(together.points)} of its {sum(len(view.points) for view in views)} points lie on a "
+            f"surface; at least {MIN_POINTS} are needed: it is too sparse, or shows no surface"
+        )
+    return thin(together, step) if len(views) > 1 else together
+
+
+def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -> Surfels:
+    """One view's surface points, about `step` [m] apart, with normals towards its camera."""
+    from scipy.spatial import KDTree
+
+    points = _thin_by_sight(view, step)
+    if len(points) <= settings.neighbours:
+        return nothing()
+    distance, near = KDTree(points).query(points, k=settings.neighbours)
+    view_depth = points - view.viewpoint
+    view_depth /= np.linalg.norm(view_depth, axis=1, keepdims=True)
+    centre, normals = points[near].mean(1), np.zeros_like(points)
+    weights = np.ones(near.shape)
+    # The second pass leaves out what lies across an edge from the first one's plane.
+    for _ in range(3):
+        total = weights.sum(1, keepdims=True)
+        centre = np.einsum("nk,nkd->nd", weights, points[near]) / total
+        spread = points[near] - centre[:, None]
+        normals = least_axes(np.swapaxes(weights[..., None] * spread, 1, 2) @ spread)
+        off = np.einsum("nkd,nd->nk", spread, normals)
+        weights = np.exp(-np.square(off / (1.5 * step)) - np.square(distance / distance[:, -1:]))
+    normals *= -np.sign(np.einsum("nd,nd->n", normals, view_depth))[:, None]
+    slope = -np.einsum("nd,nd->n", normals, view_depth)
+    shift = np.einsum("nd,nd->n", points - centre, normals) / np.maximum(slope, 1e-3)
+    crowded = distance[:, -1] < 2.5 * np.median(distance[:, -1])
+    kept = (slope > MIN_VIEW_COSINE) & (np.abs(shift) < settings.stray_distance) & crowded
+    smooth = points + shift[:, None] * view_depth
+    return Surfels(smooth[kept], normals[kept])
+
+
+def thin(surfels: Surfels, step: float) -> Surfels:
+    """The mean of the points in each cube of side `step` [m] that face the same way, to the nearest of six."""
+    if len(surfels.points) == 0:
+        return surfels
+    facing = np.abs(surfels.normals).argmax(1)
+    side = 2 * facing + (np.take_along_axis(surfels.normals, facing[:, None], 1)[:, 0] > 0)
+    cells = np.column_stack([np.floor(surfels.points / step).astype(int), side])
+    _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
+    mean = lambda x: np.column_stack([np.bincount(which, x[:, k]) for k in range(3)]) / count[:, None]  # noqa: E731
+    normals = mean(surfels.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    return Surfels(mean(surfels.points), normals)
+
+
+def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
+    """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
+    view_depth = view.points - view.viewpoint
+    distance = np.linalg.norm(view_depth, axis=1)
+    width = step / float(np.median(distance))
+    axis = view_depth.mean(0) / np.linalg.norm(view_depth.mean(0))
+    right = perpendicular(axis)
+    depth = np.maximum(view_depth @ axis, 1e-6)
+    image = np.column_stack([view_depth @ right, view_depth @ np.cross(axis, right)]) / depth[:, None]
+    _, which, count = np.unique(voxel_keys(image, width), return_inverse=True, return_counts=True)
+    order = np.lexsort([distance, which])
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    return view.points[order[first + (count - 1) // 2]]
+
+
+# A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
+# this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
+# looked it takes more: from above, a third of the lines may run along the sides of a cup.
+MAX_RISE_CELLS = 4.0
+LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
+
+# Neighbours for a normal, and for passing its sense on.
+NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
+# Points that are too regular for that are moved by up to this many steps.
+JITTER_STEPS = 0.02
+
+
+def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
+    """Whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it.
+
+    Args:
+        view: the object's points.
+        axis_known: it is said which way the camera looked.
+    """
+    from scipy.spatial import KDTree
+
+    points = clean_cloud(view.points, view.viewpoint).points
+    local = (points - view.viewpoint) @ view_frame(PointCloud(points, view.viewpoint))
+    distance = float(local[:, 2].mean())
+    # From very near the object, lines of sight are not spread enough to sort points by: any direction will do.
+    if distance > np.ptp(points, axis=0).max() and local[:, 2].min() > 0:
+        local[:, :2] *= distance / local[:, 2:]
+    cell = 1.5 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
+    _, line = np.unique(packed_rows(np.round(local[:, :2] / cell).astype(int)), return_inverse=True)
+    near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
+    np.minimum.at(near, line, local[:, 2])
+    np.maximum.at(far, line, local[:, 2])
+    most = LAYERED_SHARE_OF_CAMERA if axis_known else LAYERED_SHARE
+    return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
+
+
+def orient_unposed(view: PointCloud, step: float) -> Surfels:
+    """Points of an all-round cloud, `step` [m] apart, with normals that agree with their neighbours'.
+
+    Raises:
+        CloudError: no surface passes through them.
+    """
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points)).voxel_down_sample(step)
+    points = np.asarray(cloud.points)
+    # The triangulation that passes the sense on fails on points exactly on a sphere, a plane or a line.
+    shaken = points + JITTER_STEPS * step * np.random.default_rng(0).uniform(-1, 1, points.shape)
+    for tried in (points, shaken):
+        with suppress(RuntimeError):
+            return Surfels(points, _normals(tried))
+    raise CloudError(f"cloud: no surface passes through its {len(points)} points; views with their cameras are needed")
+
+
+def _normals(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
+    cloud.orient_normals_consistent_tangent_plane(ORIENTATION_NEIGHBOURS)
+    return np.asarray(cloud.normals)

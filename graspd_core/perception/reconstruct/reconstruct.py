@@ -1,0 +1,307 @@
+"""From one or more views of an object to a closed mesh, saying how it was made and how far each part was seen.
+
+What was seen is surfaced by screened Poisson with normals towards each view's camera: on a grid, and by Open3D where
+that does not fit. What was not is completed first, by the symmetry, revolution or extrusion that the evidence favours;
+what the cameras saw to be empty is cut away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.config import ReconstructionConfig
+from graspd_core.errors import CloudError, MeshError
+from graspd_core.mesh.mesh_files import check_mesh, simplify
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
+from graspd_core.mesh.topology import is_closed
+from graspd_core.perception.cloud.free_space import FreeSpace, make_view_depths
+from graspd_core.perception.cloud.point_cloud import PointCloud, clean_cloud, measured
+from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, stand
+from graspd_core.perception.reconstruct.merge_views import (
+    Surfels,
+    is_unposed,
+    join,
+    merge_views,
+    nothing,
+    orient_unposed,
+    point_step,
+)
+from graspd_core.perception.reconstruct.poisson import (
+    GRID_CELLS,
+    Field,
+    close_surface,
+    grid_cell,
+    grid_poisson_field,
+    part_walls,
+    poisson_field,
+)
+from graspd_core.perception.reconstruct.shape_completion import Completion, Evidence, complete_shape
+from graspd_core.se3 import perpendicular
+from graspd_core.types import Plane, TriangleMesh
+
+# Share of the seen points that must lie on the result.
+MIN_FITTED_SHARE = 0.85
+# What is fewer cells across balloons on the grid.
+_LEAST_CELLS = 8
+# A face of the foot looks down by this cosine, at least.
+_DOWN = 0.7
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A closed surface and how it came about.
+
+    Attributes:
+        mesh: closed, in the frame of the views [m].
+        confidence: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
+        method: "poisson", and what completed it, e.g. "poisson, revolution".
+        warnings: what was guessed, one sentence each.
+        evidence: what else the hidden side may be.
+    """
+
+    mesh: TriangleMesh
+    confidence: Float[np.ndarray, "vertices"]
+    method: str
+    warnings: tuple[str, ...]
+    evidence: Evidence
+
+
+def reconstruct(
+    views: Sequence[PointCloud],
+    support: Plane | None = None,
+    settings: ReconstructionConfig | None = None,
+    whole: Sequence[PointCloud] = (),
+) -> Reconstruction:
+    """The closed surface of the object that the views show.
+
+    Args:
+        views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
+            cloud that shows it from all round may stand for many views.
+        support: what the object stands on, in the same frame.
+        settings: precision of the cameras, and sizes.
+        whole: all that the same cameras saw: what stands before the object hides what is behind it.
+
+    Raises:
+        CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
+    """
+    settings = settings or ReconstructionConfig()
+    axis_known = views[0].forward is not None if views else False
+    views = _clean(views, settings)
+    rotation, origin = _frame(views, support)
+    local = [_in_frame(view, rotation, origin) for view in views]
+    by_eye = {tuple(view.viewpoint.astype(float)): view for view in whole}
+    around = [_in_frame(by_eye[tuple(view.viewpoint)], rotation, origin) for view in views] if whole else ()
+    step = point_step(local)
+    standing = support is not None
+    unposed = len(local) == 1 and is_unposed(local[0], axis_known)
+    if unposed:
+        seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing, 0.0, settings.outline_slack)
+        guess = Completion("", nothing(), 0.0)
+    else:
+        seen = merge_views(local, step, settings)
+        lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, MAX_FOOT_HEIGHT_M)) if standing else 0.0
+        free_space = FreeSpace(
+            make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
+        )
+        guess = complete_shape(seen, free_space, step, settings)
+    mesh = _closed(seen, guess.surfels, free_space, step, settings)
+    confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
+    hidden = not unposed and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings)
+    warnings = (_sentence(len(views), guess.method),) if hidden else ()
+    method = f"poisson, {guess.method}" if guess.method else "poisson"
+    evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden)
+    mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
+    return Reconstruction(mesh, confidence, method, warnings, evidence)
+
+
+def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> PointCloud:
+    return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
+
+
+def _closed(
+    seen: Surfels, guess: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig
+) -> TriangleMesh:
+    """The closed surface by Poisson on a grid, or by Open3D's where that is asked for or the grid's does not fit."""
+    adaptive = partial(poisson_field, finest=settings.poisson_cell)
+    small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
+    if small or settings.poisson == "open3d":
+        return closed_mesh(seen, guess, free_space, step, settings, adaptive)
+    try:
+        return closed_mesh(seen, guess, free_space, step, settings, grid_poisson_field)
+    except CloudError:
+        return closed_mesh(seen, guess, free_space, step, settings, adaptive)
+
+
+def closed_mesh(
+    seen: Surfels,
+    guess: Surfels,
+    free_space: FreeSpace,
+    step: float,
+    settings: ReconstructionConfig,
+    field: Field,
+    cells: int = GRID_CELLS,
+) -> TriangleMesh:
+    """The closed surface through what was seen and what is guessed, standing on the support where there is one.
+
+    Args:
+        field: how a surface is fitted to points.
+        cells: of the grid that it is closed on, along the object's longest side.
+
+    Raises:
+        CloudError: none fits what was seen.
+    """
+    known = join(seen, guess)
+    known = join(known, stand(known, free_space, step)) if free_space.standing else known
+    known = part_walls(known, grid_cell(known, settings.min_cell, cells))
+    cell = grid_cell(known, settings.min_cell, cells)
+    return _finished(close_surface(known, field, free_space, cell), seen, settings)
+
+
+def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
+    """Finite points, near where most are, of the views that have enough of them for a surface."""
+    from scipy.spatial import KDTree
+
+    if len(views) == 0:
+        raise CloudError("cloud: no view at all; at least one is needed")
+    for view in views:
+        if not np.isfinite(view.viewpoint).all():
+            raise CloudError("cloud: the place of a view's camera (viewpoint) is not finite")
+    most = settings.max_points // len(views)
+    kept = [_some(view, most) for view in views]
+    clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
+    tree = KDTree(clean.points)
+    near = 3 * float(np.median(tree.query(clean.points, k=2)[0][:, 1]))
+    result = []
+    for points, view in zip(kept, views, strict=True):
+        points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
+        # Among a thousand: one place sent often is no surface, and its sight would call all else empty.
+        if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > settings.neighbours:
+            result.append(PointCloud(points, view.viewpoint.astype(float)))
+    if not result:
+        raise CloudError(
+            f"cloud: none of its {len(views)} views shows more than {settings.neighbours} points of the object"
+        )
+    return result
+
+
+def _some(view: PointCloud, most: int) -> Float[np.ndarray, "n 3"]:
+    """A view's measured points, some `most` of them at most; where none is, all, for the message that says so."""
+    points = view.points[:: 1 + len(view.points) // most].astype(float)
+    good = measured(points, view.viewpoint)
+    return points[good] if good.any() else points
+
+
+def _frame(
+    views: Sequence[PointCloud], support: Plane | None
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
+    points = np.concatenate([view.points for view in views])
+    centre = points.mean(0)
+    view = views[0].viewpoint - centre
+    if support is None:
+        up = view if np.linalg.norm(view) > 1e-6 else np.eye(3)[2]
+        view = np.linalg.svd(points[:: 1 + len(points) // 2000] - centre, full_matrices=False)[2][0]
+    else:
+        up = np.asarray(support.normal, dtype=float)
+        centre = centre - (centre @ up - support.offset) * up
+    up = up / np.linalg.norm(up)
+    level = view - (view @ up) * up
+    if np.linalg.norm(level) < 1e-3 * np.linalg.norm(view):
+        level = perpendicular(up)
+    level = level / np.linalg.norm(level)
+    return np.column_stack([level, np.cross(up, level), up]), centre
+
+
+def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig) -> TriangleMesh:
+    """Few faces, closed, and through the points that were seen."""
+    try:
+        mesh = _fewer(check_mesh(mesh, "reconstruction")[0], settings.max_faces)
+    except MeshError as error:
+        raise CloudError(f"cloud: no usable surface fits its {len(seen.points)} points ({error})") from None
+    fitted = float((surface_distance(make_surface(mesh), seen.points) < settings.fit_distance).mean())
+    if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
+        raise CloudError(
+            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed"
+        )
+    return mesh
+
+
+def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
+    """At most so many faces; the slower of two simplifiers where the quicker one tears the surface each time."""
+    import open3d as o3d
+
+    for aggressiveness in (7, 5, 3):
+        quick, _ = check_mesh(simplify(mesh, most, aggressiveness=aggressiveness), "reconstruction")
+        if is_closed(quick):
+            return quick
+    whole = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    ).simplify_quadric_decimation(most)
+    slow = TriangleMesh(np.asarray(whole.vertices), np.asarray(whole.triangles, dtype=np.int64))
+    slow, _ = check_mesh(slow, "reconstruction")
+    return slow if is_closed(slow) else mesh
+
+
+def _confidence(
+    mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"], settings: ReconstructionConfig
+) -> Float[np.ndarray, "vertices"]:
+    """1 near seen points, less the farther from them."""
+    from scipy.spatial import KDTree
+
+    far = settings.guessed_distance
+    distance, _ = KDTree(seen).query(mesh.vertices, distance_upper_bound=far)
+    return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
+
+
+def _is_guessed(
+    mesh: TriangleMesh,
+    seen: Surfels,
+    guess: Completion,
+    confidence: Float[np.ndarray, "vertices"],
+    views: int,
+    standing: bool,
+    settings: ReconstructionConfig,
+) -> bool:
+    """Whether a good part of a surface was not seen; what stands on the support at z = 0 is known."""
+    if views > 1:
+        # Whatever a rule filled; and normals of what was seen may cancel though much was not, as of a bottle's sides.
+        return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
+    # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
+    area = _open_area(mesh, standing)[0]
+    guessed = float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
+    return bool(guess.method) or max(guess.openness, guessed) > settings.open_share
+
+
+def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: float) -> float:
+    """Share of a surface that no seen surface is near in place and normal: the back of what is thin is not seen.
+
+    Args:
+        reach: how far is near [m]; a turn of 60° is as far.
+    """
+    from scipy.spatial import KDTree
+
+    area, normals = _open_area(mesh, standing)
+    place = np.hstack([mesh.vertices[mesh.faces].mean(1), reach * normals])
+    far = KDTree(np.hstack([seen.points, reach * seen.normals])).query(place)[0] > reach
+    return float((area * far).sum() / max(area.sum(), 1e-12))
+
+
+def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:
+    """Area [m²] and normal of each face, the area none where the face stands on the support at z = 0."""
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    across = np.cross(b - a, c - a)
+    length = np.linalg.norm(across, axis=1)
+    foot = (across[:, 2] < -_DOWN * length) & (np.maximum(np.maximum(a, b), c)[:, 2] < MAX_FOOT_HEIGHT_M)
+    normals = across / np.maximum(length, 1e-30)[:, None]
+    return 0.5 * np.where(foot & standing, 0.0, length), normals
+
+
+def _sentence(views: int, method: str) -> str:
+    seen = "one side only" if views == 1 else f"{views} sides, not all round"
+    by = method or "closing the surface smoothly within the cameras' outlines"
+    return f"cloud: seen from {seen}; the rest is guessed by {by}"

@@ -1,0 +1,162 @@
+"""What the guesses of an object's hidden side are made of.
+
+The unseen side of an object, guessed by whichever rule the evidence favours.
+
+Guesses: a body of revolution, one or two mirror planes, a centre of symmetry; beside each, the outline seen from above
+extruded to the support. A guessed point that lies in seen empty space, in the support, or where the surface itself was
+seen is dropped; a rule is used only where the cameras confirm much of it and contradict next to nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.config import ReconstructionConfig
+from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
+from graspd_core.perception.reconstruct.extrusion import extrude, stand
+from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
+from graspd_core.perception.reconstruct.revolution import find_revolution
+from graspd_core.perception.reconstruct.symmetry import Symmetry, find_centre, find_mirrors, image
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was seen of an object: other guesses of what was hidden are made of it.
+
+    Attributes:
+        seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
+        rotation, origin: of that frame in the views' [m].
+        chosen: the rule that the reconstruction took; empty where none applied.
+        settings: of the reconstruction.
+        hidden: whether a good part of the surface was.
+    """
+
+    seen: Surfels
+    free_space: FreeSpace
+    step: float
+    rotation: Float[np.ndarray, "3 3"]
+    origin: Float[np.ndarray, "3"]
+    chosen: str
+    settings: ReconstructionConfig
+    hidden: bool
+
+
+REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION = "revolution", "mirror", "point symmetry", "extrusion"
+RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
+# Share of a body of revolution's surface that a contradicted share of it takes away.
+FAULT_WEIGHT = 5.0
+# Symmetries of which the cameras contradict more than this share are chance.
+MAX_SYMMETRY_FAULTS = 0.02
+# Two rules' guesses keep this far from each other [m].
+RULE_DISTANCE_M = 0.008
+
+
+@dataclass(frozen=True)
+class Completion:
+    """Guessed surface.
+
+    Attributes:
+        method: the rule, e.g. "mirror and extrusion"; empty where none applied.
+        surfels: without what contradicts or repeats what was seen.
+        openness: share of the surface that was missing before.
+    """
+
+    method: str
+    surfels: Surfels
+    openness: float
+
+
+def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig) -> Completion:
+    """The guess that the evidence favours: of rules that explain what was seen, the one that says most."""
+    from scipy.spatial import KDTree
+
+    known = join(seen, stand(seen, free_space, step)) if free_space.standing else seen
+    missing = openness(known, step)
+    turned = find_revolution(seen, free_space, step)
+    if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > settings.revolution_share:
+        guess = plausible(turned.surfels, seen, free_space, step)
+        # What a handle hides of itself, and the like, is left to Poisson.
+        return Completion(REVOLUTION if _counts(guess, seen) else "", guess, missing)
+    methods, guess = [], nothing()
+    if missing < settings.open_share:
+        return Completion("", guess, missing)
+    if free_space.standing:
+        guess = plausible(extrude(seen, free_space, step), seen, free_space, step)
+        methods = [EXTRUSION] if _counts(guess, seen) else []
+    known = join(seen, guess)
+    if (
+        openness(join(known, stand(known, free_space, step)) if free_space.standing else known, step)
+        > settings.open_share
+    ):
+        name, raw = _symmetric(seen, free_space, settings.symmetry_worth)
+        images = plausible(raw, known, free_space, step)
+        if len(guess.points):
+            # Where both speak, walls beneath seen outlines are the surer.
+            apart = KDTree(guess.points).query(images.points)[0] > RULE_DISTANCE_M
+            images = take(images, apart)
+        methods += [name] if _counts(images, seen) else []
+        guess = join(guess, images)
+    return Completion(" and ".join(methods), guess, missing)
+
+
+def openness(surfels: Surfels, step: float) -> float:
+    """How much of a surface is missing: the normals of a closed one, evenly sampled, add up to nothing."""
+    return float(np.linalg.norm(thin(surfels, 2 * step).normals.mean(0)))
+
+
+def _counts(guess: Surfels, seen: Surfels) -> bool:
+    return len(guess.points) > 0.03 * len(seen.points)
+
+
+def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float) -> Surfels:
+    """The guess, thinned, less what the cameras speak against and what lies where the surface is known."""
+    from scipy.spatial import KDTree
+
+    guess = take(guess, empty_depth(free_space, guess.points) < free_space.slack)
+    distance, nearest = KDTree(known.points).query(guess.points, distance_upper_bound=3 * step)
+    alike = (guess.normals * known.normals[np.minimum(nearest, len(known.points) - 1)]).sum(1) > 0
+    return thin(take(guess, distance > np.where(alike, 2.5, 1.2) * step), step)
+
+
+def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str, Surfels]:
+    mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
+    value = {MIRROR: 0.0, POINT_SYMMETRY: 0.0}
+    if mirrors and mirrors[0].wrong < MAX_SYMMETRY_FAULTS:
+        value[MIRROR] = mirrors[0].worth
+    if centre.wrong < MAX_SYMMETRY_FAULTS:
+        value[POINT_SYMMETRY] = centre.worth
+    best = max(value, key=lambda name: value[name])
+    if value[best] < least:
+        return "", nothing()
+    return best, image(centre, seen) if best == POINT_SYMMETRY else _mirrored(mirrors, seen)
+
+
+def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
+    """The images in one plane, or in two and in both."""
+    images = [image(m, seen) for m in mirrors]
+    if len(mirrors) == 2:
+        images.append(image(mirrors[1], images[0]))
+    return join(*images)
+
+
+def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
+    """What one of `RULES` says of the unseen side, whether or not it is the likeliest; None where it says nothing.
+
+    "" says that nothing is hidden but what the surface closes over.
+    """
+    if rule == REVOLUTION:
+        turned = find_revolution(seen, free_space, step)
+        raw = None if turned is None else turned.surfels
+    elif rule == MIRROR:
+        raw = _mirrored(find_mirrors(seen, free_space), seen)
+    elif rule == POINT_SYMMETRY:
+        raw = image(find_centre(seen, free_space), seen)
+    elif rule == EXTRUSION:
+        raw = extrude(seen, free_space, step) if free_space.standing else None
+    else:
+        return nothing()
+    guess = None if raw is None else plausible(raw, seen, free_space, step)
+    return guess if guess is not None and _counts(guess, seen) else None

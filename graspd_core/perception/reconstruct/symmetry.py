@@ -1,0 +1,205 @@
+"""Symmetries that a partly seen object may have: mirror planes and centres.
+
+Each search moves points of what was seen by many candidates at once and keeps the one whose images fall on seen surface
+where cameras looked, never into space that they saw to be empty, and show something new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.perception.cloud.free_space import FreeSpace, on_seen, weigh
+from graspd_core.perception.reconstruct.merge_views import Surfels
+from graspd_core.se3 import perpendicular
+
+# Points that a candidate is judged on, closely and at first.
+FINE_SAMPLES, COARSE_SAMPLES = 240, 90
+# What a contradiction weighs against a confirmation.
+CONTRADICTION_WEIGHT = 3.0
+# Directions of mirror planes that are tried of an object that stands, and of one that does not; places of each.
+UPRIGHT_DIRECTIONS, SPHERE_DIRECTIONS, PLANE_OFFSETS = 30, 70, 29
+
+UP = np.array([0.0, 0.0, 1.0])
+
+Shares = Float[np.ndarray, "_"]
+# Of shares confirmed, contradicted, met and closed, how good a candidate is.
+Score = Callable[[Shares, Shares, Shares, Shares], Shares]
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A motion, or a reflection, that is thought to take the object onto itself: p ↦ A p + b.
+
+    Attributes:
+        linear, shift: A and b [m].
+        agree, wrong: share of judged images that the cameras confirm and contradict.
+        worth: how much it shows, and how surely.
+    """
+
+    linear: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+    agree: float
+    wrong: float
+    worth: float
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """What candidates are judged on: points all over what was seen, and where it ends."""
+
+    few: Surfels
+    rim: Float[np.ndarray, "n 3"]
+
+
+def image(symmetry: Symmetry, surfels: Surfels) -> Surfels:
+    """The surfels moved."""
+    return Surfels(surfels.points @ symmetry.linear.T + symmetry.shift, surfels.normals @ symmetry.linear.T)
+
+
+def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
+    """Where every image falls on what is seen anyway, a symmetry is true and useless; where none does, unproven.
+
+    Args:
+        agree, wrong: share of judged images that the cameras confirm and contradict.
+        meets: share of the rim of what was seen that the image goes on from.
+        closes: share of the open side that the image turns its own to.
+    """
+    return (4 * agree * (1 - agree - wrong) + closes) * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
+
+
+def truth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
+    """How well a symmetry is proven, useful or not."""
+    return agree * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
+
+
+def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
+    """The mirror plane that shows most, and the one square to it, if that is true as well."""
+    sample = _sample(surfels)
+    first, normal = _best_plane(_directions(free_space.standing), sample, free_space, worth)
+    if free_space.standing:
+        square = np.cross(UP, normal)[None]
+    else:
+        side = perpendicular(normal)
+        turn = np.linspace(0, np.pi, 12, endpoint=False)[:, None]
+        square = np.cos(turn) * side + np.sin(turn) * np.cross(normal, side)
+    second, _ = _best_plane(square, sample, free_space, truth)
+    both = second.agree > 0.5 * first.agree and second.wrong < 0.01
+    return [first, second] if both else [first]
+
+
+def find_centre(surfels: Surfels, free_space: FreeSpace) -> Symmetry:
+    """The best centre of symmetry; of a standing object, the best upright axis of half a turn."""
+    sample = _sample(surfels)
+    low, high = surfels.points.min(0), surfels.points.max(0)
+    middle, size = 0.5 * (low + high), float((high - low).max())
+    across = np.linspace(-0.5, 0.5, 15 if free_space.standing else 11) * size
+    depths = np.zeros(1) if free_space.standing else np.linspace(-0.7, 0.2, 10) * size
+    linear = np.diag([-1.0, -1.0, 1.0]) if free_space.standing else -np.eye(3)
+    best = Symmetry(linear, np.zeros(3), 0.0, 1.0, 0.0)
+    for finer in (1, 5, 25):
+        grid = np.stack(np.meshgrid(across / finer, across / finer, depths / finer, indexing="ij"), -1).reshape(-1, 3)
+        centres = middle + grid
+        shift = centres - centres @ linear.T
+        everywhere = np.broadcast_to(linear, (len(shift), 3, 3))
+        which, best = _pick(everywhere, shift, _rough(sample) if finer == 1 else sample, free_space, worth)
+        middle = centres[which]
+    return best
+
+
+def _best_plane(
+    normals: Float[np.ndarray, "k 3"], sample: _Sample, free_space: FreeSpace, score: Score
+) -> tuple[Symmetry, Float[np.ndarray, "3"]]:
+    pivot = sample.few.points.mean(0)
+    reach = (sample.few.points - pivot) @ normals.T
+    low, high = reach.min(0), reach.max(0)
+    size = float((high - low).max())
+    tried = np.repeat(normals, PLANE_OFFSETS, 0)
+    place = (low[:, None] + (high - low)[:, None] * np.linspace(-0.1, 1.1, PLANE_OFFSETS)).reshape(-1)
+    scored = _rough(sample)
+    for finer in (1, 3, 9):
+        linear = np.eye(3) - 2 * np.einsum("ki,kj->kij", tried, tried)
+        shift = 2 * (place + tried @ pivot)[:, None] * tried
+        which, best = _pick(linear, shift, scored, free_space, score)
+        normal, at = tried[which], place[which]
+        # Around the best: turned a little, moved a little.
+        turned = _around(normal, 0.1 / finer, free_space.standing)
+        moves = np.linspace(-0.02, 0.02, 9) * size / finer
+        tried, place = np.repeat(turned, len(moves), 0), at + np.tile(moves, len(turned))
+        scored = sample
+    return best, normal  # pyright: ignore[reportPossiblyUnboundVariable]
+
+
+def _pick(
+    linear: Float[np.ndarray, "k 3 3"],
+    shift: Float[np.ndarray, "k 3"],
+    sample: _Sample,
+    free_space: FreeSpace,
+    score: Score,
+) -> tuple[int, Symmetry]:
+    """The best of several, and which it is."""
+    few = sample.few
+    points = np.einsum("kij,nj->kni", linear, few.points) + shift[:, None]
+    confirmed, against = weigh(free_space, points, np.einsum("kij,nj->kni", linear, few.normals))
+    agree, wrong = confirmed.mean(1), against.mean(1)
+    # These motions are their own inverse: a rim point lies on the image where its image lies on what was seen.
+    rim = np.einsum("kij,nj->kni", linear, sample.rim) + shift[:, None]
+    meets = on_seen(free_space, rim).mean(1) if len(sample.rim) else np.ones(len(agree))
+    closes = _closes(linear, few.normals.mean(0), free_space.standing)
+    which = int(score(agree, wrong, meets, closes).argmax())
+    value = float(worth(agree, wrong, meets, closes)[which])
+    return which, Symmetry(linear[which], shift[which], float(agree[which]), float(wrong[which]), value)
+
+
+def _closes(linear: Float[np.ndarray, "k 3 3"], side: Float[np.ndarray, "3"], standing: bool) -> Shares:
+    """How much of the mean normal of what was seen its image cancels; what faces up is the support's to cancel."""
+    side = side * np.array([1.0, 1.0, 0.0]) if standing else side
+    length = max(float(np.linalg.norm(side)), 1e-9)
+    return 1 - np.linalg.norm(side + linear @ side, axis=1) / (2 * length)
+
+
+def _sample(surfels: Surfels) -> _Sample:
+    """A fixed choice of points, and of those that have neighbours to one side only."""
+    from scipy.spatial import KDTree
+
+    answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
+    distance, near = answer
+    aside = np.linalg.norm(surfels.points[near[:, 1:]].mean(1) - surfels.points, axis=1)
+    rim = surfels.points[aside > 0.45 * distance[:, 1:].mean(1)]
+    spread = np.random.default_rng(1).permutation(len(rim))[: FINE_SAMPLES // 3]
+    return _Sample(_some(surfels, FINE_SAMPLES), rim[spread])
+
+
+def _rough(sample: _Sample) -> _Sample:
+    return _Sample(_some(sample.few, COARSE_SAMPLES), sample.rim[: COARSE_SAMPLES // 3])
+
+
+def _some(surfels: Surfels, count: int) -> Surfels:
+    """A fixed choice of the points."""
+    chosen = np.random.default_rng(0).permutation(len(surfels.points))[:count]
+    return Surfels(surfels.points[chosen], surfels.normals[chosen])
+
+
+def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
+    """Level directions over half a turn, or directions over half a sphere (golden spiral)."""
+    if standing:
+        turn = np.pi * np.arange(UPRIGHT_DIRECTIONS) / UPRIGHT_DIRECTIONS
+        return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT_DIRECTIONS)])
+    height = (np.arange(SPHERE_DIRECTIONS) + 0.5) / SPHERE_DIRECTIONS
+    turn = np.pi * (1 + 5**0.5) * np.arange(SPHERE_DIRECTIONS)
+    across = np.sqrt(1 - height**2)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+
+
+def _around(normal: Float[np.ndarray, "3"], angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
+    """Directions within an angle [rad]; of a level one, level ones."""
+    steps = angle * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
+    side = np.cross(normal, UP) if standing else perpendicular(normal)
+    turned = normal + steps * side
+    if not standing:
+        turned = np.concatenate([turned, normal + steps * np.cross(normal, side)])
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)

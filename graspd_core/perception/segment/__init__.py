@@ -1,0 +1,1 @@
+"""One object cut out of what cameras saw."""

@@ -1,0 +1,196 @@
+"""Large flat parts of a scene: RANSAC finds them, weighted least squares refines them.
+
+The noise of a depth camera grows with the square of the distance (stereo and structured light both measure disparity),
+so a plane's tolerance does too: the residuals themselves say how fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.config import SegmentationConfig
+from graspd_core.mesh.topology import packed_rows
+from graspd_core.perception.cloud.point_cloud import longest_side
+from graspd_core.types import Plane
+
+# So many points, evenly taken, show which plane has most of them.
+RANSAC_POINTS = 10_000
+# Residuals of a plane gather in the middle of the slab in which it is searched: their median is this share of it at
+# most, and the tolerance they need is not much wider. Those of a curved surface fill the slab, and the next again.
+MAX_MEDIAN_RESIDUAL_SHARE, MAX_GATE_GROWTH = 0.4, 1.5
+# A point is on the plane within so many standard deviations.
+INLIER_DEVIATIONS = 4.0
+# It is fitted to those within so many.
+FIT_DEVIATIONS = 3.0
+MAX_PLANES = 4
+# Side of the cells by which a plane's visible part is measured; occlusion and holes of a few cells are bridged [m].
+RASTER_CELL_M = 0.01
+# Cells of that raster along a side at most; of larger parts the cells are wider.
+MAX_RASTER_CELLS = 2000
+BRIDGED_CELLS = 3
+
+
+@dataclass(frozen=True)
+class FlatPart:
+    """A plane and the part of it that was seen.
+
+    Attributes:
+        plane: normal towards the cameras.
+        axes: two unit vectors in the plane, columns.
+        noise: standard deviation of the points from it, over the square of their distance from the camera [1/m].
+        least: tolerance where the noise is small [m].
+        most: tolerance where it is large [m].
+        inliers: which of the scene's points lie on it.
+        sides: length and width of the seen part [m].
+        hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`; rows n, c.
+        area: inside the hull [m²].
+        filled: share of that area where it was seen.
+    """
+
+    plane: Plane
+    axes: Float[np.ndarray, "3 2"]
+    noise: float
+    least: float
+    most: float
+    inliers: Bool[np.ndarray, "points"]
+    sides: tuple[float, float]
+    hull: Float[np.ndarray, "edges 3"]
+    area: float
+    filled: float
+
+    def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Above the plane, towards the cameras [m]."""
+        return points @ self.plane.normal - self.plane.offset
+
+    def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """How high a point may be and still belong to the plane, by its distance from the camera [m]."""
+        return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
+
+    def beneath(self, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
+        """Whether points lie over the seen part, or at most `margin` beside it [m]."""
+        flat = points @ self.axes
+        return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
+
+
+def find_planes(
+    points: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    settings: SegmentationConfig,
+) -> list[FlatPart]:
+    """Flat parts in order of their number of points, each point in at most one.
+
+    Args:
+        points: evenly dense [m].
+        distance: of each from its camera [m].
+        viewpoints: where the cameras stood [m].
+        settings: sizes and tolerances; parts smaller than a support are left alone.
+    """
+    import open3d as o3d
+
+    left, wide = np.arange(len(points)), settings.plane_search_width
+    parts: list[FlatPart] = []
+    for _ in range(MAX_PLANES):
+        if len(left) < max(50, (settings.support_size / 0.02) ** 2):
+            break
+        some = left[:: 1 + len(left) // RANSAC_POINTS]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[some]))
+        part, guess, gate = None, np.zeros(4), wide
+        # A step in a table lies within the wide gate, which then takes both levels for one slope.
+        for gate in (wide, min(settings.plane_tolerance, 0.5 * wide)):
+            # All trials, whatever they find: threads that may stop early give another plane each time.
+            o3d.utility.random.seed(0)
+            guess = np.asarray(cloud.segment_plane(gate, 3, settings.ransac_trials, 1.0)[0])
+            part = _refine(points, distance, left, guess, viewpoints.mean(0), gate, settings)
+            if part is not None:
+                break
+        if part is not None and part.sides[1] >= settings.support_size:
+            parts.append(part)
+            left = left[~part.inliers[left]]
+        else:
+            left = left[np.abs(points[left] @ guess[:3] + guess[3]) >= gate]
+    return parts
+
+
+def _refine(
+    points: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    left: Int[np.ndarray, "left"],
+    guess: Float[np.ndarray, "4"],
+    viewpoint: Float[np.ndarray, "3"],
+    gate: float,
+    settings: SegmentationConfig,
+) -> FlatPart | None:
+    """Weighted least squares over points that the last fit calls near; None where too few are."""
+    least, most = settings.plane_tolerance, settings.max_plane_tolerance
+    size = float(np.linalg.norm(guess[:3]))
+    if not size > 0:
+        return None
+    normal, offset = guess[:3] / size, -float(guess[3]) / size
+    near, far = points[left], distance[left] ** 2
+    coarse = width = gate * far.clip(1.0)
+    noise = 0.0
+    for step in range(4):
+        residual = near @ normal - offset
+        inlier = np.abs(residual) < width
+        if inlier.sum() < 20:
+            return None
+        weight = 1.0 / far[inlier].clip(1e-4) ** 2
+        centre = weight @ near[inlier] / weight.sum()
+        spread = near[inlier] - centre
+        _, vectors = np.linalg.eigh((spread * weight[:, None]).T @ spread)
+        normal = vectors[:, 0]
+        offset = float(normal @ centre)
+        residual = np.abs(near[inlier] @ normal - offset)
+        noise = 1.4826 * float(np.median(residual / far[inlier].clip(1e-4)))
+        runs_away = INLIER_DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > MAX_GATE_GROWTH
+        if runs_away or (step == 0 and np.median(residual / width[inlier]) > MAX_MEDIAN_RESIDUAL_SHARE):
+            return None
+        # Tighter than the tolerance: the feet of what stands on it would tilt it.
+        width = np.clip(FIT_DEVIATIONS * noise * far, 0.25 * least, most)
+    if normal @ viewpoint < offset:
+        normal, offset = -normal, -offset
+    inliers = np.zeros(len(points), dtype=bool)
+    inliers[left] = np.abs(near @ normal - offset) < np.clip(INLIER_DEVIATIONS * noise * far, least, most)
+    return _measure(points, inliers, Plane(normal, offset), noise, settings)
+
+
+def _measure(
+    points: Float[np.ndarray, "n 3"],
+    inliers: Bool[np.ndarray, "n"],
+    plane: Plane,
+    noise: float,
+    settings: SegmentationConfig,
+) -> FlatPart | None:
+    """The largest connected part of the inliers, by a raster in the plane; the others are no inliers."""
+    from scipy.ndimage import binary_dilation, label
+    from scipy.spatial import ConvexHull, QhullError
+
+    axes = np.linalg.svd(plane.normal[None])[2][1:].T
+    rows = np.flatnonzero(inliers)
+    flat = points[rows] @ axes
+    low = flat.min(0)
+    width = max(RASTER_CELL_M, longest_side(flat) / MAX_RASTER_CELLS)
+    cell = np.round((flat - low) / width).astype(int) + BRIDGED_CELLS
+    raster = np.zeros(cell.max(0) + 2 * BRIDGED_CELLS, dtype=bool)
+    raster[tuple(cell.T)] = True
+    names, _ = label(binary_dilation(raster, iterations=BRIDGED_CELLS))  # pyright: ignore[reportGeneralTypeIssues]
+    name = names[tuple(cell.T)]
+    largest = name == np.bincount(name)[1:].argmax() + 1
+    flat = flat[largest]
+    try:
+        hull = ConvexHull(flat)
+    except QhullError:
+        return None
+    kept = np.zeros(len(points), dtype=bool)
+    kept[rows[largest]] = True
+    _, turn = np.linalg.eigh(np.cov(flat.T))
+    sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
+    area = float(hull.volume)
+    seen = len(np.unique(packed_rows(cell[largest]))) * width**2
+    least, most = settings.plane_tolerance, settings.max_plane_tolerance
+    length, width = float(sides.max()), float(sides.min())
+    return FlatPart(plane, axes, noise, least, most, kept, (length, width), hull.equations, area, seen / area)

@@ -1,0 +1,272 @@
+"""An object cut out of what depth cameras saw: crop, thin, support, clusters, choice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.config import SegmentationConfig
+from graspd_core.errors import CloudError, NoObjectError
+from graspd_core.perception.cloud.camera import reaches_image_border
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud
+from graspd_core.perception.cloud.voxel_downsample import VoxelScene, voxel_downsample
+from graspd_core.perception.segment.clusters import (
+    extent,
+    link_length,
+    link_points,
+    merge_occluded,
+    renumber,
+    touching_things,
+)
+from graspd_core.perception.segment.planes import find_planes
+from graspd_core.perception.segment.support_plane import Ground, find_ground, stands_on, voxels_of
+from graspd_core.perception.segment.target_selection import Target, check_target, seen, select_target
+from graspd_core.types import Plane
+
+# Scenes nearer than this to their cameras are in another unit than metres [m].
+MIN_SCENE_DISTANCE_M = 0.02
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """An object and what is around it, in the frame of the clouds.
+
+    Attributes:
+        views: the object's points as each camera saw them, at full density; views that do not show it are left out.
+        support: what it stands on; None where none was seen.
+        obstacles: the points of each other thing near it, thinned [m].
+        warnings: what was doubtful.
+    """
+
+    views: tuple[PointCloud, ...]
+    support: Plane | None
+    obstacles: tuple[Float[np.ndarray, "_ 3"], ...]
+    warnings: tuple[str, ...]
+
+
+def segment(
+    views: Sequence[PointCloud], *, target: Target | None = None, settings: SegmentationConfig | None = None
+) -> Segmentation:
+    """Find the object in one or several views of a scene, or take a cloud of an object alone as it is.
+
+    Args:
+        views: what each camera saw, in one frame; points may be NaN.
+        target: what tells the object from other things; without it, the thing nearest the first view's axis is taken
+            (towards the middle of its points where the axis is not known).
+        settings: sizes and tolerances.
+
+    Raises:
+        CloudError: empty, all NaN, too few points, or a target that cannot be meant.
+        NoObjectError: the scene is seen, and what was asked for is not in it.
+    """
+    settings, target = settings or SegmentationConfig(), target or Target()
+    scene = voxel_downsample(views, settings)
+    check_target(target, views)
+    eyes, ground, label = _parted(scene, views, settings)
+    free = _candidates(scene, eyes, label, ground, settings)
+    marked = target.box is not None or target.mask is not None
+    if not free and not (marked and label.max(initial=-1) >= 0):
+        raise NoObjectError(_nothing(scene, label, ground, settings))
+    chosen = select_target(scene, label, free, target, views, settings)
+    found = _cut_out(views, scene, chosen, ground)
+    total = sum(len(view.points) for view in found)
+    if total < MIN_POINTS:
+        raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
+    support = None if ground.support is None else ground.support.plane
+    obstacles = _obstacles(scene, label, chosen, ground, settings)
+    doubts = _doubts(scene, eyes, chosen, ground, bool(obstacles), settings)
+    return Segmentation(
+        found, support, obstacles, doubts if marked else (*doubts, *_touching(scene, eyes, chosen, ground))
+    )
+
+
+def find_things(
+    views: Sequence[PointCloud], settings: SegmentationConfig | None = None
+) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    """The points of each thing that `segment` would choose from without a target [m].
+
+    One of them as a target's point means the thing it is of. There may be none.
+
+    Raises:
+        CloudError: empty, all NaN, or too few points.
+    """
+    settings = settings or SegmentationConfig()
+    scene = voxel_downsample(views, settings)
+    eyes, ground, label = _parted(scene, views, settings)
+    of_points = label[scene.voxel]
+    return tuple(scene.points[of_points == k] for k in _candidates(scene, eyes, label, ground, settings))
+
+
+def _parted(
+    scene: VoxelScene, views: Sequence[PointCloud], settings: SegmentationConfig
+) -> tuple[Float[np.ndarray, "views 3"], Ground, Int[np.ndarray, "voxels"]]:
+    """Where the cameras stood, what things stand on, and the thing that each voxel is part of."""
+    eyes = np.array([view.viewpoint for view in views], dtype=float)
+    parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
+    ground = find_ground(scene, parts, eyes, settings)
+    return eyes, ground, _things(scene, ground, eyes, settings)
+
+
+def _things(
+    scene: VoxelScene, ground: Ground, eyes: Float[np.ndarray, "views 3"], settings: SegmentationConfig
+) -> Int[np.ndarray, "voxels"]:
+    """The thing that each voxel is part of, numbered from the largest; -1: background or noise."""
+    points = scene.mean[ground.left]
+    link = link_length(points, settings)
+    label = link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
+    label = merge_occluded(
+        points,
+        scene.mean_distance[ground.left],
+        label,
+        eyes,
+        link=link,
+        settings=settings,
+        support=ground.support,
+    )
+    label = voxels_of(label, ground.left)
+    many = int(label.max(initial=-1)) + 1
+    for k in range(many):
+        rows = np.flatnonzero(label == k)
+        if scene.count[rows].sum() < settings.min_points or _tiny(scene, rows, ground, settings):
+            label[rows] = -1
+    return renumber(label)
+
+
+def _tiny(scene: VoxelScene, rows: Int[np.ndarray, "rows"], ground: Ground, settings: SegmentationConfig) -> bool:
+    """Whether a cluster is no larger than noise: a speck, or a bump of the support."""
+    points = scene.mean[rows]
+    if extent(points) < settings.smallest_object:
+        return True
+    return ground.support is not None and float(ground.support.height(points).max()) < settings.smallest_object
+
+
+def _candidates(
+    scene: VoxelScene,
+    eyes: Float[np.ndarray, "views 3"],
+    label: Int[np.ndarray, "voxels"],
+    ground: Ground,
+    settings: SegmentationConfig,
+) -> list[int]:
+    """Things of a size to be grasped: those that stand on the support, else all."""
+    things = range(int(label.max(initial=-1)) + 1)
+    fits = [k for k in things if extent(scene.mean[label == k]) <= settings.largest_object]
+    if ground.support is None:
+        return fits
+    part, distance = ground.support, scene.mean_distance
+    standing = [k for k in fits if stands_on(part, scene.mean[label == k], distance[label == k], eyes, settings)]
+    return standing or fits
+
+
+def _cut_out(
+    views: Sequence[PointCloud], scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], ground: Ground
+) -> tuple[PointCloud, ...]:
+    """The object's points of every view that shows it."""
+    wanted = chosen[scene.voxel]
+    if ground.support is not None:
+        rows = np.flatnonzero(wanted)
+        height = ground.support.height(scene.points[rows])
+        wanted[rows] = height > ground.support.tolerance(scene.distance[rows])
+    found = []
+    for k, view in enumerate(views):
+        part = scene.of_view(k)
+        if wanted[part].any():
+            found.append(PointCloud(scene.points[part][wanted[part]], view.viewpoint, view.forward))
+    return tuple(found)
+
+
+def _obstacles(
+    scene: VoxelScene,
+    label: Int[np.ndarray, "voxels"],
+    chosen: Bool[np.ndarray, "voxels"],
+    ground: Ground,
+    settings: SegmentationConfig,
+) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    """Other things and large flat parts, as far as they are within reach of the object's bounding box."""
+    mine = scene.mean[chosen]
+    low, high = mine.min(0) - settings.obstacle_range, mine.max(0) + settings.obstacle_range
+    near = ((scene.mean >= low) & (scene.mean <= high)).all(1) & ~chosen
+    masks = [near & (label == k) for k in range(int(label.max()) + 1)]
+    masks += [near & part.inliers & (label < 0) for part in ground.background]
+    return tuple(scene.mean[mask] for mask in masks if mask.any())
+
+
+def _doubts(
+    scene: VoxelScene,
+    eyes: Float[np.ndarray, "views 3"],
+    chosen: Bool[np.ndarray, "voxels"],
+    ground: Ground,
+    crowded: bool,
+    settings: SegmentationConfig,
+) -> tuple[str, ...]:
+    """What the user should know of how the object was found."""
+    doubts = []
+    if scene.size > 0.5 * settings.gap:
+        doubts.append(
+            f"cloud: {len(scene.points)} points thinned by {1e3 * scene.size:.1f} mm; finer gaps are not seen"
+        )
+    blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
+    if blind:
+        doubts.append(f"cloud: of {len(scene.rows)} views these show nothing near enough: {', '.join(blind)}")
+    if ground.support is None and crowded:
+        doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken as part")
+    # A thing alone makes the outline itself.
+    surrounded = ground.support is not None or len(ground.background) > 0
+    for k in range(len(scene.rows) if surrounded else 0):
+        part = scene.of_view(k)
+        if reaches_image_border(scene.points[part], eyes[k], chosen[scene.voxel[part]], settings.border_width):
+            doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
+    if _cut_off(scene, chosen, settings):
+        doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
+    return tuple(doubts)
+
+
+def _touching(
+    scene: VoxelScene, eyes: Float[np.ndarray, "views 3"], chosen: Bool[np.ndarray, "voxels"], ground: Ground
+) -> tuple[str, ...]:
+    """That what was taken for one thing on a support may be several, if a seam parts it."""
+    if ground.support is None:
+        return ()
+    points = scene.mean[chosen]
+    middles = touching_things(points, eyes, ground.support.height(points), scene.size)
+    if not middles:
+        return ()
+    places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*middle) for middle in middles)
+    return (
+        f"cloud: the object may be {len(middles)} things that touch, about {places} m; "
+        "a box or a mask as target says which is meant",
+    )
+
+
+def _cut_off(scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], settings: SegmentationConfig) -> bool:
+    mine = scene.mean[chosen]
+    cut = bool((scene.mean_distance[chosen] > settings.max_range - 2 * scene.size).any())
+    if settings.roi_low is not None:
+        cut |= bool((mine < np.asarray(settings.roi_low, dtype=float) + scene.size).any())
+    if settings.roi_high is not None:
+        cut |= bool((mine > np.asarray(settings.roi_high, dtype=float) - scene.size).any())
+    return cut
+
+
+def _nothing(scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentationConfig) -> str:
+    """What was seen instead of an object."""
+    if label.max(initial=-1) >= 0:
+        sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
+        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        each = f"{sizes[0]:.2f} m long:" if len(sizes) == 1 else f"the shortest {min(sizes):.2f} m long: each is"
+        limit = f"larger than largest_object={settings.largest_object:g} m"
+        return f"{told}, {each} {limit}; a box or a mask as target says what part is meant"
+    flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
+    if not flat:
+        near = float(np.median(scene.mean_distance))
+        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
+        unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
+        return told + unit if near < MIN_SCENE_DISTANCE_M else told
+    part = flat[0]
+    away = float(np.median(scene.mean_distance[part.inliers]))
+    return (
+        f"cloud: no object among {len(scene.points)} points: a plane of {part.sides[0]:.2f} by {part.sides[1]:.2f} m "
+        f"at {away:.2f} m from the camera, and nothing on it that is higher than {1e3 * part.least:.0f} mm"
+    )

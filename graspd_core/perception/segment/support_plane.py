@@ -1,0 +1,187 @@
+"""Which flat part of a scene is what things stand on, which are background, and which a face of a thing.
+
+A support has the cameras on its free side, is larger than what stands on it, and something stands on it: comes down to
+it, lies over its seen part, and is of a size to be grasped. A face of a convex body has nothing on its free side; the
+floor of a tray has only a rim that is as wide as itself; a wall has things before it that do not come down to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.config import SegmentationConfig
+from graspd_core.perception.cloud.voxel_downsample import VoxelScene
+from graspd_core.perception.segment.clusters import extent, link_length, link_points
+from graspd_core.perception.segment.planes import FlatPart
+
+# Share of its width by which the lowest seen point of a thing may be above its support.
+HIDDEN_HEIGHT_SHARE = 0.5
+# Lines of sight this near to upright [cosine, 15°] show no sides, however high: what they end on rests on something.
+MIN_UPRIGHT_COSINE = 0.966
+# Less of a plane's hull seen than this share, it is a slice through several things.
+MIN_SEEN_SHARE = 0.3
+# Points down to so many tolerances below a part, as many as this share of its own, are a body's other faces.
+EDGE_BAND_TOLERANCES, EDGE_BAND_SHARE = 4.0, 0.25
+# A point is on a flat part, and not where the part's plane cuts through a thing, if of the points within so many
+# tolerances at least this share is on the plane too: on a wall that it cuts squarely, four in ten are.
+NEIGHBOURHOOD_TOLERANCES, ON_PLANE_SHARE = 3.0, 0.6
+# Of so many points around it is asked; where there are more, as noise makes it wide, some of them stand for all.
+NEIGHBOUR_SAMPLES = 50
+# Beyond so many clusters the rest is noise.
+MAX_CLUSTERS = 20
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a scene's things stand on, and what is left when all background is taken away.
+
+    Attributes:
+        support: None where nothing is seen to stand on anything.
+        background: large flat parts that are no support: walls, floors, an empty table.
+        left: which of the scene's voxels may belong to things.
+    """
+
+    support: FlatPart | None
+    background: tuple[FlatPart, ...]
+    left: Bool[np.ndarray, "voxels"]
+
+
+def find_ground(
+    scene: VoxelScene, parts: list[FlatPart], viewpoints: Float[np.ndarray, "views 3"], settings: SegmentationConfig
+) -> Ground:
+    """Sort the flat parts."""
+    margin = settings.support_margin
+    parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
+    large = [part for part in parts if part.sides[0] > settings.largest_object]
+    # As they are asked for: of a table alone in view, which is the support, never.
+    known: dict[int, Bool[np.ndarray, "voxels"]] = {}
+
+    def covered(others: Sequence[FlatPart]) -> list[Bool[np.ndarray, "voxels"]]:
+        known.update({id(part): _covered(scene, part, margin) for part in others if id(part) not in known})
+        return [known[id(part)] for part in others]
+
+    best, most = None, (0, 0)
+    for part in parts:
+        if (viewpoints @ part.plane.normal <= part.plane.offset).any():
+            continue
+        others = covered([x for x in large if x is not part])
+        standing = _standing(scene, part, _left(scene, part, others), viewpoints, settings)
+        if standing > most:
+            best, most = part, standing
+    background = tuple(part for part in large if part is not best)
+    return Ground(best, background, _left(scene, best, covered(background)))
+
+
+def _left(
+    scene: VoxelScene, support: FlatPart | None, background: Sequence[Bool[np.ndarray, "voxels"]]
+) -> Bool[np.ndarray, "voxels"]:
+    """What is above the support and not part of the background."""
+    left = np.ones(len(scene.mean), dtype=bool)
+    if support is not None:
+        left = support.height(scene.mean) > support.tolerance(scene.mean_distance)
+    for covered in background:
+        left &= ~covered
+    return left
+
+
+def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Bool[np.ndarray, "voxels"]:
+    """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
+    from scipy.spatial import KDTree
+
+    height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
+    band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
+    band = band[part.beneath(scene.mean[band], 2 * margin)]
+    on = band[(height[band] <= tolerance[band]) & part.beneath(scene.mean[band], margin)]
+    if len(on) == 0:
+        return np.zeros(len(scene.mean), dtype=bool)
+    reach = NEIGHBOURHOOD_TOLERANCES * tolerance[on]
+    # A flat part has so many voxels within reach.
+    share = NEIGHBOUR_SAMPLES * scene.size**2 / (np.pi * np.median(reach) ** 2)
+    band = band[np.random.default_rng(0).random(len(band)) < share]
+    around, alike = (
+        KDTree(scene.mean[rows]).query_ball_point(scene.mean[on], r=reach, return_length=True)
+        for rows in (band, np.intersect1d(band, on))
+    )
+    covered = np.zeros(len(scene.mean), dtype=bool)
+    covered[on[alike >= ON_PLANE_SHARE * around]] = True
+    return covered
+
+
+def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
+    """Whether the surface goes on downwards from the part's edge: a face of a body, or a flat spot on a curved one."""
+    height, tolerance = part.height(scene.mean), part.tolerance(scene.mean_distance)
+    below = (height < -tolerance) & (height > -EDGE_BAND_TOLERANCES * tolerance)
+    below[below] = part.beneath(scene.mean[below], margin)
+    return bool(below.sum() > EDGE_BAND_SHARE * part.inliers.sum())
+
+
+def _standing(
+    scene: VoxelScene,
+    part: FlatPart,
+    left: Bool[np.ndarray, "voxels"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    settings: SegmentationConfig,
+) -> tuple[int, int]:
+    """How many voxels belong to things that touch that part, and to things that may stand on it."""
+    points, distance = scene.mean[left], scene.mean_distance[left]
+    label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
+    touching, standing = 0, 0
+    for k in range(min(int(label.max(initial=-1)) + 1, MAX_CLUSTERS)):
+        rows = np.flatnonzero(label == k)
+        if stands_on(part, points[rows], distance[rows], viewpoints, settings):
+            standing += len(rows)
+            touching += len(rows) if _clearance(part, points[rows], distance[rows]) <= settings.contact else 0
+    return touching, standing
+
+
+def stands_on(
+    part: FlatPart,
+    thing: Float[np.ndarray, "n 3"],
+    distance: Float[np.ndarray, "n"],
+    viewpoints: Float[np.ndarray, "views 3"],
+    settings: SegmentationConfig,
+) -> bool:
+    """Whether a cluster of voxels is a thing on that support."""
+    if not settings.smallest_object <= extent(thing) <= settings.largest_object:
+        return False
+    flat = thing @ part.axes
+    # From above, a round body hides as much of its height as half its width.
+    hidden = HIDDEN_HEIGHT_SHARE * float(np.ptp(flat, axis=0).max())
+    hidden = settings.largest_object if _upright(part, thing, viewpoints) else max(settings.contact, hidden)
+    if _clearance(part, thing, distance) > hidden:
+        return False
+    over = part.beneath(thing, settings.gap).mean() >= 0.5
+    return bool(over) and part.area >= settings.support_area_ratio * _outline_area(flat)
+
+
+def _upright(part: FlatPart, thing: Float[np.ndarray, "n 3"], viewpoints: Float[np.ndarray, "views 3"]) -> bool:
+    """Whether all cameras look straight down on a thing."""
+    sight = viewpoints - thing.mean(0)
+    return bool((sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all())
+
+
+def _clearance(part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"]) -> float:
+    """Between the plane's noise and the lowest point that is seen of a thing [m]."""
+    return float((part.height(thing) - part.tolerance(distance)).min())
+
+
+def _outline_area(flat: Float[np.ndarray, "n 2"]) -> float:
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(flat) < 3:
+        return 0.0
+    try:
+        return float(ConvexHull(flat).volume)
+    except QhullError:
+        return 0.0
+
+
+def voxels_of(label: Int[np.ndarray, "left"], left: Bool[np.ndarray, "voxels"]) -> Int[np.ndarray, "voxels"]:
+    """Labels of all voxels from those of the voxels left; -1 for the others."""
+    everywhere = np.full(len(left), -1)
+    everywhere[left] = label
+    return everywhere

@@ -1,0 +1,226 @@
+"""Parts of space: boxes, balls and what lies near to given points.
+
+Whether a link enters a box: exact for solids that are the hull of balls, which all but finely cut hulls are.
+
+Frank and Wolfe's steps (Naval Research Logistics 1956) lead to the point of a solid's core that is nearest to the box.
+On their way they give a lower bound of the distance. A pair that they leave undecided counts as entered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from graspd_core.errors import ConfigError, shown
+from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import build_sdf
+from graspd_core.optimize.obstacle_distance import RETREAT, extreme_points_of_solids, hand_reach
+from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.se3 import SE3, rotation_from_quaternion
+from graspd_core.types import Posture, TriangleMesh
+
+# A few numbers, as a caller may write them.
+Numbers = Sequence[float | int] | np.ndarray
+
+
+def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
+    """So many finite numbers. Raises ConfigError: they are not, by the name of what was given."""
+    try:
+        values = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ConfigError(f"{name}: {shown(given)}; valid: {count} finite numbers")
+    return tuple(values.tolist())
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box.
+
+    Attributes:
+        center: its middle, object frame [m].
+        size: its edges' lengths [m].
+        quaternion_wxyz: how its edges are turned, of any length; not at all by default.
+
+    Raises:
+        ConfigError: a number is not finite, an edge not longer than 0, the quaternion 0.
+    """
+
+    center: Numbers
+    size: Numbers
+    quaternion_wxyz: Numbers = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, count in (("center", 3), ("size", 3), ("quaternion_wxyz", 4)):
+            object.__setattr__(self, name, numbers(f"box {name}", getattr(self, name), count))
+        if min(self.size) <= 0:
+            raise ConfigError(f"box size: {shown(self.size)}; valid: three lengths above 0, in metres")
+        if not any(self.quaternion_wxyz):
+            raise ConfigError("box quaternion_wxyz: all 0; valid: w, x, y, z, not all 0")
+
+    @cached_property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """`R_object_box`."""
+        return rotation_from_quaternion(torch.tensor(tuple(self.quaternion_wxyz), dtype=torch.float64)).numpy()
+
+    def local(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the object frame in the box's own [m]."""
+        return (points - np.asarray(self.center)) @ self.rotation
+
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Signed distance of points [m], negative inside."""
+        beyond = np.abs(self.local(points)) - np.asarray(self.size) / 2
+        return np.linalg.norm(beyond.clip(0.0), axis=-1) + beyond.max(-1).clip(max=0.0)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball.
+
+    Attributes:
+        center: its middle, object frame [m].
+        radius: [m].
+
+    Raises:
+        ConfigError: a number is not finite, or the radius not above 0.
+    """
+
+    center: Numbers
+    radius: float | int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", numbers("sphere center", self.center, 3))
+        if not np.isfinite(self.radius) or self.radius <= 0:
+            raise ConfigError(f"sphere radius: {self.radius} m; valid: above 0")
+
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Signed distance of points [m], negative inside."""
+        return np.linalg.norm(points - np.asarray(self.center), axis=-1) - self.radius
+
+
+@dataclass(frozen=True, eq=False)
+class NearPoints:
+    """What lies near to points, as those that a mask of an image shows.
+
+    Attributes:
+        points: object frame [m].
+        radius: how near [m].
+
+    Raises:
+        ConfigError: there is no finite point, or the radius is not above 0.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    radius: float = 0.01
+    _tree: KDTree = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, dtype=float)
+        points = points[np.isfinite(points).all(-1)] if points.ndim == 2 and points.shape[-1] == 3 else points[:0]
+        if len(points) == 0:
+            raise ConfigError("region points: none is finite; valid: rows of x, y, z in metres")
+        if not np.isfinite(self.radius) or self.radius <= 0:
+            raise ConfigError(f"region radius: {self.radius} m; valid: above 0")
+        object.__setattr__(self, "_tree", KDTree(points))
+
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """How far points are from the nearest point, less the radius [m]; negative inside."""
+        return self._tree.query(points)[0] - self.radius
+
+
+Region = Box | Sphere | NearPoints
+
+
+_STEPS = 60
+# A gap narrower than this is none [m].
+_TOUCH = 1e-5
+_GRID_RESOLUTION = 32
+# The search keeps so far off a box [m]: it allows a little depth in obstacles, and a squeeze closes the fingers more.
+_PAD = 0.004
+
+
+def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) -> Bool[np.ndarray, "postures"]:
+    """In which postures a link reaches into one of the boxes; positions in the boxes' frame."""
+    if not boxes or not postures:
+        return np.zeros(len(postures), dtype=bool)
+    points, radii = _placed_solids(hand, postures)
+    found = [_enter(box.local(points), radii, np.asarray(box.size) / 2) for box in boxes]
+    return np.any(found, axis=0)
+
+
+def _placed_solids(
+    hand: HandModel, postures: Sequence[Posture]
+) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
+    """Extreme points of each solid [m], the first again where it has fewer than others; and the radius about them."""
+    solids = extreme_points_of_solids(hand)
+    most = max(len(points) for points, _, _ in solids)
+    local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])
+    joints = torch.as_tensor(np.stack([p.joint_positions for p in postures])).double()
+    links = forward(make_kinematics(hand, dtype=torch.float64), joints)[:, torch.as_tensor([s[2] for s in solids])]
+    inside = torch.einsum("bsij,skj->bski", links.rotation, torch.as_tensor(local)) + links.translation[:, :, None]
+    turns = rotation_from_quaternion(torch.as_tensor(np.stack([p.quaternion_wxyz for p in postures])).double())
+    base = SE3(turns, torch.as_tensor(np.stack([p.position for p in postures])).double())
+    placed = base.apply(inside.flatten(1, 2)).reshape(inside.shape)
+    return placed.numpy(), np.array([radius for _, radius, _ in solids])
+
+
+def _enter(
+    points: Float[np.ndarray, "postures solids corners 3"],
+    radii: Float[np.ndarray, "solids"],
+    half: Float[np.ndarray, "3"],
+) -> Bool[np.ndarray, "postures"]:
+    """Which hands have a solid less than its radius from the box |x| ≤ `half`."""
+    flat = points.reshape(-1, *points.shape[2:])
+    radius = np.tile(radii, len(points))
+    # What lies beyond one of the box's faces is clear of it.
+    clear = ((flat.min(1) - radius[:, None] > half) | (flat.max(1) + radius[:, None] < -half)).any(-1)
+    rows = np.flatnonzero(~clear)
+    x = flat[rows].mean(1)
+    for _ in range(_STEPS):
+        away = x - x.clip(-half, half)
+        gap = np.linalg.norm(away, axis=-1)
+        along = np.einsum("nki,ni->nk", flat[rows], away)
+        nearest = along.argmin(1)
+        bound = along.min(1) - (away * x.clip(-half, half)).sum(-1)
+        parted = bound > (radius[rows] + _TOUCH) * gap
+        inside = gap <= radius[rows] + _TOUCH
+        clear[rows[parted & ~inside]] = True
+        going = ~parted & ~inside
+        if not going.any():
+            break
+        rows, x, away, nearest = rows[going], x[going], away[going], nearest[going]
+        step = flat[rows, nearest] - x
+        share = -(away * step).sum(-1) / np.maximum((step * step).sum(-1), 1e-18)
+        x = x + share.clip(0.0, 1.0)[:, None] * step
+    return ~clear.reshape(len(points), -1).all(-1)
+
+
+def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple[Obstacle, ...]:
+    """What the hand could meet of each box on its way to the object, as an obstacle of the search."""
+    reach = scene.object.radius + hand_reach(hand) + RETREAT
+    found = []
+    for box in boxes:
+        middle, half = box.local(scene.object.center_of_mass), np.asarray(box.size) / 2
+        low, high = np.maximum(-half - _PAD, middle - reach), np.minimum(half + _PAD, middle + reach)
+        if (low < high).all():
+            mesh = _box_mesh(box, low, high)
+            found.append(Obstacle(mesh, build_sdf(mesh, resolution=_GRID_RESOLUTION, padding=0.02)))
+    return tuple(found)
+
+
+def _box_mesh(box: Box, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> TriangleMesh:
+    """The part of a box between two corners of its own frame."""
+    import trimesh
+
+    mesh = trimesh.creation.box(bounds=np.stack([low, high]))
+    vertices = np.asarray(mesh.vertices) @ box.rotation.T + np.asarray(box.center)
+    return TriangleMesh(vertices, np.asarray(mesh.faces, dtype=np.int64))

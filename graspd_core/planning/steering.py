@@ -1,0 +1,291 @@
+"""The part of an object outside a region, as an obstacle of the search: what touches it there is pushed off.
+
+So the search itself puts all contacts into the region, with the loss and the gradient that it has for obstacles. The
+distance is the greater of two, that to the object and that to the outside of the region: exact where one of them is the
+nearer one's, else too small, and its gradient jumps where they are equal.
+
+Where a hand comes from, how it is rolled, what it touches and what it keeps away from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from graspd_core.errors import ConfigError, shown
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import GridSDF
+from graspd_core.optimize.initial_poses import closing_axis, depth_of_starts
+from graspd_core.optimize.obstacle_distance import RETREAT
+from graspd_core.optimize.restrictions import Aim, BoundRestriction, BoundRestrictions, Refusal, Roll
+from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Sphere, boxes_in_reach, entered, numbers
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Grasp
+
+# The untouched part begins so far outside the region, and links keep so far off its surface [m].
+_BEGINS, _SKIN = 0.003, 0.004
+
+
+def untouched_part(scene: Scene, region: Region) -> Obstacle:
+    """The object outside `region`, on the nodes of the object's own grid."""
+    sdf = scene.sdf
+    field, spacing = sdf.field.double().cpu().numpy(), float(sdf.spacing)
+    axes = [float(x) + spacing * np.arange(n) for x, n in zip(sdf.origin, field.shape[1:], strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    left = _BEGINS - region.distance(nodes.reshape(-1, 3)).reshape(nodes.shape[:-1])
+    slope = np.array(np.gradient(left, spacing))
+    slope = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-9)
+    phi = field[0] - _SKIN
+    values = np.where(phi > left, np.concatenate([phi[None], field[1:]]), np.concatenate([left[None], slope]))
+    return Obstacle(
+        scene.object.mesh, GridSDF(torch.as_tensor(values).to(sdf.field), sdf.origin, sdf.spacing, sdf.half)
+    )
+
+
+# A contact may lie so far outside the region [m]; rounding of angles [rad].
+CONTACT_TOLERANCE = 0.005
+_ROUNDING = 1e-6
+# Points of the surface that tell what part of the object lies in a region, and how many of those are aimed at.
+_SURFACE, _MOST_PLACES = 20_000, 400
+# Fingers that point so nearly along the approach have no side of their own: sine of the angle.
+_ALONG = 0.3
+# From so near to the vertical a roll is measured from x: cosine of the angle.
+_VERTICAL = 0.95
+# Directions with a lesser angle's sine are along each other.
+_PARALLEL = 1e-3
+# Starts that are looked at, and how deep the best of them is in the support where none can come from there [m].
+_PROBES, _TOO_DEEP = 8, 0.06
+
+
+@dataclass(frozen=True)
+class Steering:
+    """What is asked of a grasp's place and direction. Everything is in the object frame; what is None is not asked for.
+
+    The direction of approach of a hand is the one in which it moves from the retreat over the pregrasp to the grasp:
+    `HandModel.approach`, which a hand's description says and which is the palm's normal where it does not.
+
+    Its side, from which the roll is measured, is the direction from the palm to the fingertips, square to the approach;
+    for a hand whose open fingers point along the approach, as a gripper's, the one in which they close.
+
+    Attributes:
+        approach_direction: direction of approach that is wanted, of any length but 0; (0, 0, -1) is from above.
+        approach_angle: greatest angle between it and a grasp's approach, above 0, at most π [rad].
+        region: a `Box`, a `Sphere` or points (`NearPoints`); every contact lies in it, or at most 5 mm outside.
+        avoid: boxes that no link enters at pregrasp, grasp and squeeze.
+        roll: turn of the hand's side about the approach, right-handed [rad]; at 0 it points along z, or along x
+            where the wanted approach is within 18° of vertical. It needs an approach direction, and an angle below π/2.
+        roll_zero: where the hand's side points at a roll of 0, once made square to the approach; None: as `roll` says.
+        roll_tolerance: greatest difference from `roll` either way, above 0, at most π [rad].
+
+    Raises:
+        ConfigError: a value is out of its range, not finite, or contradicts another.
+    """
+
+    approach_direction: Numbers | None = None
+    approach_angle: float | int = np.pi / 6
+    region: Region | None = None
+    avoid: Sequence[Box] = ()
+    roll: float | int | None = None
+    roll_tolerance: float | int = np.pi / 12
+    roll_zero: Numbers | None = None
+
+    def __post_init__(self) -> None:
+        if self.approach_direction is not None:
+            values = numbers("approach_direction", self.approach_direction, 3)
+            if not np.linalg.norm(values) > 0:
+                raise ConfigError("approach_direction: (0, 0, 0) is no direction; valid: x, y, z, not all 0")
+        for name in ("approach_angle", "roll_tolerance"):
+            if not 0 < getattr(self, name) <= np.pi:
+                raise ConfigError(f"{name}: {getattr(self, name):.4g} rad; valid: above 0, at most pi (180 degrees)")
+        if self.region is not None and not isinstance(self.region, Box | Sphere | NearPoints):
+            raise ConfigError(f"region: {type(self.region).__name__}; valid: Box, Sphere, NearPoints")
+        if any(not isinstance(box, Box) for box in self.avoid):
+            raise ConfigError("avoid: not all are a Box")
+        if self.roll is None:
+            return
+        if not np.isfinite(self.roll):
+            raise ConfigError(f"roll: {self.roll} rad; valid: a finite number")
+        if self.approach_direction is None or self.approach_angle >= np.pi / 2:
+            raise ConfigError("roll: needs approach_direction, and approach_angle below pi/2 (90 degrees)")
+        if self.roll_zero is not None:
+            zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
+            if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):
+                raise ConfigError(f"roll_zero: {shown(zero)}; valid: a direction that is not along approach_direction")
+
+    def bind(self, scene: Scene, hand: HandModel) -> BoundSteering:
+        """Steering of this hand in this scene.
+
+        Raises:
+            ConfigError: no part of the object lies in the region, or that part lies in an avoided box.
+        """
+        direction = None if self.approach_direction is None else np.array(self.approach_direction, dtype=float)
+        if direction is not None:
+            direction = direction / np.linalg.norm(direction)
+        roll = None
+        if direction is not None and self.roll is not None:
+            zero = zero_of_roll(direction) if self.roll_zero is None else np.array(self.roll_zero, dtype=float)
+            zero = zero - (zero @ direction) * direction
+            roll = Roll(hand_side(hand), zero / np.linalg.norm(zero), self.roll, self.roll_tolerance)
+        places = None if self.region is None else _part_of_object(scene, self.region, self.avoid)
+        aim = Aim(direction, self.approach_angle, roll, places)
+        return BoundSteering(self, scene, hand, aim)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundSteering(BoundRestriction):
+    """`Steering` of one hand in one scene; `wanted` is where starts are drawn."""
+
+    steering: Steering
+    scene: Scene
+    hand: HandModel
+    wanted: Aim
+
+    @property
+    def asked(self) -> str:
+        """The wishes that there are, by name."""
+        given = {name: getattr(self.steering, name) is not None for name in ("approach_direction", "region", "roll")}
+        given["avoid"] = len(self.steering.avoid) > 0
+        return ", ".join(name for name, there in given.items() if there)
+
+    @property
+    def aim(self) -> Aim | None:
+        """Where starts are drawn, if a place, a direction or a roll is asked for."""
+        asked = self.wanted.direction is not None or self.wanted.places is not None
+        return self.wanted if asked else None
+
+    @cached_property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The avoided boxes, where the hand could meet them, and what of the object is not to be touched."""
+        region = self.steering.region
+        rest = () if region is None else (untouched_part(self.scene, region),)
+        return (*boxes_in_reach(self.scene, self.hand, self.steering.avoid), *rest)
+
+    @property
+    def impossible(self) -> str:
+        """Why the hand cannot come from the wanted direction: it would have to come out of the support."""
+        if self.scene.support is None or self.wanted.direction is None:
+            return ""
+        depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))
+        if depth <= _TOO_DEEP:
+            return ""
+        return (
+            f"approach_direction: nothing is left of it, since on its way the hand would reach {depth * 100:.0f} cm "
+            "into what the object stands on; ask for a direction from the free side, or a wider approach_angle"
+        )
+
+    def starts(
+        self,
+        positions: Float[np.ndarray, "batch 3"],
+        quaternions: Float[np.ndarray, "batch 4"],
+        joints: Float[np.ndarray, "batch joints"],
+    ) -> Bool[np.ndarray, "batch"]:
+        """Hands whose palm lies in no avoided box, there and at the retreat; their aim sees to all else."""
+        if not self.steering.avoid:
+            return np.ones(len(positions), dtype=bool)
+        turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
+        palms = [positions + turns @ (self.hand.palm_center - back * self.hand.approach) for back in (0.0, RETREAT)]
+        return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
+
+    def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
+        """The candidates that are as asked for; the first wish that one misses is why it is refused."""
+        if not grasps:
+            return grasps
+        missed = {
+            f"outside the approach cone of {np.degrees(self.steering.approach_angle):.0f} degrees": self._off_cone(
+                grasps
+            ),
+            "with another roll": self._off_roll(grasps),
+            "with a contact outside the region": self._off_region(grasps),
+            "with a link in an avoided box": self._in_boxes(grasps),
+        }
+        reasons = [next((why for why, rows in missed.items() if rows[i]), "") for i in range(len(grasps))]
+        return [Refusal(why) if why else grasp for why, grasp in zip(reasons, grasps, strict=True)]
+
+    def _off_cone(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
+        if self.wanted.direction is None:
+            return np.zeros(len(grasps), dtype=bool)
+        angles = [angle_of_approach(self.hand, grasp, self.wanted.direction) for grasp in grasps]
+        return np.array(angles) > self.steering.approach_angle + _ROUNDING
+
+    def _off_roll(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
+        if self.wanted.roll is None:
+            return np.zeros(len(grasps), dtype=bool)
+        turned = rotation_from_quaternion(torch.as_tensor(np.stack([g.grasp.quaternion_wxyz for g in grasps])).double())
+        missing = self.wanted.roll.missing(turned @ torch.as_tensor(self.hand.approach), turned)
+        return np.abs(missing.numpy()) > self.steering.roll_tolerance + _ROUNDING
+
+    def _off_region(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
+        if self.steering.region is None:
+            return np.zeros(len(grasps), dtype=bool)
+        return np.array([outside_region(self.steering.region, grasp) > CONTACT_TOLERANCE for grasp in grasps])
+
+    def _in_boxes(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
+        stages = ("pregrasp", "grasp", "squeeze")
+        return np.any(
+            [entered(self.hand, [getattr(g, stage) for g in grasps], self.steering.avoid) for stage in stages], axis=0
+        )
+
+
+def angle_of_approach(hand: HandModel, grasp: Grasp, direction: Float[np.ndarray, "3"]) -> float:
+    """Angle between a grasp's approach and a unit direction [rad]."""
+    turned = rotation_from_quaternion(torch.as_tensor(grasp.grasp.quaternion_wxyz)).double().numpy()
+    approach = turned @ hand.approach
+    return float(np.arctan2(np.linalg.norm(np.cross(approach, direction)), approach @ direction))
+
+
+def outside_region(region: Region, grasp: Grasp) -> float:
+    """How far the farthest contact of a grasp lies outside a region [m]; infinite without a contact."""
+    points = np.array([contact.position for contact in grasp.contacts], dtype=float)
+    return float(region.distance(points).max()) if len(points) else np.inf
+
+
+def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
+    """Unit direction that rolls are measured by, square to the approach, base frame; see `Steering`."""
+    rotations, translations = link_poses(hand, hand.open_posture)
+    links = hand.candidate_link
+    points = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
+    tips = [points[hand.link_group[links] == group].mean(0) for group in hand.fingertip_groups]
+    ahead = np.mean(tips, axis=0) - hand.palm_center
+    side = ahead - (ahead @ hand.approach) * hand.approach
+    if np.linalg.norm(side) < _ALONG * np.linalg.norm(ahead):
+        side = closing_axis(hand)
+        side = side - (side @ hand.approach) * hand.approach
+        # The axis has no sign of its own.
+        side = side * np.sign(side[np.abs(side).argmax()])
+    return side / np.linalg.norm(side)
+
+
+def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Where a hand's side points at a roll of 0 where nobody says: unit, square to the wanted unit approach."""
+    up = np.eye(3)[0 if abs(direction[2]) > _VERTICAL else 2]
+    square = up - (up @ direction) * direction
+    return square / np.linalg.norm(square)
+
+
+def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float[np.ndarray, "places 3"]:
+    """Points of the object's surface in a region [m].
+
+    Raises:
+        ConfigError: there is none, or all of them lie in an avoided box.
+    """
+    mesh = scene.object.mesh
+    points = np.vstack([surface_samples(mesh, _SURFACE, seed=0)[0], mesh.vertices])
+    inside = points[region.distance(points) <= 0.0]
+    if len(inside) == 0:
+        low, high = (" ".join(f"{v:.3f}" for v in corner) for corner in (points.min(0), points.max(0)))
+        raise ConfigError(
+            f"region: no part of the object lies in it; the object goes from ({low}) to ({high}) m and is "
+            f"{region.distance(points).min():.3f} m away"
+        )
+    for number, box in enumerate(avoid):
+        if (box.distance(inside) <= 0.0).all():
+            raise ConfigError(f"region: all of it that is on the object lies in avoid box {number}; valid: one outside")
+    return inside[:: len(inside) // _MOST_PLACES + 1]

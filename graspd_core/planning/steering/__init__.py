@@ -1,1 +1,0 @@
-"""Steering: where a hand comes from, what it touches and what it keeps away from."""

@@ -1,1 +1,0 @@
-"""A closed mesh from what was seen of an object."""

@@ -1,1 +1,0 @@
-"""Pictures and depth images of meshes, and authored tabletop scenes whose truth is known."""

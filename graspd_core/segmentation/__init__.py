@@ -1,1 +1,0 @@
-"""One object cut out of a scene: planes, clusters, the support plane, the target."""

@@ -1,1 +1,0 @@
-"""Physics trials in MuJoCo. They share no code with the methods."""

@@ -1,0 +1,1 @@
+"""Trials in MuJoCo, metrics, and the verdict."""

@@ -1,0 +1,339 @@
+"""The hold trial: close on a free object, pull it along ±x, ±y, ±z in turn, and see whether it stays.
+
+After DexGraspBench's floating protocol, re-implemented from its parameters. Travel and turn of the object are measured
+from its pose at the start of the trial, so that what the closing fingers do to it counts too. A pull ends when its
+answer is known (`early_stop`), unless the protocol asks for the full length.
+
+The noisy hold trial: does a grasp survive not knowing exactly where the object is?
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.perception.scene import moved_grasp
+from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle, rotation_from_quaternion
+from graspd_core.types import Grasp, Posture, TrialResult
+from graspd_core.verify.early_stop import CHECK_EVERY, LOOK_EVERY, ObjectState, answer_known, stop_rule
+from graspd_core.verify.world import Protocol, World, advance, trial_data
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
+# Why a trial failed that its caller ended.
+STOPPED = "stopped before the trial ended"
+
+
+def hold_trial(
+    world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
+) -> TrialResult:
+    """Run one hold trial of `protocol`; ends at the first breach.
+
+    Returns:
+        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the pulls, until
+        the pulls ended: an object that still creeps when a pull's answer is known would go farther by its full length.
+        A simulation that diverges, or has more contacts than memory, is a failure with that reason.
+    """
+    import mujoco
+
+    grasp = moved_grasp(grasp, -world.origin)
+    worst = np.zeros(2)
+    try:
+        return _result(worst, _hold(world, grasp, protocol, worst, stop))
+    except mujoco.FatalError as error:
+        return _result(worst, gave_up(error))
+
+
+def gave_up(error: Exception) -> str:
+    """Why a trial is over that MuJoCo has broken off."""
+    return f"the simulation gave up: {str(error).splitlines()[0]}"
+
+
+def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, stop: Callable[[], bool]) -> str:
+    """Why the grasp does not hold, empty if it does; `worst` travel [m] and turn [rad] are brought up to date."""
+    import mujoco
+
+    with trial_data(world) as data:
+        reason = close_hand(world, data, grasp, protocol, worst, stop=stop)
+        if reason:
+            return reason
+        held = np.empty(mujoco.mj_stateSize(world.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+        mujoco.mj_getState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mass = float(world.model.body_mass[world.object_body])
+        steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
+        for direction in DIRECTIONS[list(protocol.pulls)]:
+            mujoco.mj_setState(world.model, data, held, mujoco.mjtState.mjSTATE_INTEGRATION)
+            data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
+            reason = step_until_known(world, data, protocol, worst, steps, stop=stop)
+            if reason:
+                return reason if reason == STOPPED else f"{reason} under a pull along {axis_name(direction)}"
+        return ""
+
+
+def step_until_known(
+    world: World, data: Any, protocol: Protocol, worst: np.ndarray, steps: int, *, stop: Callable[[], bool]
+) -> str:
+    """Simulate what acts now for `steps` steps, or until it is known that the object stays within the limits.
+
+    `worst` travel [m] and turn [rad] are brought up to date. Returns why the trial is over, empty if it is not.
+    """
+
+    rule, done = stop_rule(protocol, world.fingers), 0
+    recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)
+    while done < steps:
+        if done % CHECK_EVERY == 0 and stop():
+            return STOPPED
+        count = min(LOOK_EVERY, steps - done)
+        advance(world, data, count)
+        done += count
+        checked = done % CHECK_EVERY == 0 or done == steps
+        reason = breach(world, data, protocol, worst) if checked else ""
+        if reason:
+            return reason
+        if rule is None:
+            continue
+        recent.append(object_state(world, data))
+        if done >= rule.first and answer_known(rule, protocol, [*recent], moved(world, recent[-1]), steps - done):
+            return breach(world, data, protocol, worst)
+    return ""
+
+
+def object_state(world: World, data: Any) -> ObjectState:
+    """Where the object is, and how fast."""
+    turn = world.object_address + 3
+    x, y, z, *spin = data.qvel[world.object_velocity : world.object_velocity + 6].tolist()
+    return ObjectState(
+        center=tuple(data.xipos[world.object_body].tolist()),
+        quaternion_wxyz=tuple(data.qpos[turn : turn + 4].tolist()),
+        speed=math.hypot(x, y, z),
+        spin=math.hypot(*spin),
+    )
+
+
+def moved(world: World, state: ObjectState) -> tuple[float, float]:
+    """Travel [m] of the object's centre of mass, and the object's turn [rad], from the start of the trial."""
+    w, x, y, z = state.quaternion_wxyz
+    return math.dist(state.center, world.center_of_mass), 2 * math.atan2(math.hypot(x, y, z), abs(w))
+
+
+def close_hand(
+    world: World,
+    data: Any,
+    grasp: Grasp,
+    protocol: Protocol,
+    worst: np.ndarray,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> str:
+    """From the pregrasp over the grasp to the squeeze; returns why the trial is over, empty if it is not.
+
+    `worst` travel [m] and turn [rad] of the object are brought up to date.
+    """
+    import mujoco
+
+    set_hand_pose(world, data, grasp.pregrasp)
+    mujoco.mj_forward(world.model, data)
+    depth = start_penetration(world, data)
+    if depth > protocol.max_start_penetration:
+        return f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm"
+    for stage, (start, end) in {
+        "closing": (grasp.pregrasp, grasp.grasp),
+        "squeezing": (grasp.grasp, grasp.squeeze),
+    }.items():
+        reason = _move(world, data, start, end, protocol, worst)
+        if not reason and stop():
+            return STOPPED
+        if reason:
+            return f"{reason} while {stage}"
+    return ""
+
+
+def _result(worst: np.ndarray, reason: str) -> TrialResult:
+    return TrialResult("hold", not reason, float(worst[0]), float(worst[1]), reason)
+
+
+def start_penetration(world: World, data: Any) -> float:
+    """Deepest overlap of hand and object in the current state [m]."""
+    bodies = world.model.geom_bodyid
+    contact = data.contact
+    on_object = (bodies[contact.geom1] == world.object_body) != (bodies[contact.geom2] == world.object_body)
+    return float(-min(contact.dist[on_object], default=0.0)) if data.ncon else 0.0
+
+
+def axis_name(direction: np.ndarray) -> str:
+    return f"{'-' if direction.min() < 0 else '+'}{'xyz'[int(np.abs(direction).argmax())]}"
+
+
+def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
+    """Put base, joints and targets where a posture says; `mj_forward` is the caller's."""
+    set_joints(world, data, posture.joint_positions)
+    data.mocap_pos[0] = posture.position
+    data.mocap_quat[0] = posture.quaternion_wxyz
+    data.ctrl[:] = posture.joint_positions
+
+
+def set_joints(world: World, data: Any, values: np.ndarray) -> None:
+    """Put the actuated joints at `values` [rad] or [m], and those coupled to them where they belong."""
+    data.qpos[world.joint_addresses] = values
+    for address, mimic in zip(world.coupled_addresses, world.mimics, strict=True):
+        data.qpos[address] = mimic.multiplier * values[mimic.joint] + mimic.offset
+
+
+def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
+    """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
+
+    steps = round(protocol.stage_time / protocol.timestep)
+    way = straight_way(start, end, np.arange(1, steps + 1) / steps)
+    for step in range(1, steps + 1):
+        set_targets(data, way, step - 1)
+        advance(world, data)
+        if step % CHECK_EVERY == 0:
+            reason = breach(world, data, protocol, worst)
+            if reason:
+                return reason
+    return ""
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """Base poses (wxyz, [m]) and joint targets [rad] or [m] on the way from one posture to another."""
+
+    positions: Float[np.ndarray, "n 3"]
+    quaternions: Float[np.ndarray, "n 4"]
+    joints: Float[np.ndarray, "n joints"]
+
+
+def straight_way(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> Way:
+    """The postures at some shares of the straight way from start to end, all at once: a trial takes hundreds."""
+    a = shares[:, None]
+    # The shorter way round for the base: wxyz and its negative are the same rotation.
+    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
+    quaternions = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
+    return Way(
+        (1 - a) * start.position + a * end.position,
+        quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        (1 - a) * start.joint_positions + a * end.joint_positions,
+    )
+
+
+def set_targets(data: Any, way: Way, index: int) -> None:
+    """Base pose and joint targets at a point of the way."""
+    data.mocap_pos[0] = way.positions[index]
+    data.mocap_quat[0] = way.quaternions[index]
+    data.ctrl[:] = way.joints[index]
+
+
+def diverged(data: Any) -> bool:
+    """Whether MuJoCo met a bad state. Its other warnings, such as a full contact buffer, leave the state sound."""
+    import mujoco
+
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    return any(data.warning[int(warning)].number for warning in bad)
+
+
+def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
+    """Update the worst travel and turn; name the limit that is broken, if any."""
+    travel, turn = moved(world, object_state(world, data))
+    if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
+        worst[:] = np.inf
+        return "the simulation diverged"
+    worst[:] = np.maximum(worst, [travel, turn])
+    return broken_limit(protocol, travel, turn)
+
+
+def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
+    """Which limit a travel [m] and a turn [rad] break, as a sentence; empty for none."""
+    if travel > protocol.max_displacement:
+        return f"the object moved {travel * 100:.1f} cm"
+    if turn > protocol.max_rotation:
+        return f"the object turned {np.rad2deg(turn):.0f}°"
+    return ""
+
+
+TRIALS = 8
+# A turn and an offset [m] of the hand.
+PoseError = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
+# Errors are uniform up to these: along each axis [m], and about a random axis through the centre of mass [rad].
+OFFSET, TURN = 0.005, float(np.deg2rad(5.0))
+
+
+def noisy_trial(
+    world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
+) -> float:
+    """Share of 8 hold trials that the grasp passes, each with the hand out of place by up to 5 mm and 5°."""
+    return sum(hold.passed for hold in noisy_holds(world, grasp, protocol, seed=seed, stop=stop)) / TRIALS
+
+
+def noisy_holds(
+    world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
+) -> tuple[TrialResult, ...]:
+    """The 8 hold trials of a noisy trial.
+
+    The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same
+    errors. A start that the error pushes too deep into the object counts as not held.
+    """
+    moved = [displaced(grasp, *error, world.center_of_mass + world.origin) for error in pose_errors(seed, TRIALS)]
+    return tuple(hold_trial(world, g, protocol, stop=stop) for g in moved)
+
+
+def noisy_share(
+    world: World,
+    grasp: Grasp,
+    protocol: Protocol,
+    errors: Sequence[PoseError],
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> float | None:
+    """Share of hold trials under the given errors that the grasp passes.
+
+    None where `stop` ended one of them, or there is none.
+    """
+    held, center = 0, world.center_of_mass + world.origin
+    for error in errors:
+        held += hold_trial(world, displaced(grasp, *error, center), protocol, stop=stop).passed
+        if stop():
+            return None
+    return held / len(errors) if errors else None
+
+
+def pose_errors(seed: int | Sequence[int], count: int) -> list[PoseError]:
+    """Seeded errors, one for each trial."""
+    rng = np.random.default_rng(seed)
+    return [pose_error(rng) for _ in range(count)]
+
+
+def pose_error(rng: np.random.Generator) -> PoseError:
+    """A random turn and a random offset [m]."""
+    axis = rng.normal(size=3)
+    angle = torch.tensor(rng.uniform(-TURN, TURN), dtype=torch.float64)
+    rotation = rotation_from_axis_angle(torch.as_tensor(axis / np.linalg.norm(axis)), angle).numpy()
+    return rotation, rng.uniform(-OFFSET, OFFSET, 3)
+
+
+def displaced(
+    grasp: Grasp,
+    rotation: Float[np.ndarray, "3 3"],
+    offset: Float[np.ndarray, "3"],
+    center: Float[np.ndarray, "3"],
+) -> Grasp:
+    """The grasp with all its hand postures turned about `center` and shifted by `offset` [m], object frame."""
+
+    def move(posture: Posture) -> Posture:
+        base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+        return replace(
+            posture,
+            position=rotation @ (posture.position - center) + center + offset,
+            quaternion_wxyz=quaternion_from_rotation(torch.as_tensor(rotation @ base)).numpy(),
+        )
+
+    return replace(grasp, pregrasp=move(grasp.pregrasp), grasp=move(grasp.grasp), squeeze=move(grasp.squeeze))

@@ -1,0 +1,206 @@
+"""The lift trial: come from a retreat, close on an object that stands on its support, lift it, and hold it.
+
+Two questions, in this order. Do the commanded postures, from the retreat over the pregrasp to the grasp, reach into the
+support or a neighbour? That is geometry, asked of MuJoCo's distances, because a base that follows its commands passes
+through fixed things. Then, in the simulation under gravity: does the object rise with the hand and stay with it?
+
+The lift is seen from the hand: the base stands still, everything else sinks, and the object feels the acceleration as
+weight. MuJoCo gives bodies that follow commands no velocity, so a base that really rose would not carry by friction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.hands.model import HandModel
+from graspd_core.perception.scene import moved_grasp
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Grasp, Posture, TrialResult
+from graspd_core.verify.early_stop import CHECK_EVERY
+from graspd_core.verify.hold_trial import (
+    STOPPED,
+    breach,
+    gave_up,
+    set_hand_pose,
+    set_joints,
+    set_targets,
+    step_until_known,
+    straight_way,
+)
+from graspd_core.verify.world import Protocol, World, advance, trial_data
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+_COMING, _CLOSING, _LIFTING = "while the hand came", "while closing", "while lifting"
+# Shares of each way at which the hand's commanded postures are held against the obstacles.
+_SHARES = (0.0, 0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True)
+class LiftSettings:
+    """What happens in a lift trial, beside the physics and limits of `world.Protocol`.
+
+    Attributes:
+        retreat: how far back along the hand's approach the trial begins [m].
+        approach_time: from the retreat to the pregrasp [s].
+        lift_height: [m].
+        lift_time: [s].
+        hold_time: [s].
+        max_reach_through: deepest that a commanded posture may lie in the support or a neighbour [m].
+    """
+
+    retreat: float = 0.1
+    approach_time: float = 0.4
+    lift_height: float = 0.2
+    lift_time: float = 1.0
+    hold_time: float = 3.0
+    max_reach_through: float = 0.002
+
+
+def retreat_posture(hand: HandModel, pregrasp: Posture, distance: float = LiftSettings.retreat) -> Posture:
+    """The pregrasp moved straight back against the hand's approach direction by `distance` [m]."""
+    rotation = rotation_from_quaternion(torch.as_tensor(pregrasp.quaternion_wxyz, dtype=torch.float64)).numpy()
+    return replace(pregrasp, position=pregrasp.position - distance * rotation @ hand.approach)
+
+
+def lift_trial(
+    world: World,
+    hand: HandModel,
+    grasp: Grasp,
+    protocol: Protocol,
+    *,
+    settings: LiftSettings = LiftSettings(),
+    stop: Callable[[], bool] = lambda: False,
+) -> TrialResult:
+    """Run one lift trial in a world built with a support or neighbours; ends at the first breach.
+
+    While the hand comes and closes, and until it first touches the object, that rests as it was seen, because a
+    reconstructed bottom may not stand. From then on it is free.
+
+    The object has to stay within the protocol's limits (5 cm, 15°) of where it stood, as carried along by the lift, at
+    all times. Without a support there is no gravity, and the hand takes the object back the way it came.
+    """
+    import mujoco
+
+    grasp = moved_grasp(grasp, -world.origin)
+    try:
+        return _lift(world, hand, grasp, protocol, settings, stop)
+    except mujoco.FatalError as error:
+        return TrialResult("lift", False, 0.0, 0.0, gave_up(error))
+
+
+def _lift(
+    world: World, hand: HandModel, grasp: Grasp, protocol: Protocol, settings: LiftSettings, stop: Callable[[], bool]
+) -> TrialResult:
+    with trial_data(world) as data:
+        begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
+        reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
+        if reason:
+            return TrialResult("lift", False, 0.0, 0.0, reason)
+        set_hand_pose(world, data, begin)
+        worst = np.zeros(2)
+        reason = _raise(world, data, begin, grasp, protocol, settings, worst=worst, stop=stop)
+        if not reason:
+            steps = round(settings.hold_time / protocol.timestep)
+            reason = _said(step_until_known(world, data, protocol, worst, steps, stop=stop), "while held up")
+        return TrialResult("lift", not reason, float(worst[0]), float(worst[1]), reason)
+
+
+def _raise(
+    world: World,
+    data: Any,
+    begin: Posture,
+    grasp: Grasp,
+    protocol: Protocol,
+    settings: LiftSettings,
+    *,
+    worst: np.ndarray,
+    stop: Callable[[], bool],
+) -> str:
+    """Come, close, squeeze and lift; returns why the trial is over, empty if it is not. Brings `worst` up to date."""
+
+    away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
+    for name, start, end, duration in _stages(begin, grasp, protocol, settings):
+        steps = round(duration / protocol.timestep)
+        way = straight_way(start, end, np.arange(1, steps + 1) / steps)
+        for step in range(1, steps + 1):
+            set_targets(data, way, step - 1)
+            if name == _LIFTING:
+                _sink(world, data, away if world.up is None else world.up, step / steps, settings)
+            advance(world, data)
+            if not touched and name in (_COMING, _CLOSING):
+                touched = _touches(world, data)
+                _rest(world, data)
+            if step % CHECK_EVERY == 0 or step == steps:
+                reason = breach(world, data, protocol, worst)
+                if reason or stop():
+                    return _said(reason or STOPPED, name)
+    return ""
+
+
+def _said(reason: str, stage: str) -> str:
+    """A reason with the stage that it came in; empty without one."""
+    return f"{reason} {stage}" if reason and reason != STOPPED else reason
+
+
+def _stages(
+    begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
+) -> tuple[tuple[str, Posture, Posture, float], ...]:
+    """Name, first and last posture and duration [s] of every stage but the last, the hold, in order."""
+    return (
+        (_COMING, begin, grasp.pregrasp, settings.approach_time),
+        (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
+        ("while squeezing", grasp.grasp, grasp.squeeze, protocol.stage_time),
+        (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
+    )
+
+
+def _touches(world: World, data: Any) -> bool:
+    """Whether hand and object are in contact."""
+    bodies = world.model.geom_bodyid
+    first, second = data.contact.geom1, data.contact.geom2
+    hand = np.isin(first, world.hand_geoms) | np.isin(second, world.hand_geoms)
+    return bool((hand & ((bodies[first] == world.object_body) | (bodies[second] == world.object_body))).any())
+
+
+def _rest(world: World, data: Any) -> None:
+    """Put the object back to where it was seen."""
+    data.qpos[world.object_address : world.object_address + 7] = [0, 0, 0, 1, 0, 0, 0]
+    data.qvel[world.object_velocity : world.object_velocity + 6] = 0
+
+
+def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, settings: LiftSettings) -> None:
+    """All that is fixed but the hand, at a share `a` of the lift from rest to rest; what is free feels it."""
+    data.mocap_pos[1:] = -settings.lift_height * a * a * (3 - 2 * a) * up
+    acceleration = settings.lift_height * (6 - 12 * a) / settings.lift_time**2 if a < 1 else 0.0
+    for body in (world.object_body, *world.others):
+        data.xfrc_applied[body, :3] = -acceleration * world.model.body_mass[body] * up
+
+
+def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
+    """Where the hand is deepest in an obstacle on the straight ways between postures; empty up to `limit` [m]."""
+    import mujoco
+
+    worst, reason = 0.0, ""
+    names = ("while coming", "while closing")
+    for (start, end), name in zip(pairwise(postures), names, strict=True):
+        way = straight_way(start, end, np.array([*_SHARES, 1.0]))
+        for index in range(len(way.positions)):
+            set_targets(data, way, index)
+            set_joints(world, data, data.ctrl)
+            mujoco.mj_kinematics(world.model, data)
+            for geom, said in world.obstacles:
+                depth = max(-mujoco.mj_geomDistance(world.model, data, geom, g, 0.0, None) for g in world.hand_geoms)
+                if depth > worst:
+                    worst = depth
+                    reason = f"the hand reaches {depth * 1e3:.1f} mm into {said} {name}" if depth > limit else ""
+    return reason

@@ -1,0 +1,155 @@
+"""The metrics of a grasp, one row each: `measure`, files, messages and tables follow; a test checks docs/metrics.md.
+
+Static quality of one grasp. Definitions are those of docs/metrics.md; every figure is independent of the frame.
+
+How different the grasps of one run are: many copies of one grasp are one grasp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from graspd_core.hands.model import HandModel
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Grasp, GraspMetrics, Posture
+from graspd_core.verify.prepared_grasp import (
+    MAX_CONTACTS,
+    MetricsContext,
+    PreparedGrasp,
+    contact_area,
+    contact_links,
+    penetration,
+    prepare_grasp,
+    self_penetration,
+)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How one metric is measured and shown.
+
+    Attributes:
+        name: key of `GraspMetrics`.
+        unit: that files and tables show; empty without one.
+        scale: value in that unit over value in SI units.
+        measure: gives the value in SI units; None where another step of planning fills it in.
+        description: definition, for docs/metrics.md.
+        digits: decimals in tables.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    measure: Callable[[PreparedGrasp], float | None] | None
+    description: str
+    digits: int = 2
+
+    @property
+    def key(self) -> str:
+        """Key in files: the name, and the unit in ASCII."""
+        unit = self.unit.replace("1/", "per_").translate(str.maketrans("²³", "23"))
+        return f"{self.name}_{unit}" if unit else self.name
+
+    @property
+    def title(self) -> str:
+        """Heading in tables."""
+        return f"{self.name.replace('_', ' ')} {self.unit}".rstrip()
+
+    def text(self, value: float) -> str:
+        """A value in SI units for people."""
+        return f"{self.name.replace('_', ' ')} {value * self.scale:.{self.digits}f} {self.unit}".rstrip()
+
+
+def _contact_per_volume(grasp: PreparedGrasp) -> float | None:
+    volume = grasp.intersection_volume
+    return contact_area(grasp.placed) / volume if volume > 0 else None
+
+
+_ROWS = (
+    Metric(
+        "penetration", "mm", 1e3, lambda g: penetration(g.placed),
+        "greatest depth of a sample inside the object",
+    ),
+    Metric(
+        "self_penetration", "mm", 1e3, lambda g: self_penetration(g.context, g.placed),
+        "greatest depth of a sample inside a link that is not adjacent to its own; links are adjacent when a joint "
+        "joins them, or when they overlap by design",
+    ),
+    Metric(
+        "contact_area", "cm²", 1e4, lambda g: contact_area(g.placed),
+        "CA: sum of the areas of samples within 2 mm of the object's surface, on either side", 1,
+    ),
+    Metric(
+        "contact_area_5mm", "cm²", 1e4, lambda g: contact_area(g.placed, 0.005),
+        "contact area within 5 mm", 1,
+    ),
+    Metric(
+        "contact_area_10mm", "cm²", 1e4, lambda g: contact_area(g.placed, 0.01),
+        "contact area within 10 mm", 1,
+    ),
+    Metric(
+        "intersection_volume", "cm³", 1e6, lambda g: g.intersection_volume,
+        "IV: volume shared by hand and object, in 1 mm voxels of a lattice fixed in the hand's base frame; an octree "
+        "finds them, so that no overlap is too small to be visited",
+    ),
+    Metric(
+        "contact_per_volume", "1/cm", 1e-2, _contact_per_volume,
+        "CA/IV: contact area within 2 mm over intersection volume; none where nothing is shared", 0,
+    ),
+    Metric(
+        "contact_links", "", 1.0, lambda g: contact_links(g.placed),
+        "links with a sample outside by at most 2 mm, or inside", 0,
+    ),
+    Metric(
+        "epsilon", "", 1.0, lambda g: g.wrench_hull[0],
+        "ε: radius of the largest ball about the origin in the convex hull of contact wrenches (Ferrari and Canny, "
+        "ICRA 1992); 0 when the origin is outside", 3,
+    ),
+    Metric("volume", "", 1.0, lambda g: g.wrench_hull[1], "volume of that hull", 3),
+    Metric(
+        "robustness", "", 1.0, None,
+        "share of noisy trials (below) that a verified grasp held; measured with `robust.rank` only",
+    ),
+)  # fmt: skip
+METRICS: dict[str, Metric] = {row.name: row for row in _ROWS}
+"""The metrics by name; a row that is added is measured too."""
+
+
+def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:
+    """Every metric of the registry, of the context's hand at `posture` on the context's object.
+
+    ε and volume are those of at most `max_contacts` contacts. None where another step measures the metric.
+    """
+    grasp = prepare_grasp(context, posture, max_contacts)
+    values = {name: row.measure(grasp) if row.measure else None for name, row in METRICS.items()}
+    return GraspMetrics({name: None if value is None else float(value) for name, value in values.items()})
+
+
+# Grasps are two where their palms are this far apart [m], or look or roll this far apart [rad].
+APART, TURNED = 0.02, float(np.deg2rad(20.0))
+
+
+def distinct(grasps: Sequence[Grasp], hand: HandModel) -> tuple[Grasp, ...]:
+    """The grasps, in their order, without those that are copies of one kept before.
+
+    A copy has the middle of its palm within 20 mm and its base turned by less than 20° of the other's, in the object's
+    frame. What the object looks like plays no part: to grasp a ball from the left and from the right is two grasps,
+    because a robot that cannot come from one side may come from the other.
+    """
+    kept: list[Grasp] = []
+    palms, turns = np.zeros((0, 3)), np.zeros((0, 3, 3))
+    for grasp in grasps:
+        posture = grasp.grasp
+        turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+        palm = posture.position + turn @ hand.palm_center
+        # The angle between two rotations, from the trace of one undone by the other.
+        cosine = (np.einsum("nij,ij->n", turns, turn) - 1.0) / 2.0
+        near = np.linalg.norm(palms - palm, axis=1) < APART
+        if not (near & (cosine > np.cos(TURNED))).any():
+            kept.append(grasp)
+            palms, turns = np.concatenate([palms, palm[None]]), np.concatenate([turns, turn[None]])
+    return tuple(kept)

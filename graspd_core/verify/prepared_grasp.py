@@ -1,0 +1,389 @@
+"""What is the same for every grasp of one object by one hand, prepared once.
+
+Where a posture of the hand touches an object, by dense samples that no optimiser ever sees.
+
+How far a placed hand and an object, or the hand and itself, share the same space.
+
+The grasp wrench space of unit contact forces: the classic quality figures of Ferrari and Canny (ICRA 1992).
+
+One grasp ready to be measured: what several metrics need is computed once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
+from graspd_core.hands.link_distance import (
+    CollisionTensors,
+    bounds,
+    depth_inside,
+    hull_planes,
+    local_distance,
+    make_collision_tensors,
+)
+from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.surface_points import kept_dense_samples
+from graspd_core.mesh.sharp_features import farthest_points
+from graspd_core.mesh.surface_queries import (
+    DistanceQuery,
+    inside,
+    make_distance_query,
+    signed_distance,
+    unsigned_distance,
+)
+from graspd_core.mesh.topology import packed_rows
+from graspd_core.perception.scene import ObjectModel
+from graspd_core.se3 import rotation_from_quaternion
+from graspd_core.types import Posture
+from graspd_core.verify import prepared_grasp as intersection
+
+# Samples and a seed that the optimiser's candidates never see.
+_SAMPLES, _SEED = 4000, 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class HandSurface:
+    """Dense samples of a hand's collision surface, link frames.
+
+    Attributes:
+        points: [m].
+        links: link of each sample.
+        areas: surface that each sample stands for [m²].
+        kinematics: float64.
+    """
+
+    points: Float[np.ndarray, "samples 3"]
+    links: Int[np.ndarray, "samples"]
+    areas: Float[np.ndarray, "samples"]
+    kinematics: Kinematics
+
+
+@dataclass(frozen=True, eq=False)
+class MetricsContext:
+    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `quality.measure`."""
+
+    target: ObjectModel
+    hand: HandModel
+    surface: HandSurface
+    query: DistanceQuery
+
+
+def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext:
+    """Sample the hand and prepare the object's distance, once for all grasps of that object by that hand."""
+    return MetricsContext(target, hand, hand_surface(hand), make_distance_query(target.mesh))
+
+
+@lru_cache(maxsize=8)
+def hand_surface(hand: HandModel) -> HandSurface:
+    """Dense samples of a hand."""
+    points, links, areas = kept_dense_samples(hand, count=_SAMPLES, seed=_SEED)
+    return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64))
+
+
+# Hand surface nearer than this to the object's is in contact [m].
+CONTACT_DISTANCE = 0.002
+# Samples farther than this from the object's bounding box have no exact distance [m]; the widest contact is 10 mm.
+_REACH = 0.015
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedHand:
+    """Dense surface samples of a hand in the object frame.
+
+    Attributes:
+        points: [m].
+        links: link of each sample.
+        areas: surface that each sample stands for [m²].
+        distance: signed distance of each sample to the object [m]; a lower bound beyond 15 mm.
+        rotations: `R_object_link`.
+        translations: link origins in the object frame [m].
+    """
+
+    points: Float[np.ndarray, "samples 3"]
+    links: Int[np.ndarray, "samples"]
+    areas: Float[np.ndarray, "samples"]
+    distance: Float[np.ndarray, "samples"]
+    rotations: Float[np.ndarray, "links 3 3"]
+    translations: Float[np.ndarray, "links 3"]
+
+
+def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
+    """Put the hand's samples where a posture puts them, and measure every sample's distance to the object."""
+    surface = context.surface
+    joints = torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None]
+    links = forward(surface.kinematics, joints)[0]
+    base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+    rotations = base @ links.rotation.numpy()
+    translations = links.translation.numpy() @ base.T + posture.position
+    placed = np.einsum("nij,nj->ni", rotations[surface.links], surface.points) + translations[surface.links]
+    distance = signed_distance(context.query, placed, reach=_REACH)
+    return PlacedHand(placed, surface.links, surface.areas, distance, rotations, translations)
+
+
+def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
+    """Hand surface within a distance of the object's surface, on either side of it [m²]; at most 15 mm."""
+    return float(placed.areas[np.abs(placed.distance) <= within].sum())
+
+
+def contact_links(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> int:
+    """Number of links that come within a distance of the object, penetrating ones included."""
+    return len(np.unique(placed.links[touching(placed, within)]))
+
+
+def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
+    """Samples that count as contacts."""
+    return placed.distance <= within
+
+
+VOXEL = 0.001
+# Cells are halved until they are voxels: 16 mm, 8, 4, 2, 1.
+_HALVINGS = 4
+# Half the diagonal of a cube of side 1, with room for float32 distances.
+_HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
+
+
+def penetration(placed: PlacedHand) -> float:
+    """Greatest depth of a hand sample inside the object [m]."""
+    return float(max(0.0, -placed.distance.min()))
+
+
+def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
+    """Greatest depth of a hand sample inside a link that is not adjacent to its own [m]."""
+    hand, worst = context.hand, 0.0
+    for link in range(hand.num_links):
+        others = placed.points[~hand.adjacent[link][placed.links]]
+        local = (others - placed.translations[link]) @ placed.rotations[link]
+        worst = max(worst, float(depth_inside(hand, link, local).max(initial=0.0)))
+    return worst
+
+
+def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
+    """Volume of the hand inside the object [m³], counted in 1 mm voxels of a lattice fixed in the hand's base frame.
+
+    An octree of each solid finds them: a cell is dropped when its centre is farther outside solid or object than its
+    half diagonal, and known to be wholly inside the object when it is that far inside; no overlap is too small or too
+    thin to be visited. Cells have integer coordinates in voxels, so that what solids share is counted once.
+    """
+    solids = _placed_solids(context.hand, placed)
+    cells, which = _root_cells(solids, placed)
+    # Whether a cell is known to lie inside the object as a whole.
+    known = np.zeros(len(cells), dtype=bool)
+    for halving in range(_HALVINGS + 1):
+        size = 2 ** (_HALVINGS - halving)
+        half_diagonal = _HALF_DIAGONAL * size * VOXEL if size > 1 else 0.0
+        centers = (cells + 0.5 * size) * VOXEL @ placed.rotations[0].T + placed.translations[0]
+        kept = _solid_distance(solids, which, centers) < half_diagonal
+        cells, which, known, centers = cells[kept], which[kept], known[kept], centers[kept]
+        if size == 1:
+            known[~known] = inside(context.query, centers[~known])
+            return len(np.unique(packed_rows(cells[known]))) * VOXEL**3
+        kept, known = _against_object(context, centers, known, half_diagonal)
+        cells, which, known = _halve(cells[kept], size // 2), np.repeat(which[kept], 8), np.repeat(known[kept], 8)
+    return 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _PlacedSolids:
+    """The collision primitives of a hand at its grasp, hulls last.
+
+    Attributes:
+        primitives: those of the hand.
+        rotations: `R_object_primitive`.
+        translations: primitive origins in the object frame [m].
+        smooth: those that are no hulls, for distances.
+    """
+
+    primitives: tuple[Primitive, ...]
+    rotations: Float[np.ndarray, "solids 3 3"]
+    translations: Float[np.ndarray, "solids 3"]
+    smooth: CollisionTensors
+
+
+def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
+    primitives = tuple(sorted(hand.primitives, key=lambda primitive: primitive.kind == "hull"))
+    rotations = np.array([placed.rotations[p.link] @ p.rotation for p in primitives]).reshape(-1, 3, 3)
+    origins = [placed.rotations[p.link] @ p.translation + placed.translations[p.link] for p in primitives]
+    smooth = make_collision_tensors(hand, "cpu", torch.float64)
+    return _PlacedSolids(primitives, rotations, np.reshape(origins, (-1, 3)), smooth)
+
+
+def _root_cells(
+    solids: _PlacedSolids, placed: PlacedHand
+) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
+    """Cells of the coarsest size over the boxes of all solids, base frame, in voxels; and the solid of each, rising."""
+    size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
+    for primitive in solids.primitives:
+        low, high = bounds(primitive)
+        rotation = base.T @ placed.rotations[primitive.link]
+        center = (placed.translations[primitive.link] - placed.translations[0]) @ base + rotation @ (low + high) / 2
+        reach = np.abs(rotation) @ (high - low) / 2
+        ends = np.floor((center - reach) / (size * VOXEL)), np.ceil((center + reach) / (size * VOXEL))
+        cells.append(size * _lattice(*(end.astype(np.int64) for end in ends)))
+    return np.concatenate(cells), np.repeat(np.arange(len(solids.primitives)), [len(some) for some in cells[1:]])
+
+
+def _solid_distance(
+    solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Signed distance [m] of points of the object frame each to one solid, `which` rising; of hulls a lower bound."""
+    local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
+    hulls = int(np.searchsorted(which, len(solids.smooth.link)))
+    smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
+    parts = [smooth]
+    for hull in np.unique(which[hulls:]):
+        normals, offsets = hull_planes(solids.primitives[hull])
+        parts.append((local[which == hull] @ normals.T - offsets).max(1))
+    return np.concatenate(parts)
+
+
+def _against_object(
+    context: MetricsContext,
+    centers: Float[np.ndarray, "cells 3"],
+    known: Bool[np.ndarray, "cells"],
+    half_diagonal: float,
+) -> tuple[Bool[np.ndarray, "cells"], Bool[np.ndarray, "cells"]]:
+    """Which cells may share space with the object, and which are known to lie inside it as a whole."""
+    kept, whole = np.ones(len(centers), dtype=bool), known.copy()
+    unknown = np.flatnonzero(~known)
+    clear = unknown[unsigned_distance(context.query, centers[unknown]) > half_diagonal]
+    whole[clear] = kept[clear] = inside(context.query, centers[clear])
+    return kept, whole
+
+
+def _halve(cells: Int[np.ndarray, "cells 3"], size: int) -> Int[np.ndarray, "children 3"]:
+    return (cells[:, None] + size * _lattice(np.zeros(3, dtype=int), np.full(3, 2))).reshape(-1, 3)
+
+
+def _lattice(low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> Int[np.ndarray, "n 3"]:
+    """All integer points from `low` to before `high`."""
+    return np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), -1).reshape(-1, 3)
+
+
+CONE_EDGES = 8
+# A set of wrenches whose smallest extent is below this share of its largest spans no volume.
+_FLAT = 1e-9
+
+
+def wrench_hull(
+    arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
+) -> tuple[float, float]:
+    """Ferrari-Canny ε and volume of the convex hull of unit-force friction-cone wrenches.
+
+    Args:
+        arms: contact points about the centre of mass [m].
+        normals: outward unit normals of the object.
+        friction: Coulomb coefficient.
+        length: torque scale, the object's largest radius [m].
+
+    Returns:
+        Radius of the largest origin-centred ball in the hull (0 where the origin is outside) and the hull's volume.
+    """
+    hull = _hull(arms, normals, friction, length)
+    return (0.0, 0.0) if hull is None else (max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume))
+
+
+def weakest_push(
+    arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
+) -> Float[np.ndarray, "6"] | None:
+    """The unit disturbance (force, torque over length) that contacts resist least: against the hull's nearest facet.
+
+    Arguments as of `wrench_hull`. None where the hull does not hold the origin.
+    """
+    hull = _hull(arms, normals, friction, length)
+    if hull is None or hull.equations[:, -1].max() >= 0:
+        return None
+    return -hull.equations[hull.equations[:, -1].argmax(), :-1]
+
+
+def _hull(arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float) -> Any:
+    """The convex hull of the contacts' wrenches; None where it has no volume."""
+    from scipy.spatial import ConvexHull
+
+    if len(arms) < 2:
+        return None
+    wrenches = cone_wrenches(arms, normals, friction, length)
+    extent = np.linalg.svd(wrenches - wrenches.mean(0), compute_uv=False)
+    if extent[-1] <= _FLAT * extent[0]:
+        return None
+    # Joggled by some 1e-10: takes half the time of merging facets, and is the same every time.
+    return ConvexHull(wrenches, qhull_options="QJ")
+
+
+def cone_wrenches(
+    arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
+) -> Float[np.ndarray, "wrenches 6"]:
+    """Wrenches (force, torque over length) of unit forces along the edges of each contact's friction cone."""
+    reference = np.eye(3)[np.abs(normals).argmin(-1)]
+    first = np.cross(normals, reference)
+    first /= np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
+    second = np.cross(normals, first)
+    angles = np.arange(CONE_EDGES) * 2 * np.pi / CONE_EDGES
+    tangents = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
+    forces = (-normals[:, None] + friction * tangents) / np.sqrt(1 + friction**2)
+    torques = np.cross(arms[:, None], forces) / length
+    return np.concatenate([forces, torques], -1).reshape(-1, 6)
+
+
+# Contacts that the wrench hull is made of. The protocol allows 32, whose hull in six dimensions has some 22,000 facets
+# and takes four times as long; that raises ε by a tenth (docs/metrics.md). Benchmarks ask for 32, planning does not.
+MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
+# Half the distance of a central difference [m].
+_STEP = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedGrasp:
+    """A hand at its grasp, about to be measured.
+
+    Attributes:
+        context: the object and the hand.
+        placed: the hand's samples in the object frame.
+        max_contacts: contacts that the wrench hull is made of at most.
+    """
+
+    context: MetricsContext
+    placed: PlacedHand
+    max_contacts: int
+
+    @cached_property
+    def wrench_hull(self) -> tuple[float, float]:
+        """Ferrari-Canny radius and volume of the grasp wrench hull."""
+        return wrench_hull(*self._contacts)
+
+    @cached_property
+    def weakest_push(self) -> Float[np.ndarray, "6"] | None:
+        """The unit disturbance that the wrench hull resists least (force, torque over the object's radius)."""
+        return weakest_push(*self._contacts)
+
+    @property
+    def _contacts(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float, float]:
+        """Arms [m], normals, friction and torque scale [m] of the contacts that the wrench hull is made of."""
+        target, points = self.context.target, self.placed.points[touching(self.placed)]
+        chosen = points[farthest_points(points, self.max_contacts)]
+        normals = surface_normals(self.context.query, chosen)
+        return chosen - target.center_of_mass, normals, target.friction, target.radius
+
+    @cached_property
+    def intersection_volume(self) -> float:
+        """Volume of the hand inside the object [m³]."""
+        return intersection.intersection_volume(self.context, self.placed)
+
+
+def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:
+    """Put the hand at a posture."""
+    return PreparedGrasp(context, placed_hand(context, posture), max_contacts)
+
+
+def surface_normals(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Outward unit normals of the object's surface next to points, by central differences of the exact distance."""
+    probes = points[:, None, None] + _STEP * np.stack([np.eye(3), -np.eye(3)])
+    distance = signed_distance(query, probes.reshape(-1, 3)).reshape(len(points), 2, 3)
+    gradient = distance[:, 0] - distance[:, 1]
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,71 @@
+"""The clock, the hooks and the end of one run."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from graspd_core.perception.scene import moved_grasp
+from graspd_core.types import Grasp, Outcome, Progress, ProgressHook, Snapshot, Stage, StopHook, WatchHook
+
+
+class Run:
+    """When a run began and must end, whom it tells, and whether it was cancelled.
+
+    Attributes:
+        began: `time.perf_counter()` value.
+        cancelled: whether the stop hook has said so.
+        watch: sees the hands that the run works on, where somebody watches.
+        origin: of what the run works on, in the frame of the scene that it was given [m].
+    """
+
+    def __init__(
+        self,
+        began: float,
+        deadline: float | None,
+        progress: ProgressHook | None,
+        stop: StopHook | None,
+        watch: WatchHook | None = None,
+    ):
+        self.began = began
+        self.watch = watch
+        self.origin = np.zeros(3)
+        self.cancelled = False
+        self._end = began + deadline if deadline is not None else float("inf")
+        self._progress, self._stop = progress, stop
+
+    def over(self) -> bool:
+        """Whether to end; asks the stop hook, so only for the run's own thread."""
+        self.cancelled = self.cancelled or (self._stop is not None and self._stop())
+        return self.known_over()
+
+    def known_over(self) -> bool:
+        """As `over`, for other threads: the stop hook is asked by the run's own thread alone."""
+        return self.cancelled or self.late()
+
+    def late(self) -> bool:
+        """Whether the deadline has passed."""
+        return time.perf_counter() >= self._end
+
+    def report(self, stage: Stage, step: int, of: int, best: float, verified: int, found: Grasp | None = None) -> None:
+        """Tell the caller."""
+        if self._progress is not None:
+            found = None if found is None else moved_grasp(found, self.origin)
+            self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))
+
+    def show(self, seen: Snapshot) -> None:
+        """Let who watches see it."""
+        if self.watch is not None:
+            self.watch(replace(seen, positions=seen.positions + self.origin))
+
+    def outcome(self, any_found: bool, good: int, count: int) -> Outcome:
+        """How the run ended, with `good` of `count` grasps."""
+        if good >= count:
+            return Outcome.SUCCEEDED
+        if self.cancelled:
+            return Outcome.CANCELLED
+        if self.late():
+            return Outcome.DEADLINE
+        return Outcome.TOO_FEW if any_found else Outcome.NO_CANDIDATES

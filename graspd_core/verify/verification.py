@@ -1,0 +1,329 @@
+"""The trials of a run: worlds built once, candidates tried in rank order, and those that held put in order.
+
+Grasps from anywhere, another planner's or a file's: tried and measured as those of `plan_grasps` are.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from itertools import chain, repeat
+
+import numpy as np
+import torch
+
+from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
+from graspd_core.errors import ConfigError
+from graspd_core.hands.model import HandModel
+from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
+from graspd_core.verify import metrics
+from graspd_core.verify.hold_trial import noisy_share, pose_errors
+from graspd_core.verify.metrics import measure
+from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
+from graspd_core.verify.robustness import (
+    HoldUnder,
+    Hypotheses,
+    Hypothesis,
+    Results,
+    begin_in_thread,
+    begin_other_world,
+    hypotheses_of,
+    one_by_one,
+    results_in_order,
+    try_hypotheses,
+)
+from graspd_core.verify.run_clock import Run
+from graspd_core.verify.trial_registry import TrialContext, audited_trials, build_worlds, grasp_trials
+from graspd_core.verify.world import PROTOCOLS, Protocol, World, at_friction
+
+# How often stop and deadline are looked at while waiting for the collision parts [s].
+_POLL = 0.02
+
+# Objects are cut into convex parts, and their worlds built, one at a time.
+_CUTTING = threading.Lock()
+
+# Where verified grasps stand whose robustness nobody had the time to measure.
+_UNKNOWN = 0.5
+
+# Keeps the errors that grasps are ranked by apart from all others of the same seed.
+_NOISE = 0x6E6F697365
+
+
+@dataclass(frozen=True)
+class VerificationContext:
+    """What the grasps of a run are tried with, and measured with, made when first asked for; None: they are not."""
+
+    trials: TrialContext
+    metrics: Callable[[], MetricsContext] | None
+    hypotheses: Hypotheses | None = None
+
+
+@dataclass(frozen=True)
+class TrialsAhead:
+    """What the trials of a run need and takes long, made by threads beside the search.
+
+    Attributes:
+        worlds: of the likeliest scene; None where the run was over before.
+        other: the world of another shape of the object; None where no grasp is tried in one.
+    """
+
+    worlds: Future[TrialContext | None]
+    other: Future[World | None] | None
+
+
+def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
+    """Begin what the trials need, in threads beside (`begin_in_thread`).
+
+    It takes about as long as the optimiser does. One object is cut at a time, and none whose run is over before its
+    turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
+    """
+
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+
+    def build() -> TrialContext | None:
+        with _CUTTING:
+            return None if run.known_over() else _worlds(scene, hand, protocol)
+
+    worlds = begin_in_thread("graspd-parts", build)
+    return TrialsAhead(worlds, begin_other_world(run, scene, hand, protocol, certainty.probability))
+
+
+def make_trial_context(
+    run: Run, scene: Scene, hand: HandModel, ahead: TrialsAhead, certainty: CertaintyConfig, *, measure: bool
+) -> VerificationContext | None:
+    """The contexts, as soon as the worlds are there; None where the run ended first."""
+    while not run.over() and not wait([ahead.worlds], timeout=_POLL).done:
+        pass
+    if run.over() or (worlds := ahead.worlds.result()) is None:
+        return None
+    hypotheses = hypotheses_of(scene, ahead.other, worlds, certainty.probability)
+    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
+
+
+# Kept for the last few scenes and hands, which are hashed by identity.
+@lru_cache(maxsize=4)
+def _worlds(scene: Scene, hand: HandModel, protocol: Protocol) -> TrialContext:
+    return build_worlds(scene, hand, object_parts(scene.object), protocol)
+
+
+@lru_cache(maxsize=4)
+def _metrics_context(scene: Scene, hand: HandModel) -> MetricsContext:
+    return make_metrics_context(scene.object, hand)
+
+
+def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
+    """Candidates with their metrics, none of them tried."""
+    postures = [grasp.grasp for grasp in candidates]
+    with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="graspd-metrics") as pool:
+        metrics = list(pool.map(partial(measure, _metrics_context(scene, hand)), postures))
+    return tuple(replace(grasp, metrics=one) for grasp, one in zip(candidates, metrics, strict=True))
+
+
+@dataclass(frozen=True)
+class TriedGrasps:
+    """What the trials of some candidates came to.
+
+    Attributes:
+        grasps: those that were tried, verified ones first.
+        first: when the first of them had passed, a `time.perf_counter()` value.
+        audits: how many were tried once more with a pull at full length.
+    """
+
+    grasps: tuple[Grasp, ...] = ()
+    first: float | None = None
+    audits: AuditCount = field(default_factory=AuditCount)
+
+
+def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
+    """The hands of candidates, none of them tried."""
+    hands = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in candidates]
+    return Snapshot(*map(np.stack, zip(*hands, strict=True)), verdicts=(Verdict.UNVERIFIED,) * len(candidates))
+
+
+def run_trials(
+    run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
+) -> TriedGrasps:
+    """Try candidates in rank order until `count` are verified; `before` are already.
+
+    On as many threads as torch may use in the calling one; verdicts and order do not depend on their number. What is
+    verified is measured beside the trials of the next.
+    """
+    verified: list[Grasp] = []
+    others: list[Grasp] = []
+    metrics: list[Future[GraspMetrics]] = []
+    threads = torch.get_num_threads()
+    first, audits = None, AuditCount()
+    seen = None if run.watch is None else candidates_seen(candidates)
+    # The first answer comes sooner where the best candidate is tried under several hypotheses at a time.
+    alone = context.hypotheses is not None and not before
+    # No trial gives more than one verified grasp.
+    trials = _tried(run, context, candidates, alone, lambda: count - len(verified))
+    with closing(trials), ThreadPoolExecutor(threads, thread_name_prefix="graspd-metrics") as pool:
+        for index, (tried, audit) in enumerate(trials):
+            passed = tried.verdict is Verdict.VERIFIED
+            if run.over() and not passed:
+                # A trial that was cut short says nothing of the grasp.
+                break
+            audits += audit
+            first = first or (time.perf_counter() if passed else None)
+            found = tried if passed else None
+            run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed, found)
+            if seen is not None:
+                seen = replace(seen, verdicts=(*seen.verdicts[:index], tried.verdict, *seen.verdicts[index + 1 :]))
+                run.show(seen)
+            enough = len(verified) + passed == count
+            if enough:
+                # What is tried ahead takes no more time from measuring.
+                trials.close()
+            # Behind the report: measuring takes longer than a trial. What failed is not measured.
+            if passed and context.metrics is not None:
+                metrics.append(pool.submit(measure, context.metrics(), tried.grasp))
+                # A run that ends now still measures what it found: that is never more than there are threads.
+                wait(metrics[: 1 - threads or None])
+            (verified if passed else others).append(tried)
+            if enough:
+                break
+    if metrics:
+        verified = [replace(grasp, metrics=one.result()) for grasp, one in zip(verified, metrics, strict=True)]
+    return TriedGrasps(surest_first((*verified, *others)), first, audits)
+
+
+def _tried(
+    run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], alone: bool, needed: Callable[[], int]
+) -> Generator[tuple[Grasp, AuditCount]]:
+    """Candidates with their trials, in their order.
+
+    The first `alone`: under several hypotheses at a time, the others once it waits for the world of one, or has ended.
+    """
+    threads, hypotheses = torch.get_num_threads(), context.hypotheses
+    work = partial(_all_trials, context, one_by_one)
+    if alone and hypotheses is not None:
+        work = partial(_best_first, context, hypotheses, candidates[0], threads)
+    return results_in_order(run.over, work, candidates, threads, needed, known_over=run.known_over)
+
+
+def _best_first(
+    context: VerificationContext, hypotheses: Hypotheses, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
+) -> tuple[Grasp, AuditCount]:
+    """A candidate with its trials; those that are not the best wait until there is time for them."""
+    if grasp is not best:
+        while not hypotheses.waited_for.wait(_POLL) and not stop():
+            pass
+        return _all_trials(context, one_by_one, grasp, stop)
+    try:
+        return _all_trials(context, one_by_one if threads == 1 else partial(_at_once, threads), grasp, stop)
+    finally:
+        hypotheses.waited_for.set()
+
+
+def _at_once(threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
+    """As `one_by_one`, in several threads."""
+    return results_in_order(stop, lambda item, ended: item.hold(grasp, ended), items, threads, lambda: len(items))
+
+
+def _all_trials(
+    context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook
+) -> tuple[Grasp, AuditCount]:
+    """The grasp with the trials of the likeliest scene, and where it passes them those of what else may be true."""
+    results, audit = audited_trials(context.trials, grasp, stop)
+    if not results[-1].passed or context.hypotheses is None:
+        return replace(grasp, trials=results), audit
+    under, probability = try_hypotheses(context.hypotheses, grasp, stop, hold_under)
+    return replace(grasp, trials=(*results, under), probability=probability), audit
+
+
+def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
+    """Verified grasps, then those less sure, then those that failed; among them by probability, then by score."""
+    place = {Verdict.VERIFIED: 0, Verdict.UNVERIFIED: 1, Verdict.FAILED: 2}
+    return tuple(sorted(grasps, key=lambda g: (place[g.verdict], -(g.probability or 0.0), -g.score)))
+
+
+def rank_by_robustness(
+    run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
+) -> tuple[Grasp, ...]:
+    """The grasps with those first that still hold when the object is not quite where it was thought to be.
+
+    The share of noisy trials that a verified grasp held is written into its metrics. Where the run ends before all were
+    tried, those that were not stand between the good and the bad.
+    """
+    verified = [grasp for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
+    measured: list[Grasp] = []
+    # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
+    errors = pose_errors((_NOISE, seed), config.trials)
+    protocol = replace(context.trials.protocol, hold_time=config.hold_time)
+
+    def share_held(grasp: Grasp, stop: StopHook) -> float | None:
+        return noisy_share(context.trials.alone, grasp, protocol, errors, stop=stop)
+
+    threads, needed = torch.get_num_threads(), lambda: len(verified)
+    shares = results_in_order(run.over, share_held, verified, threads, needed, known_over=run.known_over)
+    with closing(shares):
+        # None for those that the end of the run leaves over.
+        for index, (grasp, share) in enumerate(zip(verified, chain(shares, repeat(None)), strict=False)):
+            metrics = GraspMetrics({**(grasp.metrics or {}), "robustness": share})
+            measured.append(replace(grasp, metrics=metrics))
+            run.report(Stage.VERIFY, index + 1, len(verified), 0.0, len(verified))
+    return (*most_robust_first(measured), *grasps[len(verified) :])
+
+
+def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
+    """Grasps by the share that they held out of place; where it is the same, or nobody measured it, in their order."""
+
+    def share(grasp: Grasp) -> float:
+        known = grasp.metrics.get("robustness") if grasp.metrics else None
+        return _UNKNOWN if known is None else known
+
+    return sorted(verified, key=share, reverse=True)
+
+
+# Farther from one than this, the length of a quaternion is no rounding error.
+_UNIT_TOLERANCE = 0.01
+
+
+def verify_grasps(
+    scene: Scene, hand: HandModel, grasps: Sequence[Grasp], *, verify: str = "standard", measure: bool = True
+) -> tuple[Grasp, ...]:
+    """Run the trials and measure the metrics of grasps that are given, in their order; none is dropped.
+
+    Args:
+        scene: what is grasped; with a support or obstacles the lift trial runs too.
+        hand: whose joints the postures name, in the order of `hand.joint_names`.
+        grasps: `pregrasp`, `grasp` and `squeeze` count; earlier metrics and trials are replaced.
+        verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
+        measure: whether metrics are measured, of failed grasps too.
+
+    Raises:
+        ConfigError: `verify` is unknown, or a posture does not fit the hand or is not finite.
+    """
+    if verify not in VERIFICATIONS:
+        raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")
+    for index, grasp in enumerate(grasps):
+        _refuse_posture(grasp, hand, f"grasp {index}")
+    verified = tuple(replace(grasp, metrics=None, trials=()) for grasp in grasps)
+    if verify != "none":
+        protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
+        worlds = build_worlds(scene, hand, object_parts(scene.object), protocol)
+        verified = tuple(replace(grasp, trials=grasp_trials(worlds, grasp)) for grasp in verified)
+    if measure:
+        context = make_metrics_context(scene.object, hand)
+        verified = tuple(replace(grasp, metrics=metrics.measure(context, grasp.grasp)) for grasp in verified)
+    return verified
+
+
+def _refuse_posture(grasp: Grasp, hand: HandModel, name: str) -> None:
+    for stage in ("pregrasp", "grasp", "squeeze"):
+        posture = getattr(grasp, stage)
+        joints = len(hand.joint_names)
+        for key, size in (("position", 3), ("quaternion_wxyz", 4), ("joint_positions", joints)):
+            values = np.asarray(getattr(posture, key))
+            if values.shape != (size,) or not np.isfinite(values).all():
+                raise ConfigError(f"{name}: {stage}.{key} is {values.tolist()}; valid: {size} finite numbers")
+        length = float(np.linalg.norm(posture.quaternion_wxyz))
+        if abs(length - 1) > _UNIT_TOLERANCE:
+            raise ConfigError(f"{name}: {stage}.quaternion_wxyz has length {length:.3g}; valid: 1")

@@ -1,0 +1,1 @@
+"""Data sets of grasps on Ray, and grasps of others."""

@@ -1,0 +1,208 @@
+"""What a data set is made of: blocks of grasps, each known by the content of what it asks for."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from graspd_bench.study import hand_hash, object_hash, object_sources, thing_name
+from graspd_core.errors import ConfigError
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
+from graspd_core.planning.plan_grasps import check_request
+
+FORMAT, SCHEMA_VERSION = "graspd/dataset", 1
+Measured = Literal["verified", "all", "none"]
+MEASURED: tuple[str, ...] = get_args(Measured)
+# Hexadecimal digits of a key: 128 bits.
+_DIGITS = 32
+
+
+def content_key(asked: Any) -> str:
+    """Key of JSON-ready values."""
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+
+
+@dataclass(frozen=True)
+class DatasetObject:
+    """An object at a scale.
+
+    Attributes:
+        source: shape:NAME or a mesh file.
+        content: hash of the shape's or the file's content.
+        scale: factor on the file's coordinates.
+        mass: [kg].
+        friction: Coulomb coefficient.
+    """
+
+    source: str
+    content: str
+    scale: float
+    mass: float
+    friction: float
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """What counts of it: not what it is called."""
+        return {"content": self.content, "scale": self.scale, "mass": self.mass, "friction": self.friction}
+
+    @cached_property
+    def key(self) -> str:
+        """By its content."""
+        return content_key(self.asked)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One call of `plan_grasps`, whose candidates are written together.
+
+    Attributes:
+        object: what is grasped.
+        hand: name or path.
+        hand_content: hash of its files.
+        preset: what the settings are called.
+        config: the settings.
+        verify: the trials.
+        measure: which grasps get their metrics.
+        seed: of the plan.
+        count: verified grasps wanted.
+    """
+
+    object: DatasetObject
+    hand: str
+    hand_content: str
+    preset: str
+    config: PlanConfig
+    verify: str
+    measure: str
+    seed: int
+    count: int
+
+    @property
+    def hand_name(self) -> str:
+        """What the hand's partition is called."""
+        return thing_name(self.hand)
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """All that the rows depend on but the code, JSON-ready."""
+        return {
+            "schema": SCHEMA_VERSION,
+            "object": self.object.asked,
+            "hand": self.hand_content,
+            "settings": to_mapping(self.config),
+            "verify": self.verify,
+            "measure": self.measure,
+            "seed": self.seed,
+            "count": self.count,
+        }
+
+    @cached_property
+    def key(self) -> str:
+        """By its content: the name of its file."""
+        return content_key(self.asked)
+
+
+@dataclass(frozen=True)
+class DatasetRequest:
+    """What a data set is asked to hold.
+
+    Attributes:
+        objects: shape:NAME, mesh files, or folders of them.
+        hands: names or paths.
+        per_object: verified grasps wanted of every object, scale and hand.
+        block: verified grasps wanted of a block.
+        preset: name or file.
+        seed: of the first block of every object and hand, and of the random scales.
+        scales: factors on every object's coordinates.
+        random_scales: how many more factors each object gets, and the range that they are drawn from, evenly in their
+            logarithm.
+        mass: [kg].
+        friction: Coulomb coefficient.
+        verify: the trials.
+        measure: which grasps get their metrics.
+
+    Raises:
+        ConfigError: a number is out of range.
+    """
+
+    objects: tuple[str, ...]
+    hands: tuple[str, ...] = ("allegro_right",)
+    per_object: int = 128
+    block: int = 128
+    preset: str = "balanced"
+    seed: int = 0
+    scales: tuple[float, ...] = (1.0,)
+    random_scales: tuple[int, float, float] = (0, 1.0, 1.0)
+    mass: float = 0.1
+    friction: float = 0.6
+    verify: str = "standard"
+    measure: str = "verified"
+
+    def __post_init__(self) -> None:
+        check_request(count=self.block, seed=self.seed, verify=self.verify, deadline=None, device="cpu")
+        if self.per_object < 1:
+            raise ConfigError(f"per-object: {self.per_object} grasps; at least 1")
+        if self.measure not in MEASURED:
+            raise ConfigError(f"measure: {self.measure!r}; valid: {', '.join(MEASURED)}")
+        number, low, high = self.random_scales
+        if number < 0 or not 0 < low <= high < np.inf:
+            raise ConfigError(f"random-scales: {number} {low:g} {high:g}; valid: a number, and 0 < LOW <= HIGH")
+        for name, value in [("scales", s) for s in self.scales] + [("mass", self.mass), ("friction", self.friction)]:
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"{name}: {value!r}; it must be a positive number")
+
+
+def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
+    """The blocks of a data set, those of an object together.
+
+    Raises:
+        GraspdError: there is no such object, hand or preset.
+    """
+    config = load_preset(request.preset)
+    hands = {name: hand_hash(name) for name in request.hands}
+    preset = Path(request.preset).stem if request.preset.endswith((".yaml", ".yml")) else request.preset
+    counts = _split(request.per_object, request.block)
+    return tuple(
+        Block(thing, hand, hashed, preset, config, request.verify, request.measure, request.seed + number, count)
+        for thing in _objects(request)
+        for hand, hashed in hands.items()
+        for number, count in enumerate(counts)
+    )
+
+
+def by_object(blocks: Sequence[Block]) -> list[tuple[DatasetObject, list[Block]]]:
+    """Blocks by what they grasp, in their order."""
+    groups: dict[str, tuple[DatasetObject, list[Block]]] = {}
+    for block in blocks:
+        groups.setdefault(block.object.key, (block.object, []))[1].append(block)
+    return list(groups.values())
+
+
+def _split(total: int, most: int) -> list[int]:
+    """`total` in parts of `most`; the last one is smaller."""
+    return [min(most, total - begun) for begun in range(0, total, most)]
+
+
+def _objects(request: DatasetRequest) -> list[DatasetObject]:
+    """Every object at every scale; what is named twice counts once."""
+    found: dict[str, DatasetObject] = {}
+    for source in object_sources(request.objects):
+        content = object_hash(source)
+        for scale in (*request.scales, *_drawn_scales(content, request)):
+            thing = DatasetObject(source, content, scale, request.mass, request.friction)
+            found.setdefault(thing.key, thing)
+    return list(found.values())
+
+
+def _drawn_scales(content: str, request: DatasetRequest) -> list[float]:
+    """Random scales of an object, the same for the same content and seed; rounded, so that they can be typed."""
+    number, low, high = request.random_scales
+    draw = np.random.default_rng([int(content[:8], 16), request.seed]).uniform(np.log(low), np.log(high), number)
+    return [round(float(scale), 4) for scale in np.exp(draw)]

@@ -1,0 +1,265 @@
+"""`graspd dataset`: grasps by the million on Ray, resumable; and what is done with a data set that is there."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
+from graspd_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graspd_dataset.blocks import Block, DatasetRequest
+    from graspd_dataset.dataset_store import DatasetStore
+    from graspd_dataset.guarded_calls import Limits, Report
+    from graspd_dataset.run_dataset import RunRecord
+
+
+EXIT_FAULTS = 1
+# Seconds between two plain lines of progress, and between two writes of what a run took.
+_LINES, _RECORDS = 10.0, 30.0
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("dataset", help="make a data set of grasps, or look at one (docs/dataset.md)")
+    parser.set_defaults(run=run)
+    parser.add_argument(
+        "words",
+        nargs="+",
+        metavar="OBJECT",
+        help="shape:NAME, meshes in metres (else --scales) or folders; "
+        "or stats, validate, merge, sample or export and the data sets meant",
+    )
+    parser.add_argument("--out", default="", metavar="DIR|s3://…", help="the data set; of sample a .parquet file")
+    make = parser.add_argument_group("making one")
+    make.add_argument("--hands", nargs="+", default=("allegro_right",), metavar="NAME|PATH")
+    make.add_argument("--per-object", type=int, default=128, metavar="N", help="verified, by object, scale and hand")
+    make.add_argument("--block", type=int, default=128, metavar="N", help="verified grasps of a file (default 128)")
+    make.add_argument("--preset", default="balanced")
+    make.add_argument("--seed", type=int, default=0)
+    make.add_argument("--scales", nargs="+", type=float, default=(1.0,), metavar="FACTOR", help="default 1")
+    make.add_argument("--random-scales", nargs=3, type=float, default=(0, 1, 1), metavar=("N", "LOW", "HIGH"))
+    make.add_argument("--mass", type=float, default=0.1, metavar="KG", help="default 0.1")
+    make.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
+    make.add_argument("--verify", default="standard", metavar="TRIALS")
+    make.add_argument("--measure", default="verified", metavar="WHICH", help="verified (default), all, or none")
+    make.add_argument("--dry-run", action="store_true", help="make one block of each hand; say count, hours and bytes")
+    ray = parser.add_argument_group("where it runs")
+    ray.add_argument("--address", default=None, metavar="ray://…", help="a Ray cluster (default: this machine)")
+    ray.add_argument("--workers", type=int, default=None, metavar="N", help="on this machine (default: all cores)")
+    ray.add_argument("--ray-dir", type=Path, default=None, metavar="DIR", help="for Ray's own files (default: /tmp)")
+    ray.add_argument("--patience", type=float, default=1800.0, metavar="SEC", help="until a block is called hung")
+    ray.add_argument("--memory", type=float, default=4096.0, metavar="MB", help="that a block may take")
+    ray.add_argument("--retry-failed", action="store_true", help="try blocks and objects again that failed")
+    ray.add_argument("--any-code", action="store_true", help="add to a data set that other code began")
+    parser.add_argument("--count", type=int, default=1000, metavar="N", help="of sample: rows")
+    parser.add_argument("--to", default="isaac", metavar="FORMAT", help="of export: isaac, graspgen or dexgraspbench")
+    parser.add_argument("--verdict", choices=("verified", "failed", "unverified"), default=None, help="of sample")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Returns the exit status: 0, 1 where blocks failed or a data set has faults, 130 after Ctrl-C."""
+    from graspd_dataset.dataset_store import DatasetStore
+
+    action, places = options.words[0], options.words[1:]
+    if action not in _ACTIONS:
+        return _make(options)
+    if not places or (action not in ("merge",) and len(places) > 1):
+        raise ConfigError(f"dataset {action}: {len(places)} data sets; valid: {'some' if action == 'merge' else 'one'}")
+    return _ACTIONS[action](options, [DatasetStore(place) for place in places])
+
+
+def _make(options: argparse.Namespace) -> int:
+    from graspd_dataset.blocks import blocks_of
+    from graspd_dataset.dataset_store import DatasetStore
+    from graspd_dataset.guarded_calls import Limits
+    from graspd_dataset.run_dataset import begin_run, missing_blocks
+
+    if not options.out:
+        raise ConfigError("--out is missing: a directory or s3://bucket/path")
+    if options.workers is not None and options.workers < 1:
+        raise ConfigError(f"workers: {options.workers}; at least 1")
+    request, store = _request(options), DatasetStore(options.out)
+    limits = Limits(options.patience, options.memory)
+    blocks = blocks_of(request)
+    missing = missing_blocks(blocks, store, retry_failed=options.retry_failed)
+    there = f"{len(blocks) - len(missing)} of {len(blocks)} blocks are there or failed before"
+    print(f"graspd: {there}", file=sys.stderr)
+    if options.dry_run:
+        from graspd_dataset.block_rows import dry_run
+
+        print(dry_run(missing, limits, options.workers))
+        return EXIT_OK
+    record = begin_run(store, request, len(blocks), any_code=options.any_code)
+    with Interrupt() as interrupt:
+        lines = _run_missing(options, store, limits, missing, record, interrupt) if missing else Lines(0)
+    _finish(store)
+    if interrupt.came():
+        print(f"graspd: interrupted; the same command goes on, {store.shown} keeps what is done", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    return EXIT_FAULTS if lines.wrong else EXIT_OK
+
+
+def _run_missing(
+    options: argparse.Namespace,
+    store: DatasetStore,
+    limits: Limits,
+    missing: list[Block],
+    record: RunRecord,
+    interrupt: Interrupt,
+) -> Lines:
+    """Run what is missing; the record is written from time to time, so that a run that is killed has one."""
+    from graspd_dataset.ray_engine import RayEngine, ray_running
+    from graspd_dataset.run_dataset import run_blocks, write_run
+
+    lines, began, written = Lines(len(missing)), time.monotonic(), 0.0
+    with ray_running(options.address, options.workers, options.ray_dir) as ray, lines:
+        engine = RayEngine(ray, store, limits, ship=options.address is not None)
+        for what, report in run_blocks(missing, engine, interrupt.came):
+            lines(what, report)
+            if time.monotonic() > written + _RECORDS:
+                write_run(store, lines.added_to(record, time.monotonic() - began))
+                written = time.monotonic()
+    write_run(store, lines.added_to(record, time.monotonic() - began))
+    return lines
+
+
+def _finish(store: DatasetStore) -> None:
+    """The data card of what is there by now, and the numbers for who ran it."""
+    from graspd_dataset.inspect_dataset import stats_of, stats_table
+    from graspd_dataset.run_dataset import data_card
+
+    if not store.list("grasps"):
+        return
+    stats = stats_of(store)
+    store.write("README.md", data_card(store, stats).encode())
+    print(stats_table(stats))
+
+
+def _request(options: argparse.Namespace) -> DatasetRequest:
+    from graspd_dataset.blocks import DatasetRequest
+
+    number, low, high = options.random_scales
+    names = ("per_object", "block", "preset", "seed", "mass", "friction", "verify", "measure")
+    return DatasetRequest(
+        objects=tuple(options.words),
+        hands=tuple(options.hands),
+        scales=tuple(options.scales),
+        random_scales=(int(number), float(low), float(high)),
+        **{name: getattr(options, name) for name in names},
+    )
+
+
+class Lines:
+    """Progress over blocks: a bar on a terminal, elsewhere a line now and then; what failed at once."""
+
+    def __init__(self, blocks: int) -> None:
+        self.wrong = 0
+        self._blocks, self._done, self._rows, self._verified = blocks, 0, 0, 0
+        self._cpu = self._peak = self._told = 0.0
+        self._failures: Counter[str] = Counter()
+        self._began = time.monotonic()
+        self._bar: Any = None
+
+    def __enter__(self) -> Lines:
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=self._blocks, desc="blocks", file=sys.stderr)
+        return self
+
+    def __call__(self, what: Any, report: Report) -> None:
+        if report.failed:
+            self.wrong += 1
+            name = getattr(what, "source", None) or f"{what.object.source} {what.hand} seed {what.seed}"
+            print(f"graspd: {report.failed}: {name}: {report.error}", file=sys.stderr, flush=True)
+        else:
+            self._done += 1
+            self._rows, self._verified = self._rows + report.rows, self._verified + report.verified
+            self._cpu, self._peak = self._cpu + report.cpu, max(self._peak, report.peak_mb)
+            self._failures.update(report.failures)
+        if self._bar is not None:
+            self._bar.set_postfix_str(self._text())
+            self._bar.update(not report.failed)
+        elif time.monotonic() > self._told + _LINES:
+            self._told = time.monotonic()
+            print(f"graspd: {self._done}/{self._blocks} blocks, {self._text()}", file=sys.stderr, flush=True)
+
+    def _text(self) -> str:
+        seconds = max(time.monotonic() - self._began, 1e-9)
+        reasons = ", ".join(f"{number} {reason}" for reason, number in self._failures.most_common(2))
+        told = f"{self._verified} of {self._rows} verified, {self._verified / seconds:.1f}/s"
+        return f"{told}; {reasons}" if reasons else told
+
+    def added_to(self, record: RunRecord, wall: float) -> RunRecord:
+        """The record with what this session did."""
+        more = {"done": record.done + self._done, "cpu": record.cpu + self._cpu, "wall": record.wall + wall}
+        return replace(record, **more, peak_mb=max(record.peak_mb, self._peak))
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+        elif self._done:
+            print(f"graspd: {self._done}/{self._blocks} blocks, {self._text()}", file=sys.stderr, flush=True)
+
+
+def _stats(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
+    from graspd_dataset.inspect_dataset import reason_lines, stats_of, stats_table
+
+    stats = stats_of(stores[0])
+    print("\n".join([stats_table(stats), "", *reason_lines(stats)]))
+    return EXIT_OK
+
+
+def _validate(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
+    from graspd_dataset.inspect_dataset import faults_of_dataset
+
+    faults = list(faults_of_dataset(stores[0]))
+    print("\n".join(faults) or f"{stores[0].shown}: {len(stores[0].list('grasps'))} blocks, no fault")
+    return EXIT_FAULTS if faults else EXIT_OK
+
+
+def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
+    from graspd_dataset.dataset_store import DatasetStore
+    from graspd_dataset.merge_datasets import merge
+
+    if not options.out:
+        raise ConfigError("--out is missing: where the merged data set goes")
+    out = DatasetStore(options.out)
+    copied, common = merge(stores, out)
+    print(f"{out.shown}: {copied} blocks copied, {common} were there or in several")
+    _finish(out)
+    return EXIT_OK
+
+
+def _sample(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
+    from graspd_core.io.grasps_json import check_writable
+    from graspd_core.runtime.disk_cache import save_bytes
+    from graspd_dataset.merge_datasets import sample
+
+    if not options.out.endswith(".parquet"):
+        raise ConfigError(f"--out {options.out}: a .parquet file is written")
+    check_writable(Path(options.out))
+    content, rows = sample(stores[0], options.count, options.seed, options.verdict)
+    save_bytes(Path(options.out), content)
+    print(f"{options.out}: {rows} rows")
+    return EXIT_OK
+
+
+def _export(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
+    from graspd_dataset.export_grasps import export
+
+    if not options.out:
+        raise ConfigError("--out is missing: the folder that is written")
+    files, grasps = export(stores[0], options.to, Path(options.out))
+    print(f"{options.out}: {grasps} grasps of {files} pairs of hand and object")
+    return EXIT_OK
+
+
+_ACTIONS = {"stats": _stats, "validate": _validate, "merge": _merge, "sample": _sample, "export": _export}

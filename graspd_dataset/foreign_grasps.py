@@ -1,0 +1,381 @@
+"""A grasp from somebody else's file, in graspd's terms: joints by the hand's own order, poses of its base link.
+
+DexGraspBench's npy: a pickled dictionary a grasp, three postures as position, quaternion wxyz and joints by order.
+
+A pickle is a program: it is read by `runtime/inert_pickle`, which runs none of it.
+
+isaac_grasp 1.0 (YAML): a pose of the gripper, joints at the grasp and at the pregrasp by name; no squeeze.
+
+The gripper's frame is a link of the hand by its name, the last word of a path in a stage; other words mean its base
+link. Both postures have the same pose.
+
+GraspGen's JSON: poses of the gripper's base, and whether each held there; no joints. The hand stands open there, closes
+until it touches, and presses as graspd's grasps do.
+
+Grasps of others from a file or a folder: which format it is goes by the ending.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.config.mapping import parse_yaml
+from graspd_core.errors import ConfigError, FormatError, shown
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
+from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, load_inert, read_bounded
+from graspd_core.types import Posture
+
+# A coupled joint may be so far from where it follows to [rad] or [m], and a quaternion's length from one.
+_COUPLED, _UNIT = 1e-3, 0.01
+# No position, angle or scale is larger; what is computed of such numbers stays finite.
+_LARGEST = 1e6
+
+
+@dataclass(frozen=True)
+class ImportedGrasp:
+    """One grasp as a file has it.
+
+    Attributes:
+        name: the file and the place in it.
+        mesh: file of the object or shape:NAME; in its frame, once it is scaled, the poses are.
+        scale: factor on the mesh's coordinates.
+        grasp: the touching posture; of a format without joints the open hand, which is to be closed.
+        pregrasp, squeeze: None where the format has none.
+        closed: whether the joints of `grasp` are those of the file.
+        squeeze_moved: how far the squeeze's base is from the grasp's [m]: graspd keeps it at the grasp's.
+        refused: why its own file calls it no grasp; empty where it does not.
+    """
+
+    name: str
+    mesh: str
+    scale: float
+    grasp: Posture
+    pregrasp: Posture | None = None
+    squeeze: Posture | None = None
+    closed: bool = True
+    squeeze_moved: float = 0.0
+    refused: str = ""
+
+
+def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """A value as numbers of a shape, none of them huge. Raises FormatError: it is something else."""
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = None
+    # Of NaN this is false.
+    if numbers is None or numbers.shape != shape or not (np.abs(numbers) <= _LARGEST).all():
+        wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        wanted += f" of at most {_LARGEST:.0e}"
+        raise FormatError(f"{where}: {' '.join(shown(value).split())}; expected {wanted}")
+    return numbers
+
+
+def entry(values: Any, key: str, where: str) -> Any:
+    """What a mapping has under a key. Raises FormatError: it has no such key, or is no mapping."""
+    if not isinstance(values, Mapping):
+        raise FormatError(f"{where}: {shown(values)}; expected a mapping with the key {key!r}")
+    if key not in values:
+        known = ", ".join(sorted(str(name)[:40] for name in values)[:20])
+        raise FormatError(f"{where}: the key {key!r} is missing; it has {known or 'none'}")
+    return values[key]
+
+
+def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
+    """A unit quaternion, wxyz. Raises FormatError: it is none."""
+    quaternion = numbers_of(value, (4,), where)
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1) > _UNIT:
+        raise FormatError(f"{where}: the quaternion has length {length:.3g}; valid: 1")
+    return quaternion / length
+
+
+def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
+    """Actuated joint values from named ones; coupled joints may be among them.
+
+    Raises:
+        FormatError: a name is not of the hand, one of its joints is missing, or a coupled one is not where it follows.
+    """
+    if not isinstance(values, Mapping):
+        raise FormatError(f"{where}: {shown(values)}; expected joint values by name")
+    names = all_joint_names(hand)
+    if strange := [name for name in values if name not in names]:
+        raise FormatError(f"{where}: joint {shown(strange[0])} is not of {hand.name}; valid: {', '.join(names)}")
+    if missing := [name for name in hand.joint_names if name not in values]:
+        raise FormatError(f"{where}: joint {missing[0]!r} of {hand.name} is missing")
+    joints = np.array([float(numbers_of(values[name], (), f"{where}: {name}")) for name in hand.joint_names])
+    for name, follows in zip(names, all_joint_positions(hand, joints), strict=True):
+        given = float(numbers_of(values.get(name, follows), (), f"{where}: {name}"))
+        if abs(given - follows) > _COUPLED:
+            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; by the joint that it follows {follows:.4g}")
+    return joints
+
+
+def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
+    """A joint order that fits the hand. Raises ConfigError: it names a joint that is not there, or lacks one."""
+    names = all_joint_names(hand)
+    for name in order:
+        if name not in names or list(order).count(name) > 1:
+            fault = "occurs twice" if name in names else f"is not of {hand.name}"
+            raise ConfigError(f"joint order: {name!r} {fault}; valid: {', '.join(names)}")
+    if missing := [name for name in hand.joint_names if name not in order]:
+        raise ConfigError(f"joint order: {missing[0]!r} of {hand.name} is missing")
+    return tuple(order)
+
+
+def find_beside(named: Any, file: Path, where: str) -> str:
+    """A file that another one names, relative to any folder that it lies in. Raises FormatError: it is nowhere."""
+    if isinstance(named, str) and named and "\0" not in named:
+        for folder in file.resolve().parents:
+            if (folder / named).is_file():
+                return str(folder / named)
+    raise FormatError(f"{where}: the object {shown(named)} is not beside the file; name its mesh: --object MESH")
+
+
+# The palm, our base link, in the frame of the qpos, wxyz, of hands whose model there is another than ours. Their joints
+# are in the order of ours; of other hands the frame is that of the base link.
+PALMS = {"allegro_right": (0.0, 1.0, 0.0, 1.0)}
+STAGES = ("pregrasp", "grasp", "squeeze")
+_WHAT = "file of DexGraspBench"
+
+
+def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
+    """The order of the joints of a qpos: as given, else known. Raises ConfigError: neither, or it fits no hand."""
+    if not order and hand.name not in PALMS:
+        names = ",".join(all_joint_names(hand))
+        raise ConfigError(f"joint order: npy files name no joints, that of {hand.name} is not known; such as: {names}")
+    return checked_order(order or all_joint_names(hand), hand)
+
+
+def read_dexgraspbench(
+    path: Path, content: bytes, hand: HandModel, mesh: str | None, order: Sequence[str]
+) -> list[ImportedGrasp]:
+    """The one grasp of a file, in the frame of the object; `mesh` stands for the one that it names.
+
+    Raises:
+        ConfigError: the joint order is not known or does not fit the hand.
+        FormatError: no npy of a dictionary, asks for code to be run, or an entry is missing or malformed, by its key.
+    """
+    order = order_of(hand, order)
+    values = npy_dictionary(path, content)
+    named = _plain(values, "obj_path", path)
+    mesh = mesh or find_beside(f"{named}/mesh/simplified.obj", path, f"{path}: obj_path")
+    scale = float(numbers_of(_plain(values, "obj_scale", path), (), f"{path}: obj_scale"))
+    target = _pose(_plain(values, "obj_pose", path), 0, f"{path}: obj_pose")
+    pregrasp, grasp, squeeze = (_posture(values, stage, target, hand, order, path) for stage in STAGES)
+    moved = float(np.linalg.norm(squeeze.position - grasp.position))
+    return [ImportedGrasp(f"{path}", mesh, scale, grasp, pregrasp, squeeze, squeeze_moved=moved)]
+
+
+def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
+    """The dictionary of an npy file: plain values, and `Inert` arrays of numbers. Raises FormatError: it holds none."""
+    file = BytesIO(content)
+    try:
+        major = np.lib.format.read_magic(file)[0]
+        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+    except Exception as error:
+        raise FormatError(f"{path}: not an npy file: {' '.join(str(error).split())[:200]}") from None
+    if dtype != np.dtype(object) or shape not in ((), (1,)):
+        raise FormatError(f"{path}: holds an array of {dtype} of shape {shape}; expected one pickled dictionary")
+    try:
+        held = load_inert(content[file.tell() :], NUMPY_NAMES, _WHAT)
+    except ValueError as error:
+        raise FormatError(f"{path}: {error}") from error
+    state = held.state if isinstance(held, Inert) else None
+    items = state[4] if isinstance(state, tuple) and len(state) == 5 else None
+    if not isinstance(items, list) or len(items) != 1 or not isinstance(items[0], dict):
+        raise FormatError(f"{path}: holds no dictionary")
+    return items[0]
+
+
+def _plain(values: dict[Any, Any], key: str, path: Path) -> Any:
+    """Text, a number, or an array of numbers under a key."""
+    value = entry(values, key, f"{path}")
+    if not isinstance(value, Inert):
+        return value
+    try:
+        if value.kind == "scalar" and len(value.arguments) == 2:
+            dtype, raw = value.arguments
+            return array_of(Inert("array", state=(1, (), dtype, False, raw)))
+        if value.kind != "array":
+            raise ValueError(f"holds a {value.kind} where numbers are expected")
+        return array_of(value)
+    except ValueError as error:
+        raise FormatError(f"{path}: {key}: {error}") from error
+
+
+def _pose(values: Any, joints: int, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, quaternion wxyz and joints of a qpos."""
+    size = np.shape(values)
+    if joints and len(size) == 1 and size[0] != 7 + joints:
+        raise FormatError(f"{where}: {size[0] - 7} joints; the joint order has {joints}")
+    row = numbers_of(values, (7 + joints,), where)
+    return row[:3], quaternion_of(row[3:7], where), row[7:]
+
+
+def _posture(
+    values: dict[Any, Any],
+    stage: str,
+    target: tuple[np.ndarray, ...],
+    hand: HandModel,
+    order: Sequence[str],
+    path: Path,
+) -> Posture:
+    """A posture of the hand's base link in the frame of the object."""
+    from scipy.spatial.transform import Rotation
+
+    where = f"{path}: {stage}_qpos"
+    position, quaternion, joints = _pose(_plain(values, f"{stage}_qpos", path), len(order), where)
+    into = Rotation.from_quat(np.roll(target[1], -1)).inv()
+    palm = Rotation.from_quat(np.roll(PALMS.get(hand.name, (1.0, 0.0, 0.0, 0.0)), -1))
+    base = into * Rotation.from_quat(np.roll(quaternion, -1)) * palm
+    named = joints_by_name(dict(zip(order, joints, strict=True)), hand, where)
+    return Posture(into.apply(position - target[0]), np.roll(base.as_quat(), 1), named)
+
+
+# Entries of a rotation matrix may be so far from orthonormal.
+_ROTATION = 1e-3
+
+
+def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
+    """The grasps of one file; `mesh` stands for the one that it names. Raises FormatError: malformed, by key."""
+    try:
+        _, document = parse_yaml(text.decode())
+    except ValueError as error:
+        raise FormatError(f"{path}: not YAML: {error}") from None
+    if entry(document, "format", f"{path}") != "isaac_grasp" or document.get("format_version") != 1.0:
+        told = f"{shown(document['format'])} {shown(document.get('format_version'))}"
+        raise FormatError(f"{path}: format {told}; valid: isaac_grasp 1.0")
+    # Isaac Sim writes the former names, Isaac ROS describes the latter.
+    target, frame = (document.get(f"{of}_frame_link", document.get(f"{of}_frame")) for of in ("object", "gripper"))
+    mesh = mesh or find_beside(target, path, f"{path}: object_frame_link")
+    frame = str(frame).rpartition("/")[2]
+    grasps = entry(document, "grasps", f"{path}")
+    if not isinstance(grasps, dict):
+        raise FormatError(f"{path}: grasps: {shown(grasps)}; expected grasps by name")
+    return [_grasp_of(values, hand, frame, mesh, f"{path}: {shown(name)}") for name, values in grasps.items()]
+
+
+def _grasp_of(values: Any, hand: HandModel, frame: str, mesh: str, where: str) -> ImportedGrasp:
+    joints, opened = (
+        joints_by_name(entry(values, key, where), hand, f"{where}: {key}")
+        for key in ("cspace_position", "pregrasp_cspace_position")
+    )
+    position = numbers_of(entry(values, "position", where), (3,), f"{where}: position")
+    turn, place = entry(values, "orientation", where), f"{where}: orientation"
+    xyz = numbers_of(entry(turn, "xyz", place), (3,), place)
+    quaternion = quaternion_of([entry(turn, "w", place), *xyz], place)
+    if frame in hand.link_names and frame != hand.base_link:
+        position, quaternion = _base_of(hand, frame, joints, position, quaternion)
+    grasp, pregrasp = (Posture(position, quaternion, values) for values in (joints, opened))
+    return ImportedGrasp(where, mesh, 1.0, grasp, pregrasp)
+
+
+def _base_of(
+    hand: HandModel, link: str, joints: np.ndarray, position: np.ndarray, quaternion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and quaternion of the base link where those of another link are given."""
+    from scipy.spatial.transform import Rotation
+
+    rotations, translations = link_poses(hand, joints)
+    index = hand.link_index[link]
+    base = Rotation.from_quat(np.roll(quaternion, -1)) * Rotation.from_matrix(rotations[index]).inv()
+    return position - base.apply(translations[index]), np.roll(base.as_quat(), 1)
+
+
+def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
+    """The grasps of one file; `mesh` stands for the one that it names. Raises FormatError: malformed, by key."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not JSON: {error}") from None
+    target, grasps = (entry(document, key, f"{path}") for key in ("object", "grasps"))
+    mesh = mesh or find_beside(entry(target, "file", f"{path}: object"), path, f"{path}: object")
+    scale = float(numbers_of(entry(target, "scale", f"{path}: object"), (), f"{path}: object: scale"))
+    poses, held = (entry(grasps, key, f"{path}: grasps") for key in ("transforms", "object_in_gripper"))
+    if not isinstance(poses, list) or not isinstance(held, list) or len(poses) != len(held):
+        raise FormatError(f"{path}: grasps: transforms and object_in_gripper are not lists of one length")
+    found = []
+    for number, (pose, good) in enumerate(zip(poses, held, strict=True)):
+        where = f"{path}: grasp {number}"
+        if not isinstance(good, bool):
+            raise FormatError(f"{where}: object_in_gripper: {shown(good)}; expected true or false")
+        refused = "" if good else "its own file says that it did not hold"
+        found.append(ImportedGrasp(where, mesh, scale, _open_at(pose, hand, where), closed=False, refused=refused))
+    return found
+
+
+def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
+    """The open hand at a pose `T_object_hand`."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = numbers_of(pose, (4, 4), f"{where}: transform")
+    rotation = matrix[:3, :3]
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION and np.linalg.det(rotation) > 0
+    if not rigid or np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION:
+        raise FormatError(f"{where}: transform: {shown(pose)}; expected a rotation and a translation")
+    quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+    return Posture(matrix[:3, 3], quaternion, np.clip(hand.open_posture, hand.lower, hand.upper))
+
+
+# Endings, in the order in which a folder is searched: what describes objects beside npy files is JSON, too.
+FORMATS = {".npy": "dexgraspbench", ".yaml": "isaac", ".yml": "isaac", ".json": "graspgen"}
+
+
+def read_foreign(
+    place: Path, hand: HandModel, *, mesh: str | None = None, order: Sequence[str] = ()
+) -> tuple[ImportedGrasp, ...]:
+    """All grasps of a file, or of the files of one format below a folder, in the order of their names.
+
+    Args:
+        hand: whose grasps they are.
+        mesh: of the object, instead of what the files name.
+        order: joints of an npy's rows of numbers, by name; () where the hand's is known.
+
+    Raises:
+        ConfigError: the order is not known, or does not fit the hand.
+        FormatError: there is no such file, or one is malformed.
+    """
+    found: list[ImportedGrasp] = []
+    for path in foreign_files(place):
+        try:
+            content = read_bounded(path, "file of grasps")
+        except ValueError as error:
+            raise FormatError(f"{path}: {error}") from None
+        if path.suffix == ".npy":
+            found += read_dexgraspbench(path, content, hand, mesh, order)
+        else:
+            found += (read_graspgen if path.suffix == ".json" else read_isaac)(path, content, hand, mesh)
+    return tuple(found)
+
+
+def foreign_files(place: Path) -> tuple[Path, ...]:
+    """The files of grasps at a place, which share a format. Raises FormatError: there are none."""
+    endings = ", ".join(FORMATS)
+    if place.is_file():
+        if place.suffix not in FORMATS:
+            raise FormatError(f"{place}: unknown ending {place.suffix!r}; valid: {endings}")
+        return (place,)
+    if not place.is_dir():
+        raise FormatError(f"{place}: no such file or folder")
+    for kind in dict.fromkeys(FORMATS.values()):
+        files = [path for path in place.rglob("*") if FORMATS.get(path.suffix) == kind and path.is_file()]
+        if files:
+            return tuple(sorted(files, key=_natural))
+    raise FormatError(f"{place}: no file of grasps in this folder; valid endings: {endings}")
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """By which 2.npy comes before 10.npy."""
+    return [(int(part), "") if odd % 2 else (0, part) for odd, part in enumerate(re.split(r"([0-9]+)", str(path)))]

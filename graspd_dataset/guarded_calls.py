@@ -1,0 +1,187 @@
+"""Blocks on a worker of Ray: the work in a child process with limits, its files written whole by the worker.
+
+What a block does, hang, crash, or fill memory, it does to the child; the worker writes down what it was. The worker
+itself loads neither torch nor MuJoCo: what it hands on to the child is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from graspd_core.runtime.worker_process import WorkerProcess
+from graspd_dataset.dataset_store import DatasetStore, block_path
+
+T = TypeVar("T")
+
+# Calls after which the child is replaced, which bounds what libraries leak.
+_CALLS = 200
+_KINDS = {TimeoutError: "hung", MemoryError: "memory", ChildProcessError: "died"}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one block, or making one object ready, may take: seconds, and MB of resident memory."""
+
+    seconds: float = 1800.0
+    most_mb: float = 4096.0
+
+
+@dataclass(frozen=True)
+class Report:
+    """What came of a block, or of making an object ready.
+
+    Attributes:
+        key: of the block or the object.
+        failed: kind of failure (raised, hung, memory, died, lost); empty where it was written.
+        error: what failed.
+        rows, verified: numbers of candidates.
+        failures: numbers of failed candidates by trial and kind of reason.
+        size: of the file [bytes].
+        cpu: seconds.
+        peak_mb: peak of the child's memory.
+    """
+
+    key: str
+    failed: str = ""
+    error: str = ""
+    rows: int = 0
+    verified: int = 0
+    failures: dict[str, int] = field(default_factory=dict)
+    size: int = 0
+    cpu: float = 0.0
+    peak_mb: float = 0.0
+
+
+@dataclass(frozen=True)
+class ReadyObject:
+    """An object made ready: what every process that grasps it needs.
+
+    Attributes:
+        sha256: of its cleaned mesh.
+        file: bytes of its row in `objects/`.
+        shared: pickled scene and what was built for it: the distance grid, the convex parts.
+    """
+
+    sha256: str
+    file: bytes
+    shared: bytes
+
+
+@dataclass(frozen=True)
+class MadeBlock:
+    """A block's file and what it took.
+
+    Attributes:
+        object_sha256: of the cleaned mesh.
+        file: bytes of its Parquet file.
+        rows, verified: numbers of candidates.
+        failures: numbers of failed candidates by trial and kind of reason.
+        cpu: seconds of this process.
+        peak_mb: peak of its memory.
+    """
+
+    object_sha256: str
+    file: bytes
+    rows: int
+    verified: int
+    failures: dict[str, int]
+    cpu: float
+    peak_mb: float
+
+
+@dataclass(frozen=True)
+class Job:
+    """A block, or an object to make ready, as it goes to a worker.
+
+    Attributes:
+        key: of the block or the object.
+        asked: for the record of a failure, JSON-ready.
+        pickled: the block; of an object the pair of it and the settings.
+        hand: of a block, the name of its hand.
+    """
+
+    key: str
+    asked: dict[str, Any]
+    pickled: bytes
+    hand: str = ""
+
+
+def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits: Limits) -> tuple[Report, bytes]:
+    """Make an object ready and keep its mesh; what its blocks share, or where it failed, the record and nothing."""
+    try:
+        ready = call_guarded(limits, ready_of, job.pickled, content)
+    except Exception as error:
+        return failed_report(store, job, error), b""
+    store.write(f"objects/{ready.sha256}.parquet", ready.file)
+    return Report(job.key), ready.shared
+
+
+def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
+    """Make a block and keep it."""
+    try:
+        made = call_guarded(limits, block_of, job.pickled, hand, shared)
+    except Exception as error:
+        return failed_report(store, job, error)
+    store.write(block_path(job.hand, made.object_sha256, job.key), made.file)
+    return Report(
+        job.key,
+        rows=made.rows,
+        verified=made.verified,
+        failures=made.failures,
+        size=len(made.file),
+        cpu=made.cpu,
+        peak_mb=made.peak_mb,
+    )
+
+
+def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:
+    """In the child: `make_ready` of an object and settings."""
+    from graspd_dataset.block_rows import make_ready
+
+    thing, config = pickle.loads(pickled)
+    return make_ready(thing, content, config)
+
+
+def block_of(pickled: bytes, hand: bytes, shared: bytes) -> MadeBlock:
+    """In the child: `make_block`."""
+    from graspd_dataset.block_rows import make_block
+
+    return make_block(pickle.loads(pickled), hand, shared)
+
+
+def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report:
+    """Write down what failed."""
+    from graspd_bench.result_store import failure
+
+    record = failure(error, _KINDS.get(type(error), "raised"))
+    told = {"key": job.key, "asked": job.asked, **record}
+    store.write(f"failed/{job.key}.json", (json.dumps(told, indent=1) + "\n").encode())
+    return Report(job.key, failed=record["failed"], error=record["error"])
+
+
+class _Child:
+    """The child of this process, started with the first call."""
+
+    def __init__(self) -> None:
+        self._process: WorkerProcess | None = None
+        self._left = 0
+
+    def call(self, limits: Limits, work: Callable[..., T], *arguments: Any) -> T:
+        if self._process is None or self._left <= 0:
+            self.close()
+            self._process, self._left = WorkerProcess(killed_with_thread=True), _CALLS
+        self._left -= 1
+        return self._process.bounded(limits.seconds, limits.most_mb, work, *arguments)
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+
+
+_CHILD = _Child()
+call_guarded, close_child = _CHILD.call, _CHILD.close

@@ -1,0 +1,102 @@
+"""`graspd import`: somebody else's grasps into grasps.json (docs/dataset.md)."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_core.cli.running import EXIT_OK, EXIT_TOO_FEW
+from graspd_core.config import VERIFICATIONS
+from graspd_core.errors import ConfigError
+from graspd_core.types import GraspResult, Outcome, Timing, Verdict
+
+if TYPE_CHECKING:
+    from graspd_core.hands.model import HandModel
+    from graspd_core.perception.scene import Scene
+    from graspd_dataset.foreign_grasps import ImportedGrasp
+
+
+# A squeeze whose base is farther from the grasp's is worth a warning [m].
+_MOVED = 1e-4
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("import", help="grasps of others (.npy, .yaml, .json) into grasps.json")
+    parser.set_defaults(run=run)
+    parser.add_argument(
+        "place", metavar="PATH", type=Path, help="DexGraspBench .npy, isaac_grasp .yaml, GraspGen .json"
+    )
+    parser.add_argument("--hand", required=True, metavar="NAME|PATH", help="whose grasps they are")
+    parser.add_argument("--object", default=None, metavar="MESH", help="instead of what the files name")
+    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of npy files: the names of their joints")
+    parser.add_argument("--preset", default="balanced", help="settings of the squeeze and the pregrasp that are found")
+    parser.add_argument("--mass", type=float, default=0.1, metavar="KG", help="of the objects (default 0.1)")
+    parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
+    parser.add_argument("--verify", choices=VERIFICATIONS, default="none", help="try and measure them (default none)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="or a .json file for a single object")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Returns the exit status: 0, 3 where no grasp of an object is left."""
+    from graspd_core.hands.library import load_hand
+    from graspd_core.io.grasps_json import check_writable, save_result
+    from graspd_core.optimize.plan_config import load_preset
+    from graspd_core.perception.load_scene import load_scene
+    from graspd_dataset.complete_grasps import by_object
+    from graspd_dataset.foreign_grasps import read_foreign
+
+    config = load_preset(options.preset)
+    hand = load_hand(options.hand, candidates=config.problem.fine_candidates)
+    order = tuple(name for name in options.joint_order.split(",") if name)
+    targets = by_object(read_foreign(options.place, hand, mesh=options.object, order=order))
+    single = options.out.suffix == ".json"
+    if single and len(targets) > 1:
+        raise ConfigError(f"{options.out}: one file for {len(targets)} objects; give a directory")
+    check_writable(options.out if single else options.out / "probe")
+    status = EXIT_OK
+    for (mesh, scale), imported in targets.items():
+        factors = {"mass": options.mass, "friction": options.friction, "scale": scale}
+        scene = load_scene(mesh, resolution=config.resolution, **factors)
+        result = _result(scene, hand, imported, config, options.verify)
+        path = options.out if single else options.out / f"{scene.object.sha256[:16]}.json"
+        save_result(path, result, scene.object, hand, config)
+        status = status if result.grasps else EXIT_TOO_FEW
+        held = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+        tried = f", {held} verified" if options.verify != "none" else ""
+        print(f"{path}: {len(result.grasps)} of {len(imported)} grasps of {mesh}{tried}")
+        for line in (*(f"{count} refused: {why}" for why, count in result.refused.items()), *result.warnings):
+            print(f"graspd: {line}", file=sys.stderr)
+    return status
+
+
+def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
+    """The grasps of one object as a run gives back its own, verified ones first."""
+    from graspd_core.verify.verification import verify_grasps
+    from graspd_dataset.complete_grasps import complete_grasps
+
+    completed = complete_grasps(scene, hand, imported, config)
+    grasps = completed.grasps
+    if verify != "none":
+        tried = verify_grasps(scene, hand, grasps, verify=verify)
+        grasps = tuple(sorted(tried, key=lambda grasp: grasp.verdict is not Verdict.VERIFIED))
+    good = sum(grasp.usable for grasp in grasps)
+    outcome = Outcome.SUCCEEDED if good == len(imported) else Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
+    moved = [grasp.squeeze_moved for grasp in imported if grasp.squeeze_moved > _MOVED]
+    warnings = ()
+    if moved:
+        told = f"the base of {len(moved)} squeezes was moved, by up to {max(moved) * 1000:.1f} mm"
+        warnings = (f"{told}; it stays at the grasp's",)
+    return GraspResult(
+        outcome,
+        grasps,
+        Timing(),
+        seed=0,
+        method="imported",
+        message=f"{len(grasps)} of {len(imported)} imported grasps are kept, {good} are usable",
+        warnings=warnings,
+        refused=completed.refused,
+    )

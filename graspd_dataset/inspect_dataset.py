@@ -1,0 +1,193 @@
+"""What a data set holds: numbers by hand, and why grasps failed.
+
+A data set looked through: every file whole, where its content says, and no grasp in it twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from graspd_bench.tables import markdown_table
+from graspd_core.errors import FormatError
+from graspd_dataset.block_rows import kind_of_reason
+from graspd_dataset.blocks import content_key
+from graspd_dataset.dataset_store import DatasetStore, block_path, key_of, read_parquet
+from graspd_dataset.record_schema import arrow_schema
+
+_REASONS = 8
+
+
+@dataclass
+class HandCount:
+    """Numbers of one hand's rows: by verdict, of blocks, and the objects' hashes."""
+
+    blocks: int = 0
+    size: int = 0
+    verdicts: Counter[str] = field(default_factory=Counter)
+    objects: set[str] = field(default_factory=set)
+
+
+@dataclass
+class DatasetStats:
+    """What a data set holds.
+
+    Attributes:
+        hands: numbers by hand.
+        reasons: numbers of failed grasps by trial and kind of reason.
+        codes: versions of the code that made rows.
+        failed: records of blocks and objects that failed and have no file.
+    """
+
+    hands: dict[str, HandCount] = field(default_factory=dict)
+    reasons: Counter[str] = field(default_factory=Counter)
+    codes: set[str] = field(default_factory=set)
+    failed: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def rows(self) -> int:
+        return sum(hand.verdicts.total() for hand in self.hands.values())
+
+    @property
+    def size(self) -> int:
+        return sum(hand.size for hand in self.hands.values())
+
+
+def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iterator[tuple[str, bytes, Any, Any]]:
+    """Path, bytes, table and metadata of every block, in the order of their paths.
+
+    Raises:
+        FormatError: there is no block, or one of them is spoilt.
+    """
+    paths = store.list("grasps")
+    if not paths:
+        raise FormatError(f"{store.shown}: no data set: nothing in grasps/")
+    for path in paths:
+        content = store.read(path)
+        yield path, content, *read_parquet(content, f"{store.shown}/{path}", columns)
+
+
+def stats_of(store: DatasetStore) -> DatasetStats:
+    """Count. Raises FormatError: as `tables_of`."""
+    stats, there = DatasetStats(), set[str]()
+    for path, content, table, told in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
+        there.add(told["block"])
+        stats.codes.update(table["code"].unique().to_pylist())
+        # By its path: a block without a candidate is one too.
+        hand = stats.hands.setdefault(path.split("/")[1].removeprefix("hand="), HandCount())
+        hand.blocks += 1
+        hand.size += len(content)
+        hand.verdicts.update(table["verdict"].to_pylist())
+        hand.objects.update(table["object_sha256"].to_pylist())
+        for trials in table["trials"].to_pylist():
+            lost = next((trial for trial in trials if not trial["passed"]), None)
+            if lost is not None:
+                stats.reasons[kind_of_reason(lost["name"], lost["reason"])] += 1
+    records = [json.loads(store.read(path)) for path in store.list("failed")]
+    stats.failed = [record for record in records if record["key"] not in there]
+    return stats
+
+
+def stats_table(stats: DatasetStats) -> str:
+    """Numbers by hand, in Markdown."""
+    body = [
+        (
+            name,
+            f"{len(hand.objects)}",
+            f"{hand.blocks}",
+            f"{hand.verdicts.total()}",
+            f"{hand.verdicts['verified']}",
+            f"{hand.verdicts['failed']}",
+            f"{hand.verdicts['verified'] / max(hand.verdicts.total(), 1):.0%}",
+            f"{hand.size / 2**20:.1f}",
+        )
+        for name, hand in sorted(stats.hands.items())
+    ]
+    return markdown_table(("hand", "objects", "blocks", "tried", "verified", "failed", "held", "MB"), body)
+
+
+def reason_lines(stats: DatasetStats) -> list[str]:
+    """The most frequent reasons, a line each, and what failed as a whole."""
+    lines = [f"{number} {reason}" for reason, number in stats.reasons.most_common(_REASONS)]
+    return lines + [f"{record['failed']}: {record['asked']['object']}: {record['error']}" for record in stats.failed]
+
+
+_POSTURES = tuple(f"{s}_{part}" for s in ("pregrasp", "grasp", "squeeze") for part in ("position", "quaternion_wxyz"))
+_UNIT_TOLERANCE = 1e-3
+
+
+def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
+    """What is wrong with a data set, a line each; none where all is well.
+
+    Raises:
+        FormatError: there is no data set.
+    """
+    paths, meshes = store.list("grasps"), {key_of(path) for path in store.list("objects")}
+    if not paths:
+        raise FormatError(f"{store.shown}: no data set: nothing in grasps/")
+    seen: dict[bytes, str] = {}
+    for path in paths:
+        try:
+            table, told = read_parquet(store.read(path), path)
+        except FormatError as error:
+            yield str(error)
+            continue
+        yield from (f"{path}: {fault}" for fault in _file_faults(path, table, told, meshes))
+        for digest in row_digests(table):
+            if digest in seen:
+                yield f"{path}: a grasp that is in {seen[digest]} too"
+                break
+            seen[digest] = path
+    for path in store.list("objects"):
+        try:
+            read_parquet(store.read(path), path)
+        except FormatError as error:
+            yield str(error)
+
+
+def row_digests(table: Any) -> list[bytes]:
+    """Of every row the hash of its object, hand and grasp, whatever block it is in."""
+    names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
+    rows = zip(*(table[name].to_pylist() for name in names), strict=True)
+    return [hashlib.sha256(repr(row).encode()).digest() for row in rows]
+
+
+def count_by_content(store: DatasetStore) -> tuple[int, int]:
+    """Numbers of rows, and of different ones."""
+    digests = [digest for _, _, table, _ in tables_of(store) for digest in row_digests(table)]
+    return len(digests), len(set(digests))
+
+
+def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) -> Iterator[str]:
+    """What is wrong with one block."""
+    import numpy as np
+
+    if table.schema.remove_metadata() != arrow_schema():
+        names = set(table.schema.names) ^ set(arrow_schema().names)
+        yield f"its columns are not those of the schema: {', '.join(sorted(names)) or 'other types'}"
+        return
+    if content_key(told.get("asked")) != key_of(path) or told.get("block") != key_of(path):
+        yield f"it holds the block {told.get('block')}"
+    if not table.num_rows:
+        return
+    hand, target = table["hand_name"][0].as_py(), table["object_sha256"][0].as_py()
+    if path != block_path(hand, target, key_of(path)):
+        yield f"it belongs in {block_path(hand, target, key_of(path))}"
+    if target not in meshes:
+        yield f"objects/{target}.parquet is missing"
+    if table["row"].to_pylist() != list(range(table.num_rows)):
+        yield "rows are missing or not in their order"
+    for name in _POSTURES:
+        values = np.array(table[name].to_pylist())
+        if not np.isfinite(values).all():
+            yield f"{name}: numbers that are not finite"
+        elif name.endswith("wxyz") and (abs(np.linalg.norm(values, axis=1) - 1) > _UNIT_TOLERANCE).any():
+            yield f"{name}: quaternions that are not of unit length"
+    trials = table["trials"].to_pylist()
+    passed = [bool(own) and all(trial["passed"] for trial in own) for own in trials]
+    if passed != [verdict == "verified" for verdict in table["verdict"].to_pylist()]:
+        yield "verdicts that the trials do not bear out"

@@ -1,0 +1,77 @@
+"""Several data sets in one, block by block; and some rows of one in a file."""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+from collections.abc import Sequence
+from typing import Any
+
+from graspd_core.errors import ConfigError, FormatError
+from graspd_dataset.dataset_store import DatasetStore, keys_below, parquet_bytes, read_parquet
+from graspd_dataset.inspect_dataset import tables_of
+from graspd_dataset.record_schema import arrow_schema
+
+# Columns that may differ where two data sets have the same block.
+_NAMES = ("object_source", "preset", "code")
+
+
+def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]:
+    """Copy all blocks, meshes, records of failures and runs to `out`; numbers of blocks copied and of those in common.
+
+    What is there already is compared and left; so a merge that was stopped goes on.
+
+    Raises:
+        FormatError: a file is spoilt, or two data sets hold other rows under the same key.
+    """
+    there = {path.rpartition("/")[2]: path for path in out.list("grasps")}
+    copied = common = 0
+    for source in sources:
+        for path, content, table, _ in tables_of(source):
+            name = path.rpartition("/")[2]
+            if name in there:
+                _refuse_conflict(table, out, there[name], f"{source.shown}/{path}")
+                common += 1
+                continue
+            out.write(path, content)
+            there[name] = path
+            copied += 1
+        for folder in ("objects", "failed", "runs"):
+            present = keys_below(out, folder)
+            for path in source.list(folder):
+                if path.rpartition("/")[2].partition(".")[0] not in present:
+                    out.write(path, source.read(path))
+    return copied, common
+
+
+def _refuse_conflict(table: Any, out: DatasetStore, path: str, where: str) -> None:
+    other, _ = read_parquet(out.read(path), f"{out.shown}/{path}")
+    if not table.drop_columns(list(_NAMES)).equals(other.drop_columns(list(_NAMES))):
+        raise FormatError(f"{where}: other rows than {out.shown}/{path}, which has the same key: keep one of them")
+
+
+def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = None) -> tuple[bytes, int]:
+    """A Parquet file of `count` rows drawn evenly, and their number; the same for the same rows and seed.
+
+    Raises:
+        ConfigError: the count is not valid.
+        FormatError: there is no data set, or a file is spoilt.
+    """
+    import pyarrow as pa
+
+    if count < 1:
+        raise ConfigError(f"count: {count} rows; at least 1")
+    drawn: list[tuple[int, str, int]] = []
+    # Once through two columns for the draw, once through those files that hold drawn rows.
+    for path, _, table, told in tables_of(store, ("row", "verdict")):
+        for row, said in zip(table["row"].to_pylist(), table["verdict"].to_pylist(), strict=True):
+            if verdict in (None, said):
+                digest = hashlib.sha256(f"{seed} {told['block']} {row}".encode()).digest()
+                item = (-int.from_bytes(digest[:8]), path, row)
+                heapq.heappush(drawn, item) if len(drawn) < count else heapq.heappushpop(drawn, item)
+    rows: dict[str, list[int]] = {}
+    for _, path, row in drawn:
+        rows.setdefault(path, []).append(row)
+    parts = [read_parquet(store.read(path), path)[0].take(sorted(rows[path])) for path in sorted(rows)]
+    table = pa.concat_tables([part.replace_schema_metadata(None) for part in parts] or [arrow_schema().empty_table()])
+    return parquet_bytes(table, {"sample": {"count": count, "seed": seed, "verdict": verdict}}), table.num_rows

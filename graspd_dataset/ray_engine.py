@@ -1,0 +1,176 @@
+"""Ray: one of its own on this machine, or a cluster that is there; tasks that it runs again when a worker is lost."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import secrets
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.optimize.plan_config import PlanConfig
+from graspd_dataset.blocks import Block, DatasetObject
+from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.guarded_calls import Job, Limits, Report, prepare_object, run_block
+
+# Object store of an embedded Ray [bytes]: an object that is ready takes about 2 MB, and few are at a time.
+_OBJECT_STORE = 256 * 2**20
+# How often Ray runs a task again whose worker or node was lost.
+_RETRIES = 4
+# Loopback; of 127.0.0.1 Ray would make the machine's address in its network.
+_LOOPBACK = "127.0.0.2"
+# Until a cluster has answered [s].
+_CONNECT = 10.0
+# Begin of the name of Ray's own folder; the number of the driver's process follows.
+_FOLDER = "graspd-ray-"
+
+
+@contextmanager
+def ray_running(address: str | None, workers: int | None, folder: Path | None = None) -> Iterator[Any]:
+    """The module `ray`, connected: to a cluster's address, or to a Ray of this process's own that ends with it.
+
+    An own one shows no dashboard, tells nobody of its use, takes commands only of who knows a random token, and keeps
+    its files in `folder` or a temporary one.
+
+    Raises:
+        ConfigError: Ray is not installed, or there is no cluster at the address.
+    """
+    settings = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+    if address is None:
+        settings |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
+        _remove_abandoned(folder or Path(tempfile.gettempdir()))
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    # Short: the paths of sockets in it may have 107 characters.
+    own = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-", dir=folder)) if address is None else None
+    try:
+        ray = _ray()
+        _refuse_silent(address)
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+        if own is not None:
+            options |= {"address": "local", "num_cpus": workers, "object_store_memory": _OBJECT_STORE}
+            options |= {"include_dashboard": False, "_temp_dir": str(own), "_node_ip_address": _LOOPBACK}
+        try:
+            ray.init(**{"address": address, **options})
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ConfigError(f"address: {address}: {' '.join(str(error).split())[-200:]}") from None
+        try:
+            yield ray
+        finally:
+            ray.shutdown()
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+        if own is not None:
+            shutil.rmtree(own, ignore_errors=True)
+
+
+def _refuse_silent(address: str | None) -> None:
+    """Refuse an address where nothing listens: Ray would wait for minutes and then end the process."""
+    host, _, port = (address or "").removeprefix("ray://").partition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), _CONNECT).close()
+    except OSError as error:
+        raise ConfigError(f"address: {address}: {error.strerror or error}; start one with: ray start --head") from None
+
+
+@lru_cache
+def _token() -> str:
+    """Who knows it may give commands to the Ray of this process, which reads it once: a second Ray has the same."""
+    return secrets.token_hex(32)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove what drivers left that were killed: folders that name a process which is no more."""
+    for path in folder.glob(f"{_FOLDER}*-*"):
+        process = path.name.removeprefix(_FOLDER).partition("-")[0]
+        if process.isdigit() and not Path(f"/proc/{process}").exists() and Path("/proc/self").exists():
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _ray() -> Any:
+    try:
+        import ray
+    except ImportError:
+        raise ConfigError("ray is not installed; pip install 'graspd[dataset]'") from None
+    return ray
+
+
+def pickled_hand(block: Block) -> bytes:
+    """The hand of a block as its process takes it."""
+    from graspd_core.hands.library import load_hand
+
+    return pickle.dumps(load_hand(block.hand, candidates=block.config.problem.fine_candidates))
+
+
+def object_job(thing: DatasetObject, config: PlanConfig) -> Job:
+    """An object as a worker takes it."""
+    return Job(thing.key, {"object": thing.source, **thing.asked}, pickle.dumps((thing, config)))
+
+
+def block_job(block: Block) -> Job:
+    """A block as a worker takes it."""
+    asked = {"object": block.object.source, "hand": block.hand, **block.asked}
+    return Job(block.key, asked, pickle.dumps(block), block.hand_name)
+
+
+class RayEngine:
+    """Submits blocks and objects to Ray, and says what came of them.
+
+    Args:
+        ray: the module, connected.
+        store: where files go.
+        limits: of a block and of an object.
+        ship: whether the content of mesh files goes along: to a cluster whose nodes may not see them.
+    """
+
+    def __init__(self, ray: Any, store: DatasetStore, limits: Limits, *, ship: bool) -> None:
+        self._ray, self._store, self._limits, self._ship = ray, store, limits, ship
+        self._hands: dict[str, Any] = {}
+        options = {"num_cpus": 1, "max_retries": _RETRIES, "retry_exceptions": False}
+        self._prepare = ray.remote(**options, num_returns=2)(prepare_object)
+        self._run = ray.remote(**options)(run_block)
+
+    def slots(self) -> int:
+        """How many tasks run at a time."""
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def submit_object(self, thing: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
+        """A handle of the report, and one of what the object's blocks share."""
+        shape = thing.source.startswith("shape:")
+        content = Path(thing.source).read_bytes() if self._ship and not shape else None
+        return tuple(self._prepare.remote(object_job(thing, config), content, self._store, self._limits))
+
+    def submit_block(self, block: Block, shared: Any) -> Any:
+        """A handle of the report."""
+        if block.hand_content not in self._hands:
+            self._hands[block.hand_content] = self._ray.put(pickled_hand(block))
+        return self._run.remote(block_job(block), self._hands[block.hand_content], shared, self._store, self._limits)
+
+    def wait(self, handles: Sequence[Any], seconds: float) -> list[Any]:
+        """Those that have ended, as soon as one has."""
+        return self._ray.wait(list(handles), num_returns=1, timeout=seconds)[0]
+
+    def report(self, handle: Any, key: str) -> Report:
+        """What came of it; lost where its workers or nodes were, more often than it is run again.
+
+        Raises:
+            StorageError: its file could not be written.
+        """
+        from ray.exceptions import RayError, RayTaskError
+
+        try:
+            return self._ray.get(handle)
+        except RayTaskError as error:
+            raise (error.cause if isinstance(error.cause, GraspdError) else error) from None
+        except RayError as error:
+            return Report(key, failed="lost", error=" ".join(str(error).split())[:300])

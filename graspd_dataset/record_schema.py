@@ -1,0 +1,122 @@
+"""The columns of a data set, one row each: the Parquet schema and the table of docs/dataset.md follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from graspd_bench.tables import markdown_table
+from graspd_core.verify.metrics import METRICS
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column.
+
+    Attributes:
+        name: of the column.
+        kind: of its values: string, int32, int64, double, double[3], double[4], double[], string[], contacts or trials.
+        description: with units and frame.
+    """
+
+    name: str
+    kind: str
+    description: str
+
+
+def _posture(stage: str, what: str) -> tuple[Column, ...]:
+    return (
+        Column(f"{stage}_position", "double[3]", f"{what}: origin of the hand's base link, object frame [m]"),
+        Column(f"{stage}_quaternion_wxyz", "double[4]", f"{what}: unit quaternion of the base link, object frame"),
+        Column(f"{stage}_joint_positions", "double[]", f"{what}: in the order of `joint_names` [rad] or [m]"),
+    )
+
+
+_BEFORE = (
+    Column("block", "string", "key of the block: the name of its file"),
+    Column("row", "int32", "place in the block: verified grasps first"),
+    Column("object_sha256", "string", "content of the cleaned, scaled mesh: the name of its file in `objects/`"),
+    Column("object_source", "string", "shape:NAME or the mesh file"),
+    Column("scale", "double", "factor on the file's coordinates"),
+    Column("mass", "double", "of the object [kg]"),
+    Column("friction", "double", "Coulomb coefficient between hand and object"),
+    Column("hand_name", "string", "the hand"),
+    Column("hand_sha256", "string", "content of its URDF and description"),
+    Column("joint_names", "string[]", "all joints, coupled ones too"),
+    Column("method", "string", "that searched"),
+    Column("preset", "string", "name of the settings; the file's metadata has them all"),
+    Column("verify", "string", "the trials: standard, hard, full, hard_full or none"),
+    Column("seed", "int64", "of the plan"),
+    Column("code", "string", "version of graspd, and a hash of its sources"),
+    Column("verdict", "string", "verified, failed, or unverified"),
+    Column("reason", "string", "why the first failed trial failed; empty without one"),
+    Column("score", "double", "the optimiser's own measure before any trial; larger is better"),
+    Column("probability", "double", "of holding, where cameras saw the object; else null"),
+    *_posture("pregrasp", "open and clear of the object"),
+    *_posture("grasp", "the fingers just touch"),
+    *_posture("squeeze", "targets that press"),
+    Column("contacts", "contacts", "a touching link each: `link`, `position` [m] and outward `normal`, object frame"),
+    Column("trials", "trials", "in their order: `name`, `passed`, `displacement` [m], `rotation` [rad], `reason`"),
+)
+
+
+def columns() -> tuple[Column, ...]:
+    """All columns: one for every metric of the registry among them."""
+    metrics = (
+        Column(f"metric_{row.key}", "double", f"{row.name.replace('_', ' ')} (docs/metrics.md); null: not measured")
+        for row in METRICS.values()
+    )
+    return (*_BEFORE, *metrics)
+
+
+def arrow_schema() -> Any:
+    """The pyarrow schema."""
+    import pyarrow as pa
+
+    vector = pa.list_(pa.float64(), 3)
+    kinds = {
+        "string": pa.string(),
+        "int32": pa.int32(),
+        "int64": pa.int64(),
+        "double": pa.float64(),
+        "double[3]": vector,
+        "double[4]": pa.list_(pa.float64(), 4),
+        "double[]": pa.list_(pa.float64()),
+        "string[]": pa.list_(pa.string()),
+        "contacts": pa.list_(pa.struct([("link", pa.string()), ("position", vector), ("normal", vector)])),
+        "trials": pa.list_(
+            pa.struct(
+                [
+                    ("name", pa.string()),
+                    ("passed", pa.bool_()),
+                    ("displacement", pa.float64()),
+                    ("rotation", pa.float64()),
+                    ("reason", pa.string()),
+                ]
+            )
+        ),
+    }
+    return pa.schema([pa.field(column.name, kinds[column.kind]) for column in columns()])
+
+
+def object_schema() -> Any:
+    """The pyarrow schema of the files in `objects/`: one row an object, lengths in metres."""
+    import pyarrow as pa
+
+    return pa.schema(
+        [
+            ("object_sha256", pa.string()),
+            ("volume", pa.float64()),
+            ("radius", pa.float64()),
+            ("center_of_mass", pa.list_(pa.float64(), 3)),
+            ("vertices", pa.list_(pa.list_(pa.float64(), 3))),
+            ("faces", pa.list_(pa.list_(pa.int64(), 3))),
+        ]
+    )
+
+
+def schema_table() -> str:
+    """The columns in Markdown, for docs/dataset.md."""
+    return markdown_table(
+        ("column", "type", "what it holds"), [(f"`{c.name}`", c.kind, c.description) for c in columns()]
+    )

@@ -1,0 +1,204 @@
+"""What a command asked for and what it took, beside the data; and the data card that is made of it.
+
+The blocks that are missing, a bounded number at a time: objects made ready ahead, nothing done twice.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import date
+from typing import Any
+
+from graspd_bench.result_store import code_version, commit
+from graspd_core.errors import ConfigError
+from graspd_dataset.blocks import FORMAT, SCHEMA_VERSION, Block, DatasetObject, DatasetRequest, by_object, content_key
+from graspd_dataset.dataset_store import DatasetStore, keys_below
+from graspd_dataset.guarded_calls import Report
+from graspd_dataset.inspect_dataset import DatasetStats, reason_lines, stats_table
+from graspd_dataset.ray_engine import RayEngine
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One command over all its sessions.
+
+    Attributes:
+        command: that can be typed again.
+        code, commit: that ran.
+        made: days.
+        machine: cores, kind and Python.
+        blocks: that it asks for.
+        done: blocks written.
+        cpu: seconds in the processes of blocks.
+        wall: seconds.
+        peak_mb: greatest peak of a process of blocks.
+    """
+
+    command: str
+    code: str
+    commit: str
+    made: str
+    machine: str
+    blocks: int
+    done: int = 0
+    cpu: float = 0.0
+    wall: float = 0.0
+    peak_mb: float = 0.0
+
+    @property
+    def path(self) -> str:
+        return f"runs/{content_key([self.command, self.code])}.json"
+
+
+def command_of(request: DatasetRequest, out: str) -> str:
+    """The command that asks for it, in as few words as it takes."""
+    usual, words = DatasetRequest(request.objects), ["graspd", "dataset", *request.objects]
+    for item in fields(request):
+        value = getattr(request, item.name)
+        if item.name == "objects" or value == getattr(usual, item.name):
+            continue
+        several = value if isinstance(value, tuple) else (value,)
+        words += [f"--{item.name.replace('_', '-')}", *(f"{v:g}" if isinstance(v, float) else str(v) for v in several)]
+    return shlex.join([*words, "--out", out])
+
+
+def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_code: bool = False) -> RunRecord:
+    """The record of this command, as earlier sessions left it.
+
+    Raises:
+        ConfigError: other code made what is there, and that is not wanted.
+    """
+    code = code_version()
+    records = run_records(store)
+    others = sorted({record.code for record in records} - {code})
+    if others and not any_code:
+        raise ConfigError(
+            f"{store.shown}: made by code {others[0]}, this is {code}; --any-code adds to it all the same"
+        )
+    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+    new = RunRecord(command_of(request, store.shown), code, commit(), date.today().isoformat(), machine, blocks)
+    return next((replace(record, blocks=blocks) for record in records if record.path == new.path), new)
+
+
+def write_run(store: DatasetStore, record: RunRecord) -> None:
+    """Keep it."""
+    told = {"format": FORMAT, "version": SCHEMA_VERSION, **asdict(record)}
+    store.write(record.path, (json.dumps(told, indent=1) + "\n").encode())
+
+
+def run_records(store: DatasetStore) -> list[RunRecord]:
+    """Those of a data set."""
+    names = {item.name for item in fields(RunRecord)}
+    told = [json.loads(store.read(path)) for path in store.list("runs")]
+    return [RunRecord(**{key: value for key, value in record.items() if key in names}) for record in told]
+
+
+def data_card(store: DatasetStore, stats: DatasetStats) -> str:
+    """README.md of a data set: what is in it, how it was made, what may be done with it."""
+    records = run_records(store)
+    own = all(word.startswith("shape:") for record in records for word in _objects(record.command))
+    cpu, done = sum(r.cpu for r in records), sum(r.done for r in records)
+    front = {"license": "apache-2.0" if own else "other", "tags": ["robotics", "grasping"]}
+    lines = [
+        "---",
+        *(f"{key}: {json.dumps(value)}" for key, value in front.items()),
+        "configs:",
+        "- {config_name: grasps, data_files: 'grasps/*/*/*.parquet', default: true}",
+        "- {config_name: objects, data_files: 'objects/*.parquet'}",
+        "---",
+        "",
+        "# Grasps by graspd",
+        "",
+        f"{stats.rows} grasps that were tried in MuJoCo, {stats.size / 2**20:.1f} MB. A row is a candidate, failed",
+        "ones included: three postures, contacts, metrics, every trial's figures, the verdict and its reason.",
+        f"The columns are described in graspd's docs/dataset.md (schema version {SCHEMA_VERSION}).",
+        "",
+        stats_table(stats),
+        "",
+        "Why grasps failed:",
+        "",
+        *(f"- {line}" for line in reason_lines(stats)),
+        "",
+        "## How it was made",
+        "",
+        *(f"    {record.command}\n" for record in records),
+        *(f"- {r.made}, code {r.code}, commit {r.commit or 'unknown'}; {r.machine}" for r in records),
+        f"- {done} blocks in {cpu / 3600:.2f} CPU hours; at most {max((r.peak_mb for r in records), default=0):.0f} MB "
+        "a process",
+        "",
+        "## What it is not",
+        "",
+        "No grasp was tried on a robot. Verified means that it held in simulation, with the mass and friction of",
+        "its row.",
+        "",
+        "## Licence",
+        "",
+        _LICENCE[own],
+        "",
+    ]
+    return "\n".join(lines)
+
+
+_LICENCE = {
+    True: "Apache-2.0; the objects are shapes of graspd.",
+    False: "The grasps: Apache-2.0. Meshes in `objects/` that are not shapes of graspd: as their owners say.",
+}
+
+
+def _objects(command: str) -> list[Any]:
+    """Those that a command names."""
+    words = shlex.split(command)[2:]
+    return words[: next(i for i, word in enumerate(words) if word.startswith("--"))]
+
+
+# How often a stop is looked for [s].
+_POLL = 0.5
+# Blocks submitted for every one that runs: the next is there when one ends, and a stop drops few.
+_AHEAD = 2
+
+
+def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed: bool = False) -> list[Block]:
+    """The blocks whose file is not there, by listing; those that failed, or whose object did, only where asked for."""
+    there = keys_below(store, "grasps")
+    failed = set() if retry_failed else keys_below(store, "failed")
+    return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
+
+
+def run_blocks(
+    blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[Block | DatasetObject, Report]]:
+    """Run blocks and yield each with its report as it ends; objects that fail too, their blocks are dropped then.
+
+    Raises:
+        StorageError: a file could not be written; what was written before stays.
+    """
+    waiting = deque(by_object(blocks))
+    preparing: dict[Any, tuple[DatasetObject, list[Block], Any]] = {}
+    ready: deque[tuple[Block, Any]] = deque()
+    running: dict[Any, Block] = {}
+    while (waiting or preparing or ready or running) and not stop():
+        slots = engine.slots()
+        while waiting and len(preparing) < slots and len(preparing) + len(ready) < _AHEAD * slots:
+            thing, own = waiting.popleft()
+            handle, shared = engine.submit_object(thing, own[0].config)
+            preparing[handle] = thing, own, shared
+        while ready and len(running) < _AHEAD * slots:
+            block, shared = ready.popleft()
+            running[engine.submit_block(block, shared)] = block
+        for handle in engine.wait([*preparing, *running], _POLL):
+            if handle in running:
+                block = running.pop(handle)
+                yield block, engine.report(handle, block.key)
+                continue
+            thing, own, shared = preparing.pop(handle)
+            report = engine.report(handle, thing.key)
+            if report.failed:
+                yield thing, report
+            else:
+                ready.extend((block, shared) for block in own)

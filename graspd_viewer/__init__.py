@@ -1,0 +1,1 @@
+"""Grasps in a browser."""

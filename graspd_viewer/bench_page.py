@@ -1,0 +1,200 @@
+"""A benchmark as one page: speed against accuracy, and behind every point the runs and the grasps that made it.
+
+One file that needs no network and no library. Results keep figures of grasps, not their postures: a run that a visitor
+asks for is planned again with its own settings and seed, which finds the same grasps.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import shlex
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.charts import PANELS, Point, points_of
+from graspd_bench.figures import Row, by_name, is_preset, per_verified, rows
+from graspd_bench.result_store import read_results
+from graspd_bench.study import Record
+from graspd_core.errors import ConfigError, FormatError
+from graspd_core.hands.library import load_hand
+from graspd_core.mesh.shapes import SHAPES
+from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.loop import Hooks
+from graspd_core.optimize.plan_config import METHODS, plan_config
+from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
+from graspd_core.perception.scene import object_parts
+from graspd_core.types import StopHook, Verdict
+from graspd_core.verify.metrics import measure
+from graspd_core.verify.prepared_grasp import make_metrics_context
+from graspd_core.verify.trial_registry import build_worlds, grasp_trials
+from graspd_core.verify.world import PROTOCOLS
+from graspd_viewer.server import may_connect
+from graspd_viewer.session import Session, make_session
+
+Tell = Callable[[str, float], None]
+_TIMES = {"cpu_per_grasp": "CPU seconds per raw grasp", "cpu_per_verified": "CPU seconds per verified grasp"}
+# Of one grasp's record: what is shown, from which part, times what.
+_FIGURES = (
+    ("penetration mm", "penetration", 1e3, 2),
+    ("contact area cm²", "contact_area", 1e4, 1),
+    ("ε", "epsilon", 1, 3),
+)
+
+
+def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
+    """The page of a benchmark's folder, and its runs of raw grasps by key: who serves the page shows their grasps.
+
+    Raises:
+        FormatError: the folder has no results that can be read, or none of a preset.
+    """
+    records = read_results(folder / "results.json")
+    try:
+        raw = [r for r in records if r.get("kind") == "raw" and not r["error"] and is_preset(r["name"])]
+        data, runs = {**page_data(raw), "served": served}, {record["key"]: record for record in raw}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
+    if not data["panels"]:
+        raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
+    # Within a script only this sequence could end it.
+    text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
+    return _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text), runs
+
+
+def page_data(runs: Sequence[Record]) -> dict[str, Any]:
+    """What the page's script draws: panels of points, and the runs of every name."""
+    presets = by_name(rows(runs))
+    panels = [
+        {
+            "time": label, "label": panel.label, "log": panel.log,
+            "points": [_point(point, time, presets[point.name]) for point in points_of(presets, time, panel)],
+        }
+        for time, label in _TIMES.items()
+        for panel in PANELS
+    ]  # fmt: skip
+    return {"panels": [panel for panel in panels if panel["points"]], "runs": [_run(record) for record in runs]}
+
+
+def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
+    method, (low, middle, high) = METHODS[point.method], point.x
+    if time == "cpu_per_verified":  # as the tables have it, all objects together
+        middle = per_verified(group)
+    x = (low, middle, high)
+    return {"name": point.name, "colour": method.colour, "method": method.label, "x": x, "y": point.y}
+
+
+def _run(record: Record) -> dict[str, Any]:
+    words = ["graspd", "synthesize", _source(record), "--hand", record["hand"], "--preset", record["name"]]
+    words += ["--seed", str(record["seed"]), "-n", str(record["count"]), "--view"]
+    return {
+        **{name: record[name] for name in ("name", "key", "object", "seed", "count", "held")},
+        "command": shlex.join(words), "grasps": [_grasp(grasp) for grasp in record["grasps"]],
+    }  # fmt: skip
+
+
+def _source(record: Record) -> str:
+    # Of a file only the name is kept.
+    return f"{SHAPE_PREFIX}{record['object']}" if record["object"] in SHAPES else record["object"]
+
+
+def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
+    measured, tried = grasp.get("metrics") or {}, grasp.get("standard") or {}
+    values = [(name, measured.get(key), scale, digits) for name, key, scale, digits in _FIGURES]
+    figures = {name: f"{value * scale:.{digits}f}" for name, value, scale, digits in values if value is not None}
+    return {"held": bool(tried.get("passed")), "reason": str(tried.get("reason", "")), "figures": figures}
+
+
+def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop: StopHook) -> None:
+    """Find a run's grasps anew, try and measure them, and show them.
+
+    Raises:
+        GraspdError: an object or a hand that is not here.
+    """
+    config = plan_config(record["settings"], f"settings of {record['name']}")
+    hand = load_hand(record["hand"], candidates=config.problem.fine_candidates)
+    scene = load_scene(_source(record), resolution=config.resolution)
+    title = f"{record['name']}, {record['object']}, seed {record['seed']}"
+    session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
+    show(session)
+    count, hooks = record["count"], Hooks(lambda step, of, _: tell(f"searching {step} of {of}", step / of), stop)
+    found = find_candidates(scene, hand, count=count, seed=record["seed"], config=config, hooks=hooks).grasps[:count]
+    worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
+    context, grasps = make_metrics_context(scene.object, hand), []
+    for grasp in found:
+        if stop():
+            break
+        tell(f"trying {len(grasps)} of {len(found)}", len(grasps) / len(found))
+        trials = grasp_trials(worlds, grasp, stop)
+        grasps.append(replace(grasp, trials=trials, metrics=measure(context, grasp.grasp)))
+    held = sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps)
+    line = f"{held} of {count} held; {record['held']} did in the benchmark, by graspd {record.get('code')}"
+    show(make_session(title, hand, tuple(grasps), scene, config, session.seen, (line,)))
+    tell(line, 1.0)
+
+
+@contextmanager
+def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | None]) -> Iterator[str]:
+    """Serve one page, whatever is asked for, until the end.
+
+    Args:
+        page: HTML.
+        host, port: to listen on.
+        open_run: has the grasps of a run shown, by its key, and says on which port; None where there is no such run.
+
+    Raises:
+        ConfigError: the address cannot be had.
+    """
+    handler = partial(_OnePage, page.encode(), host, open_run)
+    try:
+        server = ThreadingHTTPServer((host, port), handler)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"{host}:{port} cannot be listened on ({error}); choose another with --host and --port"
+        ) from None
+    thread = threading.Thread(target=server.serve_forever, name="graspd-page", daemon=True)
+    thread.start()
+    try:
+        yield f"http://{host}:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class _OnePage(BaseHTTPRequestHandler):
+    def __init__(self, content: bytes, host: str, open_run: Callable[[str], int | None], *arguments: Any) -> None:
+        self._content, self._host, self._open_run = content, host, open_run
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html; charset=utf-8")
+        self.send_header("Content-Length", str(len(self._content)))
+        self.end_headers()
+        self.wfile.write(self._content)
+
+    def do_POST(self) -> None:
+        """Show the grasps of a run and send the visitor there; a page of another site may not ask."""
+        named = self.headers.get("Host", "")
+        allowed = may_connect(self.headers.get("Origin"), named, self._host)
+        port = self._open_run(self.path.rpartition("/")[2]) if allowed else None
+        if port is None:
+            self.send_error(404 if allowed else 403)
+            return
+        self.send_response(303)
+        self.send_header("Location", f"http://{named.rpartition(':')[0] or named}:{port}")
+        self.end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        del format, args
+
+
+_PAGE = (Path(__file__).parent / "bench_page.html").read_text(encoding="utf-8")

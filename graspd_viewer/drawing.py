@@ -1,0 +1,248 @@
+"""What is drawn, as plain meshes: the browser (`scene_nodes`) and the docs (`pictures`) show the same.
+
+What a grasp does to its object: the forces of its squeeze, and the push that it resists least.
+
+Where the hand is on its way: from the retreat over the pregrasp and the grasp to the squeeze.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, primitive_mesh
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.optimize.grasp_postures import find_contacts, squeeze
+from graspd_core.optimize.loop import Poses
+from graspd_core.optimize.problem import build_problem
+from graspd_core.perception.scene import ObjectModel, Scene, sample_confidence
+from graspd_core.se3 import SE3, perpendicular, quaternion_from_rotation, rotation_from_quaternion
+from graspd_core.types import Contact, Grasp, Plane, Posture, Snapshot, TriangleMesh, Verdict
+from graspd_core.verify.lift_trial import retreat_posture
+from graspd_core.verify.prepared_grasp import make_metrics_context, prepare_grasp
+from graspd_viewer.session import Session
+
+Colour = tuple[float, float, float]
+OBJECT, GUESSED, HAND = (0.85, 0.55, 0.25), (0.80, 0.45, 0.65), (0.40, 0.50, 0.68)
+SEEN = (0.12, 0.43, 0.24)
+SUPPORT, NEIGHBOUR = (0.70, 0.72, 0.75), (0.55, 0.58, 0.50)
+NORMAL, FORCE, WEAKEST, TURN = (0.15, 0.45, 0.95), (0.90, 0.20, 0.25), (0.75, 0.15, 0.80), (0.95, 0.70, 0.10)
+VERDICTS = {
+    Verdict.VERIFIED: (0.15, 0.65, 0.30),
+    Verdict.UNVERIFIED: (0.60, 0.62, 0.66),
+    Verdict.FAILED: (0.85, 0.20, 0.20),
+}
+# Arrows: a contact's normal [m], metres per newton of a force; of a push radii of the object, so that it comes out.
+NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.008, (1.1, 0.7)
+_SHAFT, _SLICE = 0.0012, 96
+
+
+@dataclass(frozen=True)
+class Part:
+    """One mesh of one colour (RGB, 0 to 1) in its frame [m]."""
+
+    name: str
+    mesh: TriangleMesh
+    colour: Colour
+    opacity: float = 1.0
+
+
+def hand_parts(hand: HandModel) -> dict[int, Part]:
+    """The solids of every link that has any, by link number, link frame."""
+    parts = {}
+    for link, primitives in enumerate(hand.primitives_of):
+        if primitives:
+            mesh = joined([primitive_mesh(primitive) for primitive in primitives])
+            parts[link] = Part(f"hand/{link}", mesh, HAND)
+    return parts
+
+
+def scene_parts(scene: Scene) -> list[Part]:
+    """The object, what was seen of it and what was guessed, and what stands around it."""
+    mesh, parts = scene.object.mesh, []
+    if scene.confidence is None:
+        parts.append(Part("object/known", mesh, OBJECT))
+    else:
+        middles = torch.as_tensor(mesh.vertices[mesh.faces].mean(1)).to(scene.sdf.field)
+        seen = sample_confidence(scene.confidence, scene.sdf, middles[None])[0].numpy() >= 0.5
+        parts.append(Part("object/seen", TriangleMesh(mesh.vertices, mesh.faces[seen]), OBJECT))
+        parts.append(Part("object/guessed", TriangleMesh(mesh.vertices, mesh.faces[~seen]), GUESSED))
+    if scene.support is not None:
+        parts.append(Part("around/support", _square(scene.support, mesh), SUPPORT, 0.6))
+    parts += [Part(f"around/neighbour{i}", o.mesh, NEIGHBOUR, 0.8) for i, o in enumerate(scene.obstacles)]
+    return [part for part in parts if len(part.mesh.faces)]
+
+
+def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
+    """An arrow along the object's outward normal from every contact."""
+    if not contacts:
+        return []
+    starts = np.array([contact.position for contact in contacts])
+    ends = starts + NORMAL_LENGTH * np.array([contact.normal for contact in contacts])
+    return [Part("contacts", arrows(starts, ends), NORMAL)]
+
+
+def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "n 3"]) -> list[Part]:
+    """An arrow for every force on the object [N], which ends where the force acts."""
+    strong = np.linalg.norm(forces, axis=1) > 0.02
+    if not strong.any():
+        return []
+    tips = positions[strong]
+    return [Part("forces", arrows(tips - FORCE_LENGTH * forces[strong], tips), FORCE)]
+
+
+def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
+    """The push that a grasp resists least: its force at the centre of mass, and the axis that it turns about."""
+    center, parts = target.center_of_mass, []
+    for name, way, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
+        share = float(np.linalg.norm(way))
+        if share > 0.05:
+            length = target.radius * (PUSH_LENGTH[0] + PUSH_LENGTH[1] * share)
+            parts.append(Part(name, arrows(center[None], (center + length * way / share)[None], 1.5 * _SHAFT), colour))
+    return parts
+
+
+def sdf_slice(
+    scene: Scene, axis: int, share: float
+) -> tuple[UInt8[np.ndarray, "rows columns 3"], Float[np.ndarray, "3"]]:
+    """The signed distance on a plane square to an axis, `share` of the grid along it, and the plane's middle [m].
+
+    Blue is inside, red outside, white at the surface; the picture's rows and columns are `slice_axes`.
+    """
+    sdf = scene.sdf
+    low = sdf.origin.double().cpu().numpy()
+    size = 2 * sdf.half.double().cpu().numpy()
+    down, right = slice_axes(axis)
+    grid = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, _SLICE)] * 2, indexing="ij"), -1)
+    at = np.empty((_SLICE, _SLICE, 3))
+    at[..., axis] = low[axis] + share * size[axis]
+    at[..., down] = low[down] + grid[..., 0] * size[down]
+    at[..., right] = low[right] + grid[..., 1] * size[right]
+    points = torch.as_tensor(at.reshape(-1, 3)).to(sdf.field)
+    distance = sample_sdf(sdf, points)[0].reshape(_SLICE, _SLICE).cpu().numpy()
+    fade = (np.abs(distance) / max(float(np.abs(distance).max()), 1e-9))[..., None] ** 0.5
+    far = np.where(distance[..., None] < 0, (0.15, 0.35, 0.85), (0.85, 0.30, 0.20))
+    return (255 * (1 - fade * (1 - far))).astype(np.uint8), low + size * np.where(np.arange(3) == axis, share, 0.5)
+
+
+def slice_axes(axis: int) -> tuple[int, int]:
+    """The axes that the rows and the columns of a slice square to `axis` run along."""
+    return (axis + 2) % 3, (axis + 1) % 3
+
+
+def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], radius: float = _SHAFT) -> TriangleMesh:
+    """Arrows as closed bodies: a shaft, and a head of three times its radius."""
+    import trimesh
+
+    bodies = []
+    for start, end in zip(starts, ends, strict=True):
+        length = float(np.linalg.norm(end - start))
+        head = min(5 * radius, 0.6 * length)
+        shaft = trimesh.creation.cylinder(radius=radius, height=length - head, sections=6)
+        cone = trimesh.creation.cone(radius=3 * radius, height=head, sections=8)
+        along = (end - start) / max(length, 1e-12)
+        side = perpendicular(along)
+        turn = np.column_stack([side, np.cross(along, side), along])
+        for body, offset in ((shaft, 0.5 * (length - head)), (cone, length - head)):
+            local = np.asarray(body.vertices) + np.array([0.0, 0.0, offset])
+            bodies.append(TriangleMesh(local @ turn.T + start, np.asarray(body.faces, dtype=np.int64)))
+    return joined(bodies)
+
+
+def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """All of them as one."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
+    """A square piece of the support below the object, three times as wide as that."""
+    middle = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
+    middle = middle + (support.offset - support.normal @ middle) * support.normal
+    side = perpendicular(support.normal)
+    other = np.cross(support.normal, side)
+    half = 1.5 * float(np.ptp(mesh.vertices, axis=0).max())
+    corners = middle + half * np.array([-side - other, side - other, side + other, other - side])
+    return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@dataclass(frozen=True)
+class SqueezeForces:
+    """Where a squeeze presses on the object [m], and with what force [N], as it was planned."""
+
+    positions: Float[np.ndarray, "contacts 3"]
+    forces: Float[np.ndarray, "contacts 3"]
+
+
+class Mechanics:
+    """Answers for the grasps of a session, which has a scene; what they share is prepared once."""
+
+    def __init__(self, session: Session) -> None:
+        assert session.scene is not None
+        self._hand, self._config = session.hand, session.config
+        self._problem = build_problem(session.scene, session.hand, session.config.problem, seed=0)
+        self._metrics = make_metrics_context(session.scene.object, session.hand)
+
+    def squeeze_forces(self, grasp: Grasp) -> SqueezeForces:
+        """The balanced contact forces that the squeeze was made from."""
+        posture = grasp.grasp
+        rows = (posture.position, posture.quaternion_wxyz, posture.joint_positions)
+        poses = Poses(*(torch.as_tensor(row)[None].to(self._problem.hand.lower) for row in rows))
+        contacts = find_contacts(self._problem, poses, self._config.grasp_stages.touch_reach)
+        effort = torch.as_tensor(self._hand.effort).to(self._problem.hand.lower)
+        forces = squeeze(self._problem, poses, contacts, effort, self._config.grasp_stages).forces[0]
+        pressing = contacts.active[0] & (forces.norm(dim=-1) > 0)
+        return SqueezeForces(contacts.position[0][pressing].double().numpy(), forces[pressing].double().numpy())
+
+    def weakest_push(self, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
+        """The unit disturbance (force, torque over the object's radius) that the contacts resist least.
+
+        None where the contacts do not close around the object: there is a push that they do not resist at all.
+        """
+        return prepare_grasp(self._metrics, grasp.grasp).weakest_push
+
+
+STAGES = ("retreat", "pregrasp", "grasp", "squeeze")
+
+
+def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
+    """The posture at `at`, 0 for the retreat to 3 for the squeeze; between two stages on the straight way."""
+    stages = (retreat_posture(hand, grasp.pregrasp), grasp.pregrasp, grasp.grasp, grasp.squeeze)
+    first = min(max(int(at), 0), len(stages) - 2)
+    share = min(max(at - first, 0.0), 1.0)
+    start, end = stages[first], stages[first + 1]
+    # The shorter way round: a quaternion and its negative are the same rotation.
+    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
+    quaternion = (1 - share) * start.quaternion_wxyz + share * sign * end.quaternion_wxyz
+    return Posture(
+        (1 - share) * start.position + share * end.position,
+        quaternion / np.linalg.norm(quaternion),
+        (1 - share) * start.joint_positions + share * end.joint_positions,
+    )
+
+
+def placed_links(
+    hand: HandModel, posture: Posture
+) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links 4"]]:
+    """Position [m] and quaternion (wxyz) of every link in the object's frame."""
+    rotations, translations = link_poses(hand, posture.joint_positions)
+    base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz).double()).numpy()
+    quaternions = quaternion_from_rotation(torch.as_tensor(base @ rotations)).numpy()
+    return translations @ base.T + posture.position, quaternions
+
+
+def skeletons(hand: HandModel, seen: Snapshot) -> Float[np.ndarray, "hands bones 2 3"]:
+    """Every hand as lines from each link's origin to its parent's, object frame [m]."""
+    joints = torch.as_tensor(seen.joint_positions).float()
+    links = forward(make_kinematics(hand), joints).translation
+    quaternions = torch.as_tensor(seen.quaternions_wxyz).float()
+    base = SE3(rotation_from_quaternion(quaternions), torch.as_tensor(seen.positions).float())
+    origins = base.apply(links).numpy()
+    ends = np.flatnonzero(hand.link_parent >= 0)
+    return np.stack([origins[:, hand.link_parent[ends]], origins[:, ends]], 2)

@@ -1,0 +1,131 @@
+"""The list of grasps beside the scene: which are in it, in what order, and what is said of them. Pure text and HTML.
+
+Names and reasons come out of files that strangers may have written: nothing of them reaches the page unescaped.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+
+from graspd_core.types import Grasp, Verdict
+from graspd_core.verify.metrics import METRICS
+from graspd_viewer.drawing import VERDICTS
+
+ALL = "all"
+# What is unverified although it was tried: it holds on the likeliest shape, and is not as sure as was asked for.
+LESS_SURE = "less sure"
+FILTERS = (ALL, "verified", LESS_SURE, "unverified", "failed")
+# Metrics of which less is better; of all others more is.
+_LESS = ("penetration", "self_penetration", "intersection_volume")
+ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
+# Columns of the table, and how many rows are shown about the chosen one.
+_COLUMNS, _AROUND = ("epsilon", "penetration", "contact_area"), 2
+BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
+_OTHER_FIGURES = {
+    "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",
+    "probability": "of holding on the true object, where cameras saw it",
+    "displacement": "farthest that the object's centre of mass moved in the trial, until the answer was known",
+    "rotation": "farthest that the object turned in the trial",
+}
+
+
+def standing(grasp: Grasp) -> str:
+    """What is known of a grasp, for people: its verdict, or that it is less sure; one of the filters."""
+    return LESS_SURE if grasp.verdict is Verdict.UNVERIFIED and grasp.trials else str(grasp.verdict)
+
+
+def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
+    """Ranks of the grasps that pass a filter, best first by an order; what lacks the figure comes last.
+
+    An unknown filter or order, which only a forged message can hold, counts as the first.
+    """
+    ranks = [rank for rank, grasp in enumerate(grasps) if which not in FILTERS[1:] or standing(grasp) == which]
+
+    def place(rank: int) -> tuple[bool, float]:
+        value = _value(grasps[rank], rank, by)
+        return (True, 0.0) if value is None else (False, value)
+
+    return sorted(ranks, key=place)
+
+
+def _value(grasp: Grasp, rank: int, by: str) -> float | None:
+    """What a grasp is sorted by, less first; None where it has no such figure."""
+    if by == "score":
+        return -grasp.score
+    if by == "probability":
+        return None if grasp.probability is None else -grasp.probability
+    if by == "displacement":
+        return max((t.displacement for t in grasp.trials if math.isfinite(t.displacement)), default=None)
+    value = (grasp.metrics or {}).get(by) if by in METRICS else float(rank)
+    return value if value is None or by in _LESS or by == "rank" or by not in METRICS else -value
+
+
+def label(grasp: Grasp, rank: int) -> str:
+    """One line for the list of choices."""
+    said = standing(grasp)
+    mark = {"verified": "✓", LESS_SURE: "~", "failed": "✗"}.get(said, "·")
+    return f"{mark} #{rank} {said}{_likely(grasp, ', ')}, {len(grasp.contacts)} contacts"
+
+
+def _likely(grasp: Grasp, before: str) -> str:
+    return "" if grasp.probability is None else f"{before}{100 * grasp.probability:.0f} %"
+
+
+def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:
+    """The rows of the list about the chosen one."""
+    if not ranks:
+        return "<i>no grasp passes this filter</i>"
+    middle = ranks.index(chosen) if chosen in ranks else 0
+    first = max(0, min(middle - _AROUND, len(ranks) - 2 * _AROUND - 1))
+    head = "".join(f"<th>{html.escape(METRICS[name].title)}</th>" for name in _COLUMNS)
+    rows = [_row(grasps[rank], rank, rank == chosen) for rank in ranks[first : first + 2 * _AROUND + 1]]
+    said = [standing(grasp) for grasp in grasps]
+    counts = ", ".join(f"{said.count(word)} {word}" for word in FILTERS[1:] if word in said)
+    return (
+        f"{BLOCK}{middle + 1} of {len(ranks)} shown ({counts})"
+        f"<table style='width:100%;text-align:right'><tr><th>#</th><th></th>{head}</tr>{''.join(rows)}</table></div>"
+    )
+
+
+def figures_html(grasp: Grasp, rank: int) -> str:
+    """All that is known of one grasp, each figure with what it means."""
+    r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
+    reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
+    head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"
+    figures = []
+    if grasp.probability is not None:
+        figures.append(_figure("probability", _likely(grasp, ""), _OTHER_FIGURES["probability"]))
+    for trial in grasp.trials:
+        if math.isfinite(trial.displacement) and math.isfinite(trial.rotation):
+            name = html.escape(trial.name)
+            travel, turn = f"{1e3 * trial.displacement:.1f} mm", f"{math.degrees(trial.rotation):.1f}°"
+            figures += [
+                _figure(f"{name} displacement", travel, _OTHER_FIGURES["displacement"]),
+                _figure(f"{name} rotation", turn, _OTHER_FIGURES["rotation"]),
+            ]
+    figures.append(_figure("score", f"{grasp.score:.2f}", _OTHER_FIGURES["score"]))
+    for name, value in (grasp.metrics or {}).items():
+        if value is not None:
+            row = METRICS[name]
+            text = f"{value * row.scale:.{row.digits}f} {row.unit}"
+            figures.append(_figure(row.name.replace("_", " "), text, row.description))
+    links = "touching: " + html.escape(", ".join(contact.link for contact in grasp.contacts) or "nothing")
+    columns = f"<div style='columns:2;column-gap:1em'>{''.join(figures)}</div>"
+    return f"{BLOCK}{head}{columns}{links}</div>"
+
+
+def _figure(name: str, value: str, meaning: str) -> str:
+    said = html.escape(meaning, quote=True)
+    return f"<div title='{said}' style='cursor:help'>{name} <b>{html.escape(value)}</b></div>"
+
+
+def _row(grasp: Grasp, rank: int, chosen: bool) -> str:
+    r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
+    values = [(METRICS[name], (grasp.metrics or {}).get(name)) for name in _COLUMNS]
+    cells = "".join(f"<td>{'–' if v is None else format(v * row.scale, f'.{row.digits}f')}</td>" for row, v in values)
+    back = "background:rgba(130,150,190,0.3)" if chosen else ""
+    return (
+        f"<tr style='{back}'><td>{rank}</td><td style='color:rgb({r},{g},{b})'>●{_likely(grasp, ' ')}</td>{cells}</tr>"
+    )

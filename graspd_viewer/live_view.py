@@ -1,0 +1,74 @@
+"""A run while it plans: starts that move, candidates that drop out, trials that turn green or red."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from graspd_core.hands.model import HandModel
+from graspd_core.types import Progress, Snapshot, Stage, Verdict
+from graspd_viewer.drawing import HAND, VERDICTS, skeletons
+from graspd_viewer.scene_nodes import SceneNodes
+from graspd_viewer.server import LatestJobs
+from graspd_viewer.session import Session
+
+# Least time from one picture to the next [s], and hands in one at most.
+INTERVAL, _MOST_HANDS = 0.2, 256
+_WORDS = {Stage.OPTIMISE: "searching", Stage.VERIFY: "trying"}
+
+
+class LiveView:
+    """Hooks for `plan_grasps`: the planning thread hands over what it has, and the drawing thread draws it.
+
+    Args:
+        jobs: that draw.
+        nodes: that are drawn.
+        told: shows how far the run is: a line, and the share of its stage that is done.
+    """
+
+    def __init__(self, jobs: LatestJobs, nodes: SceneNodes, told: Callable[[str, float], None]) -> None:
+        self._jobs, self._nodes, self._told = jobs, nodes, told
+        self._hand: HandModel | None = None
+        self._origin = np.zeros(3)
+        self._drawn = -float("inf")
+
+    def begin(self, session: Session) -> None:
+        """A run for the hand and the object of a session begins."""
+        self._origin, self._hand = session.origin, session.hand
+
+    def end(self) -> None:
+        """The run is over: what was drawn of it goes."""
+        self._hand = None
+        self._jobs.submit("live", lambda: self._nodes.draw_lines(np.zeros((0, 2, 3)), np.zeros((0, 3))))
+
+    def progress(self, progress: Progress) -> None:
+        """`plan_grasps`'s progress hook."""
+        found = f", {progress.verified} verified" if progress.verified else ""
+        line = f"{_WORDS.get(progress.stage, progress.stage)} {progress.step} of {progress.of}{found}"
+        share = progress.step / progress.of if progress.of else 0.0
+        self._jobs.submit("progress", lambda: self._told(f"{line}, {progress.elapsed:.1f} s", share), self._wait())
+
+    def watch(self, seen: Snapshot) -> None:
+        """`plan_grasps`'s watch hook. Costs the run no more than handing over."""
+        hand = self._hand
+        if hand is not None:
+            self._jobs.submit("live", lambda: self._draw(hand, seen), self._wait())
+
+    def _wait(self) -> float:
+        """How long until the next picture may be drawn [s]."""
+        return max(0.0, self._drawn + INTERVAL - time.monotonic())
+
+    def _draw(self, hand: HandModel, seen: Snapshot) -> None:
+        self._drawn = time.monotonic()
+        if self._hand is not hand:
+            return
+        kept = slice(None, _MOST_HANDS)
+        few = Snapshot(seen.positions[kept] - self._origin, seen.quaternions_wxyz[kept], seen.joint_positions[kept])
+        lines = skeletons(hand, few)
+        verdicts = seen.verdicts[kept] or (None,) * len(lines)
+        tints = np.array([HAND if verdict is None else VERDICTS[Verdict(verdict)] for verdict in verdicts])
+        colours = np.repeat(tints, lines.shape[1], axis=0) if len(lines) else np.zeros((0, 3))
+        self._nodes.show_hand(False)
+        self._nodes.draw_lines(lines.reshape(-1, 2, 3).astype(np.float32), colours)

@@ -1,0 +1,177 @@
+"""The three-dimensional half of the page: what `drawing` makes, as viser's nodes. Used from the drawing thread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.topology import is_closed
+from graspd_core.se3 import perpendicular, quaternion_from_rotation
+from graspd_core.types import Posture, TriangleMesh
+from graspd_viewer.drawing import SEEN, Colour, Part, hand_parts, placed_links, scene_parts, sdf_slice, slice_axes
+from graspd_viewer.session import Session
+
+_MOST_POINTS = 20_000
+# The browser's scene is in centimetres. viser's page holds an empty background one unit before the camera, which takes
+# a software browser a fifth of a frame's time. Nothing is drawn that is nearer than `_NEAR` units.
+PER_METRE, _NEAR = 100.0, 1.01
+
+
+class SceneNodes:
+    """The nodes of one server: one hand, one object and its surroundings, arrows, a slice, and lines."""
+
+    def __init__(self, server: Any) -> None:
+        self._server = server
+        self._links: dict[int, Any] = {}
+        self._groups: dict[str, list[Any]] = {}
+        self._object: Any = None
+        self._hidden: set[str] = set()
+        self._opacity = 1.0
+        # viser's own lights, shadows and reflections bring a browser that draws in software to 1 frame a second.
+        server.initial_camera.near = _NEAR
+        server.scene.configure_default_lights(False)
+        server.scene.configure_environment_map(None)
+        server.scene.add_light_hemisphere(
+            "/light/sky", sky_color=(255, 255, 255), ground_color=(90, 90, 110), intensity=3.0
+        )
+        server.scene.add_light_directional("/light/sun", intensity=1.5, cast_shadow=False, position=(1.0, 1.0, 2.0))
+
+    def show(self, session: Session) -> None:
+        """Draw a session's object and hand anew, and nothing else."""
+        with self._server.atomic():
+            for name in list(self._groups):
+                self.draw(name, ())
+            if self._object is not None:
+                self._object.remove()
+            self._object = self._server.scene.add_frame("/object", show_axes=False)
+            if session.scene is not None:
+                for group in ("object", "around"):
+                    self.draw(group, [p for p in scene_parts(session.scene) if p.name.startswith(group)])
+            self._draw_points(session.seen)
+            self._draw_hand(session.hand)
+        self._aim(session)
+
+    def draw(self, group: str, parts: Sequence[Part]) -> None:
+        """Draw parts in place of those that the group had."""
+        for node in self._groups.pop(group, ()):
+            node.remove()
+        nodes = [self._mesh(f"/{part.name}", part) for part in parts]
+        for node in nodes:
+            node.visible = group not in self._hidden
+        self._groups[group] = nodes
+
+    def draw_lines(self, lines: Float[np.ndarray, "n 2 3"], colours: Float[np.ndarray, "n 3"]) -> None:
+        """Lines in place of those before; none where there are none."""
+        for node in self._groups.pop("lines", ()):
+            node.remove()
+        if len(lines):
+            tints = np.repeat((255 * colours).astype(np.uint8)[:, None], 2, axis=1)
+            node = self._server.scene.add_line_segments(
+                "/lines", PER_METRE * lines, tints, thickness=PER_METRE * 0.0015
+            )
+            self._groups["lines"] = [node]
+
+    def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
+        """The signed distance on a plane square to an axis; None for none."""
+        for node in self._groups.pop("slice", ()):
+            node.remove()
+        if axis is None or session.scene is None:
+            return
+        image, middle = sdf_slice(session.scene, axis, share)
+        size = 2 * PER_METRE * session.scene.sdf.half.double().cpu().numpy()
+        down, right = slice_axes(axis)
+        turn = np.zeros((3, 3))
+        turn[right, 0], turn[down, 1] = 1.0, 1.0
+        turn[:, 2] = np.cross(turn[:, 0], turn[:, 1])
+        node = self._server.scene.add_image(
+            "/slice", image, float(size[right]), float(size[down]), wxyz=_quaternion(turn), position=PER_METRE * middle
+        )
+        self._groups["slice"] = [node]
+
+    def set_visible(self, group: str, visible: bool) -> None:
+        """Show or hide a group, now and when it is drawn again."""
+        (self._hidden.discard if visible else self._hidden.add)(group)
+        for node in self._groups.get(group, ()):
+            node.visible = visible
+
+    def pose_hand(self, hand: HandModel, posture: Posture) -> None:
+        """Put the hand at a posture."""
+        self.pose_links(*placed_links(hand, posture))
+
+    def pose_links(self, positions: Float[np.ndarray, "_ 3"], quaternions: Float[np.ndarray, "_ 4"]) -> None:
+        """Put every link where it is; rows beyond the links are left out."""
+        with self._server.atomic():
+            for link, node in self._links.items():
+                node.position, node.wxyz = PER_METRE * positions[link], quaternions[link]
+
+    def pose_object(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> None:
+        """Put the object somewhere else than where it was planned on."""
+        if self._object is not None:
+            self._object.position, self._object.wxyz = PER_METRE * position, quaternion
+
+    def show_hand(self, visible: bool) -> None:
+        for node in self._links.values():
+            node.visible = visible
+
+    def fade_hand(self, opacity: float) -> None:
+        """Make the hand more or less see-through, now and when it is drawn again."""
+        self._opacity = min(max(opacity, 0.05), 1.0)
+        for node in self._links.values():
+            node.opacity = None if self._opacity == 1.0 else self._opacity
+
+    def _draw_hand(self, hand: HandModel) -> None:
+        for node in self._links.values():
+            node.remove()
+        self._links = {link: self._mesh(f"/{part.name}", part) for link, part in hand_parts(hand).items()}
+        self.fade_hand(self._opacity)
+
+    def _draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
+        nodes = []
+        if len(points):
+            every = -(-len(points) // _MOST_POINTS)
+            shown = (PER_METRE * points[::every]).astype(np.float32)
+            nodes = [self._server.scene.add_point_cloud("/cloud", shown, SEEN, point_size=PER_METRE * 0.0012)]
+        self._groups["cloud"] = nodes
+
+    def _mesh(self, name: str, part: Part) -> Any:
+        # Of a closed body nobody sees the inside: to draw it takes a software browser a fifth of a frame's time.
+        mesh, hand = part.mesh, name.startswith("/hand")
+        closed = hand or is_closed(mesh)
+        # Solids look much the same in five shades, which take a sixth less of that time. They know no flat shading, so
+        # that every face has corners of its own.
+        if hand:
+            mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
+        return self._server.scene.add_mesh_simple(
+            name, PER_METRE * mesh.vertices, mesh.faces, color=_bytes(part.colour), flat_shading=True,
+            material="toon5" if hand else "standard", side="front" if closed else "double",
+            opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    def _aim(self, session: Session) -> None:
+        """Every visitor's camera at the object, with the support's free side up."""
+        middle, size, up = np.zeros(3), 0.1, np.array([0.0, 0.0, 1.0])
+        if session.scene is not None:
+            corners = session.scene.object.mesh.vertices
+            middle, size = 0.5 * (corners.min(0) + corners.max(0)), float(np.ptp(corners, axis=0).max())
+            up = up if session.scene.support is None else session.scene.support.normal
+        elif session.grasps:
+            middle = session.grasps[0].grasp.position
+        side = perpendicular(up)
+        eye = middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up)
+        self._server.scene.set_up_direction(up)
+        for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
+            camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle
+
+
+def _bytes(colour: Colour) -> tuple[int, int, int]:
+    r, g, b = (round(255 * channel) for channel in colour)
+    return r, g, b
+
+
+def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    return quaternion_from_rotation(torch.as_tensor(rotation)).numpy()

@@ -1,0 +1,173 @@
+"""One thread that draws: of each kind of work it does the newest, so that no flood of sliders piles up.
+
+A viser server that may be left running: who may connect, and how much may be sent to it.
+
+viser serves anybody on every interface, lets any page that is open in the same browser connect, takes files of any
+size, and opens a public tunnel when a visitor asks for one. This one does none of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import urlsplit
+
+from graspd_core.errors import ConfigError
+
+Work = Callable[[], object]
+
+
+class LatestJobs:
+    """Does what it is given in a thread of its own; work that newer work of its kind replaces is never done.
+
+    Args:
+        failed: told of what work raised.
+    """
+
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
+        self._waiting: dict[str, tuple[float, Work]] = {}
+        self._change = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="graspd-viewer", daemon=True)
+        self._thread.start()
+
+    def submit(self, kind: str, work: Work, after: float = 0.0) -> None:
+        """Have work done, `after` seconds from now, unless other work of its kind comes first."""
+        with self._change:
+            self._waiting[kind] = time.monotonic() + after, work
+            self._change.notify()
+
+    def drop(self, kind: str) -> None:
+        """Work of that kind that waits is not done."""
+        with self._change:
+            self._waiting.pop(kind, None)
+
+    def close(self) -> None:
+        """End the thread behind the work it is at."""
+        with self._change:
+            self._closed = True
+            self._change.notify()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(10.0)
+
+    def _next(self) -> Work | None:
+        with self._change:
+            while not self._closed:
+                kind = min(self._waiting, key=lambda kind: self._waiting[kind][0], default=None)
+                left = None if kind is None else self._waiting[kind][0] - time.monotonic()
+                if kind is not None and left is not None and left <= 0:
+                    return self._waiting.pop(kind)[1]
+                self._change.wait(left)
+        return None
+
+    def _run(self) -> None:
+        while (work := self._next()) is not None:
+            try:
+                work()
+            except Exception as error:
+                self._failed(error)
+
+
+# Largest file that a visitor may send, and how many at a time [bytes].
+LARGEST_UPLOAD = 64 * 2**20
+_UPLOADS_AT_ONCE = 2
+LOCAL = ("localhost", "127.0.0.1", "::1")
+
+
+def start_server(host: str, port: int) -> Any:
+    """A `viser.ViserServer` on that address, on the next free port after `port`.
+
+    Raises:
+        ConfigError: no viser, or no such address on this machine.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise ConfigError("viser is not installed, which the viewer needs: pip install 'graspd[view]'") from None
+    if not 0 <= port < 65536:
+        raise ConfigError(f"port: {port}; valid: 0 to 65535, 0 for any")
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family) as probe:
+            probe.bind((host, 0))
+    except OSError as error:
+        raise ConfigError(f"host: {host!r}: {error.strerror or error}; 127.0.0.1 for this machine alone") from None
+    with quiet():
+        server = viser.ViserServer(host=host, port=port, label="graspd", verbose=False)
+    _refuse_strangers(server, host)
+    _refuse_tunnels(server)
+    _limit_uploads(server)
+    return server
+
+
+def quiet() -> contextlib.AbstractContextManager[Any]:
+    """Keep viser from printing banners."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def may_connect(origin: str | None, named: str | None, host: str) -> bool:
+    """Whether a page of `origin` may talk to the server that it calls `named`, which listens on `host`.
+
+    A page of another site may not, nor one that calls a local server by a name that is not local: its own, which it has
+    pointed here. What is no page has no origin.
+    """
+    name = urlsplit(f"//{named or ''}")
+    if host in LOCAL and name.hostname not in LOCAL:
+        return False
+    return origin is None or urlsplit(origin).netloc == name.netloc
+
+
+def _refuse_strangers(server: Any, host: str) -> None:
+    websockets = server._websock_server
+
+    async def look(connection: Any) -> None:
+        raw = websockets._live_connections.get(connection.client_id)
+        headers = raw.request.headers if raw is not None else {}
+        if raw is not None and not may_connect(headers.get("Origin"), headers.get("Host"), host):
+            await raw.close(1008, "graspd: a page of another site")
+
+    websockets.on_client_connect(look)
+
+
+def _refuse_tunnels(server: Any) -> None:
+    from viser import _messages
+
+    for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(kind)
+
+
+def _limit_uploads(server: Any) -> None:
+    """Take no file that is too large or one too many; end a transfer that sends more than it said."""
+    from viser import _messages
+
+    gui = server.gui
+    interface, transfers = gui._websock_interface, gui._current_file_upload_states
+
+    def start(client: int, message: Any) -> None:
+        busy = sum(state["client_id"] == client for state in transfers.values())
+        if 0 <= message.size_bytes <= LARGEST_UPLOAD and busy < _UPLOADS_AT_ONCE and message.part_count < 10_000:
+            gui._handle_file_transfer_start(client, message)
+            return
+        visitor = server.get_clients().get(client)
+        if visitor is not None:
+            limit = f"at most {LARGEST_UPLOAD // 2**20} MB, {_UPLOADS_AT_ONCE} at a time"
+            visitor.add_notification("Refused", f"{message.filename[:80]}: files of {limit}", color="red")
+
+    def part(client: int, message: Any) -> None:
+        state = transfers.get(message.transfer_uuid)
+        if state is None or state["client_id"] != client:
+            return
+        if state["transferred_bytes"] + len(message.content) > state["total_bytes"]:
+            transfers.pop(message.transfer_uuid, None)
+            return
+        gui._handle_file_transfer_part(client, message)
+
+    for kind, handle in ((_messages.FileTransferStartUpload, start), (_messages.FileTransferPart, part)):
+        interface.unregister_handler(kind)
+        interface.register_handler(kind, handle)

@@ -1,0 +1,137 @@
+"""What is looked at: grasps, the hand that they are for, and the object as far as it can be had."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import FormatError, GraspdError, shown
+from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.model import HandModel, all_joint_names
+from graspd_core.io.grasps_json import grasps_of, load_document
+from graspd_core.optimize.plan_config import PlanConfig, plan_config
+from graspd_core.perception.cloud.cloud_files import is_cloud_file, load_views
+from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
+from graspd_core.perception.scene import Scene, moved_grasp
+from graspd_core.planning.plan_grasps import planning_scene
+from graspd_core.types import Grasp, TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What is looked at.
+
+    Attributes:
+        title: for people.
+        hand: that the grasps are for.
+        grasps: in rank order.
+        scene: None where the object cannot be had: the grasps are shown all the same.
+        config: of the run that found them.
+        seen: points that the cameras saw, object frame [m]; empty for a mesh.
+        notes: what a visitor should know, one sentence each.
+        origin: of what is shown, in the frame of the file [m]: zero, but for an object far from its own.
+    """
+
+    title: str
+    hand: HandModel
+    grasps: tuple[Grasp, ...]
+    scene: Scene | None = None
+    config: PlanConfig = field(default_factory=PlanConfig)
+    seen: Float[np.ndarray, "points 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    notes: tuple[str, ...] = ()
+    origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+
+def open_grasps(path: Path, *, object_source: str | None = None, hand: str | None = None) -> Session:
+    """What a grasps file holds, and the object and the hand that it names.
+
+    An object that cannot be read, or is not the one that the grasps were planned on, is a note.
+
+    Args:
+        path: of a file of the format graspd/grasps.
+        object_source: a mesh or cloud file, or shape:NAME; without it, what the file names.
+        hand: a name or a path; without it, what the file names.
+
+    Raises:
+        FormatError: the file cannot be read, or the hand has other joints than the file.
+        HandError: the hand cannot be read.
+        GraspdError: the object that was asked for by name cannot be read.
+    """
+    document = load_document(path)
+    grasps = grasps_of(document)
+    model = _hand_of(document, path, hand)
+    config = plan_config(document.get("config") or {}, f"{path}: config")
+    scene, seen, notes = _object_of(document, path, object_source, config)
+    if scene is None:
+        return Session(path.name, model, grasps, config=config, notes=notes)
+    return make_session(path.name, model, grasps, scene, config, seen, notes)
+
+
+def make_session(
+    title: str,
+    hand: HandModel,
+    grasps: tuple[Grasp, ...],
+    scene: Scene,
+    config: PlanConfig,
+    seen: Float[np.ndarray, "points 3"],
+    notes: tuple[str, ...],
+) -> Session:
+    """A session about its object: browsers keep places as float32, which is too coarse far from the origin."""
+    scene, far = planning_scene(scene, config.resolution)
+    return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, config, seen - far, notes, far)
+
+
+def seen_points(source: str | TriangleMesh, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
+    """The points of a cloud file [m]; none for anything else."""
+    if isinstance(source, TriangleMesh) or source.startswith(SHAPE_PREFIX) or not is_cloud_file(source):
+        return np.zeros((0, 3))
+    points = np.concatenate([view.points for view in load_views(source)]) * scale
+    return points[np.isfinite(points).all(1)]
+
+
+def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandModel:
+    named = document.get("hand")
+    named = named if isinstance(named, dict) else {}
+    source = wanted or (named.get("name") if named.get("name") in hand_names() else named.get("urdf"))
+    if not isinstance(source, str):
+        raise FormatError(f"{path}: names no hand; name one with --hand")
+    hand = load_hand(source)
+    if list(all_joint_names(hand)) != named.get("joint_names"):
+        raise FormatError(f"{path}: its joints are not those of {source}; name the hand with --hand")
+    return hand
+
+
+def _object_of(
+    document: dict[str, Any], path: Path, wanted: str | None, config: PlanConfig
+) -> tuple[Scene | None, Float[np.ndarray, "points 3"], tuple[str, ...]]:
+    """The scene, the points that it was made of, and what is wrong with it."""
+    told = document.get("object")
+    told = told if isinstance(told, dict) else {}
+    source = wanted or _beside(str(told.get("source")), path)
+    given = {key: told[key] for key in ("mass", "friction", "scale") if isinstance(told.get(key), int | float)}
+    try:
+        # Whether a cloud showed the object alone is not in the file; what stood on nothing was taken whole.
+        alone = told.get("support") is None
+        scene = load_scene(source, **given, resolution=config.resolution, alone=alone)
+        seen = seen_points(source, given.get("scale", 1.0))
+    except GraspdError as error:
+        if wanted:
+            raise
+        note = f"the object is not shown ({error}); name it with --object"
+        return None, np.zeros((0, 3)), (note,)
+    if scene.object.sha256 == told.get("sha256"):
+        return scene, seen, scene.object.warnings
+    note = f"{shown(source)} is not what these grasps were planned on: contacts may lie off it"
+    return scene, seen, (note, *scene.object.warnings)
+
+
+def _beside(source: str, path: Path) -> str:
+    """A source as named, or the file of that name beside the grasps, where only that is there."""
+    beside = path.parent / Path(source).name
+    if source.startswith(SHAPE_PREFIX) or Path(source).exists() or not beside.is_file():
+        return source
+    return str(beside)

@@ -1,0 +1,264 @@
+"""A trial watched: where hand and object were at every moment as MuJoCo ran it, and what pressed on the object.
+
+Nothing here is run by planning; a trial that is recorded takes the same steps and ends with the same result.
+
+A grasp's trial, run again and watched: forwards, step by step, up to the moment and the reason of its failure.
+"""
+
+from __future__ import annotations
+
+import html
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import ConfigError, GraspdError, shown
+from graspd_core.perception.scene import object_parts
+from graspd_core.types import Grasp, TrialResult
+from graspd_core.verify.hold_trial import axis_name
+from graspd_core.verify.lift_trial import LiftSettings
+from graspd_core.verify.trial_registry import TRIALS, TrialContext, build_worlds
+from graspd_core.verify.world import PROTOCOLS, Protocol, World, at_friction
+from graspd_viewer.drawing import force_parts
+from graspd_viewer.grasp_list import BLOCK
+from graspd_viewer.scene_nodes import SceneNodes
+from graspd_viewer.server import LatestJobs
+from graspd_viewer.session import Session
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+
+# Steps from one frame to the next: 50 frames for each simulated second.
+FRAME_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of a trial; the object's frame as it was at the start, in which a lift moves hand and object up.
+
+    Attributes:
+        stage: what is being done.
+        positions, quaternions: of every link of the hand, in its order, and of the object last [m], wxyz.
+        contacts: where the hand touches the object [m].
+        forces: of the hand on the object there [N].
+    """
+
+    stage: str
+    positions: Float[np.ndarray, "bodies 3"]
+    quaternions: Float[np.ndarray, "bodies 4"]
+    contacts: Float[np.ndarray, "contacts 3"]
+    forces: Float[np.ndarray, "contacts 3"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A trial from its first step to its end, `seconds` of simulated time apart; the last frame is its very end."""
+
+    result: TrialResult
+    frames: tuple[Frame, ...]
+    seconds: float
+
+
+def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
+    """Run one trial of a grasp and keep what happens.
+
+    Raises:
+        ConfigError: no such trial, or none that applies to this scene.
+    """
+    names = [row.name for row in TRIALS.values() if row.applies(context)]
+    if name not in names:
+        raise ConfigError(f"trial {shown(name)}: valid for this scene: {', '.join(names)}")
+    recorder = _Recorder(context, name)
+    # Data of its own: that of a trial which ended may be in use by a run beside.
+    worlds = {
+        which: world and replace(world, watch=recorder, spare=deque())
+        for which, world in (("alone", context.alone), ("around", context.around))
+    }
+    result = TRIALS[name].run(replace(context, **worlds), grasp, lambda: False)
+    return Recording(result, recorder.frames(), FRAME_STEPS * context.protocol.timestep)
+
+
+class _Recorder:
+    """Keeps every fifth step of a trial, and the last."""
+
+    def __init__(self, context: TrialContext, name: str) -> None:
+        world = context.around if name == "lift" else context.alone
+        assert world is not None
+        self._world, self._protocol, self._lifts = world, context.protocol, name == "lift"
+        bodies = [int(world.model.body(f"link:{link}").id) for link in context.hand.link_names]
+        self._bodies = np.array([*bodies, world.object_body])
+        self._frames: list[Frame] = []
+        self._last: Frame | None = None
+        self._steps = 0
+
+    def __call__(self, data: Any) -> None:
+        self._steps += 1
+        # The last frame is wanted wherever the trial ends, which nobody knows before.
+        self._last = None if self._steps % FRAME_STEPS == 0 else self._frame(data)
+        if self._last is None:
+            self._frames.append(self._frame(data))
+
+    def frames(self) -> tuple[Frame, ...]:
+        return tuple(self._frames) if self._last is None else (*self._frames, self._last)
+
+    def _frame(self, data: Any) -> Frame:
+        # What is beside the hand sinks in a lift (lift_trial.py); seen from there, hand and object rise.
+        origin = self._world.origin - (data.mocap_pos[1] if len(data.mocap_pos) > 1 else 0.0)
+        contacts, forces = _contact_forces(self._world, data)
+        return Frame(
+            _lift_stage(data, self._protocol) if self._lifts else _hold_stage(self._world, data, self._protocol),
+            data.xpos[self._bodies] + origin,
+            data.xquat[self._bodies].copy(),
+            contacts + origin,
+            forces,
+        )
+
+
+def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Where the hand touches the object, and the force on the object there; world frame [m], [N]."""
+    import mujoco
+
+    places, forces, wrench = [], [], np.zeros(6)
+    hand = set(world.hand_geoms)
+    for index in range(data.ncon):
+        contact = data.contact[index]
+        first, second = int(contact.geom1), int(contact.geom2)
+        on_second = first in hand and world.model.geom_bodyid[second] == world.object_body
+        if not on_second and not (second in hand and world.model.geom_bodyid[first] == world.object_body):
+            continue
+        mujoco.mj_contactForce(world.model, data, index, wrench)
+        # The force on the second body, in the contact's axes, which are the rows of its frame.
+        forces.append((1.0 if on_second else -1.0) * wrench[:3] @ contact.frame.reshape(3, 3))
+        places.append(contact.pos.copy())
+    return np.array(places).reshape(-1, 3), np.array(forces).reshape(-1, 3)
+
+
+def _hold_stage(world: World, data: Any, protocol: Protocol) -> str:
+    """What a hold trial does, told by its clock, which every pull sets back, and by what pulls."""
+    pull = data.xfrc_applied[world.object_body, :3]
+    if pull.any():
+        return f"a pull along {axis_name(pull / np.linalg.norm(pull))}"
+    return "closing" if data.time <= protocol.stage_time + 1e-9 else "squeezing"
+
+
+def _lift_stage(data: Any, protocol: Protocol) -> str:
+    ends = np.cumsum([LiftSettings.approach_time, protocol.stage_time, protocol.stage_time, LiftSettings.lift_time])
+    names = ("coming", "closing", "squeezing", "lifting", "holding up")
+    return names[int(np.searchsorted(ends + 1e-9, data.time))]
+
+
+# Frames of the page for each second, and of the recording for each of those: as fast as it happened.
+_RATE = 25.0
+
+
+class TrialControls:
+    """Widgets of a trial; everything is drawn by `jobs`, in one thread."""
+
+    def __init__(self, gui: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
+        self._jobs, self._nodes = jobs, nodes
+        self._session: Session | None = None
+        self._grasp: Grasp | None = None
+        self._contexts: dict[str, TrialContext] = {}
+        self._recording: Recording | None = None
+        with gui.add_folder("Its trial, as MuJoCo ran it"):
+            self._name = gui.add_dropdown("Trial", tuple(TRIALS), hint="lift: where there is a support or a neighbour")
+            self._protocol = gui.add_dropdown("Protocol", tuple(PROTOCOLS))
+            self._play = gui.add_button("Run and play", hint="key R")
+            self._time = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True)
+            self._text = gui.add_html("")
+        self._play.on_click(lambda _: self.play())
+        gui.add_command("Play the trial", hotkey="R").on_trigger(lambda _: self.play())
+
+        @self._time.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self._jobs.drop("play")
+                self._jobs.submit("frame", lambda: self._draw(int(self._time.value)))
+
+    def show(self, session: Session, grasp: Grasp | None) -> None:
+        """Another grasp, of which no trial is run yet; its own failed trial is offered first."""
+        if session is not self._session:
+            self._session, self._contexts = session, {}
+        self._grasp = grasp
+        failed = [trial.name for trial in (grasp.trials if grasp else ()) if not trial.passed and trial.name in TRIALS]
+        if failed:
+            self._name.value = failed[0]
+        self.stop()
+        self._text.content = ""
+
+    def stop(self) -> bool:
+        """Show no moment of a trial any more; whether one was shown. From the drawing thread."""
+        self._jobs.drop("play")
+        shown, self._recording, self._time.disabled = self._recording is not None, None, True
+        self._nodes.draw("trial", ())
+        return shown
+
+    def play(self) -> None:
+        """Run the trial and play it from its beginning."""
+        self._jobs.submit("trial", self._run)
+
+    def _run(self) -> None:
+        if self._session is None or self._grasp is None or self._session.scene is None:
+            self._text.content = f"{BLOCK}a trial needs a grasp and its object</div>"
+            return
+        try:
+            self._recording = record_trial(self._context(), self._grasp, self._name.value)
+        except GraspdError as error:
+            self._text.content = f"{BLOCK}{html.escape(str(error))}</div>"
+            return
+        self._time.max, self._time.disabled = max(len(self._recording.frames) - 1, 1), False
+        self._play_from(0)
+
+    def _context(self) -> TrialContext:
+        assert self._session is not None
+        assert self._session.scene is not None
+        name = self._protocol.value if self._protocol.value in PROTOCOLS else "standard"
+        if name not in self._contexts:
+            scene = self._session.scene
+            protocol = at_friction(PROTOCOLS[name], scene.object.friction)
+            self._contexts[name] = build_worlds(scene, self._session.hand, object_parts(scene.object), protocol)
+        return self._contexts[name]
+
+    def _play_from(self, index: int) -> None:
+        if self._recording is None:
+            return
+        last = len(self._recording.frames) - 1
+        self._time.value = index
+        self._draw(index)
+        if index < last:
+            ahead = max(1, round(1 / _RATE / self._recording.seconds))
+            self._jobs.submit("play", lambda: self._play_from(min(index + ahead, last)), after=1 / _RATE)
+
+    def _draw(self, index: int) -> None:
+        recording = self._recording
+        if recording is None:
+            return
+        if not recording.frames:
+            reason = html.escape(recording.result.reason)
+            self._text.content = f"{BLOCK}failed before its first step: <b>{reason}</b></div>"
+            return
+        last = len(recording.frames) - 1
+        index = min(max(index, 0), last)
+        frame = recording.frames[index]
+        self._nodes.pose_links(frame.positions[:-1], frame.quaternions[:-1])
+        self._nodes.pose_object(frame.positions[-1], frame.quaternions[-1])
+        for planned in ("contacts", "forces", "weakest"):
+            self._nodes.draw(planned, ())
+        parts = force_parts(frame.contacts, frame.forces)
+        self._nodes.draw("trial", parts)
+        self._text.content = _told(recording, index, frame.stage)
+
+
+def _told(recording: Recording, index: int, stage: str) -> str:
+    """When and what, and how the trial ended."""
+    result, seconds = recording.result, recording.seconds
+    end = seconds * (len(recording.frames) - 1)
+    line = f"{seconds * index:.2f} s of {end:.2f} s: {html.escape(stage)}"
+    if result.passed:
+        return f"{BLOCK}{line}<br><b style='color:rgb(40,165,75)'>passed</b></div>"
+    failed = f"failed at {end:.2f} s: {html.escape(result.reason)}"
+    return f"{BLOCK}{line}<br><b style='color:rgb(215,50,50)'>{failed}</b></div>"

@@ -1,0 +1,156 @@
+"""`graspd view`: grasps, a benchmark, or a page to plan on, in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_core.cli.running import EXIT_OK, Interrupt
+from graspd_core.errors import ConfigError
+from graspd_core.types import GraspResult, ProgressHook, WatchHook
+
+if TYPE_CHECKING:
+    from graspd_core.hands.model import HandModel
+    from graspd_core.optimize.plan_config import PlanConfig
+    from graspd_core.perception.scene import Scene
+
+
+# Seconds that a run with --view waits for somebody to look.
+_PATIENCE = 60.0
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("view", help="look at grasps in a browser, or plan there")
+    parser.set_defaults(run=run)
+    parser.add_argument(
+        "path", metavar="PATH", type=Path, nargs="?", default=None,
+        help="a grasps.json, or the folder of a benchmark; without one, a page to plan on",
+    )  # fmt: skip
+    parser.add_argument("--object", default=None, metavar="OBJECT", help="instead of the one that the file names")
+    parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="instead of the one that the file names")
+    parser.add_argument("--html", type=Path, default=None, metavar="page.html", help="of a benchmark: one file")
+    add_address(parser)
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Where a page is served."""
+    parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
+    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    import torch
+
+    torch.set_num_threads(1)
+    if options.path is not None and options.path.is_dir():
+        return _view_benchmark(options)
+    if options.html is not None:
+        raise ConfigError(f"--html {options.html}: of a benchmark's folder; `graspd synthesize --html` draws a grasp")
+    from graspd_viewer.session import open_grasps
+    from graspd_viewer.viewer import Viewer
+
+    if options.path is None and (options.object or options.hand):
+        raise ConfigError("--object and --hand belong to a grasps.json; without one they are chosen on the page")
+    session = options.path and open_grasps(options.path, object_source=options.object, hand=options.hand)
+    viewer = Viewer(host=options.host, port=options.port)
+    try:
+        if session:
+            viewer.show(session)
+        wait_for_end(viewer.url)
+    finally:
+        viewer.close()
+    return EXIT_OK
+
+
+@dataclass(frozen=True)
+class Watched:
+    """How a run is followed in a browser; as it stands, by nobody.
+
+    Attributes:
+        watch: hook of `plan_grasps`.
+        told: as its progress hook.
+        show: shows what was found until Ctrl-C.
+    """
+
+    watch: WatchHook | None = None
+    told: ProgressHook | None = None
+    show: Callable[[GraspResult], None] = lambda result: None
+
+    def progress(self, reporter: ProgressHook) -> ProgressHook:
+        """The progress hook of a run that `reporter` follows too."""
+        told = self.told
+        if told is None:
+            return reporter
+        return lambda progress: (reporter(progress), told(progress))[0]
+
+
+@contextmanager
+def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: PlanConfig) -> Iterator[Watched]:
+    """A page for a run with --view, which begins when somebody is there or a minute has passed; else nothing."""
+    if not options.view:
+        yield Watched()
+        return
+    from graspd_viewer.session import make_session, seen_points
+    from graspd_viewer.viewer import Viewer
+
+    seen, notes = seen_points(options.object, scene.object.scale), scene.object.warnings
+    name = Path(options.object).name
+
+    def show(result: GraspResult) -> None:
+        viewer.live.end()
+        viewer.show(make_session(name, hand, result.grasps, scene, config, seen, notes))
+        wait_for_end(viewer.url)
+
+    viewer = Viewer(host=options.host, port=options.port, plan=False)
+    try:
+        session = make_session(name, hand, (), scene, config, seen, notes)
+        viewer.show(session)
+        viewer.live.begin(session)
+        print(f"graspd: {viewer.url} - planning begins when it is open", file=sys.stderr, flush=True)
+        viewer.wait_for_visitor(_PATIENCE)
+        yield Watched(viewer.live.watch, viewer.live.progress, show)
+    finally:
+        viewer.close()
+
+
+def wait_for_end(url: str) -> None:
+    """Say where the page is, until Ctrl-C."""
+    print(f"{url} - Ctrl-C ends it", flush=True)
+    with Interrupt() as interrupt:
+        pause = threading.Event()
+        while not interrupt.came():
+            pause.wait(0.2)
+
+
+def _view_benchmark(options: argparse.Namespace) -> int:
+    from graspd_core.io.grasps_json import save_text
+    from graspd_viewer.bench_page import bench_page, plan_again, serve_page
+    from graspd_viewer.viewer import Viewer
+
+    page, runs = bench_page(options.path, served=options.html is None)
+    if options.html is not None:
+        save_text(options.html, page)
+        print(f"{options.html}: open it in a browser")
+        return EXIT_OK
+    viewer = Viewer(host=options.host, port=options.port and options.port + 1)
+
+    def open_run(key: str) -> int | None:
+        if key not in runs:
+            return None
+        viewer.run(lambda stop: plan_again(runs[key], viewer.show, viewer.say, stop))
+        return viewer.port
+
+    try:
+        with serve_page(page, options.host, options.port, open_run) as url:
+            wait_for_end(url)
+    finally:
+        viewer.close()
+    return EXIT_OK
