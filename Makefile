@@ -16,7 +16,7 @@ setup: $(STAMP)  ## build .venv (Python 3.11 or 3.12; PYTHON=... names one)
 # The directories too: adding or removing a message makes the environment stale.
 INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*) scripts/*_msgs/*/*)
 
-KERNEL := $(wildcard graspd_core/kernel/src/*)
+KERNEL := $(wildcard graspd_core/optimize/kernel/src/*)
 
 $(STAMP): pyproject.toml setup.py setup.cfg constraints.txt scripts/setup.sh $(INTERFACES) $(KERNEL)
 	@scripts/setup.sh $(VENV) $(PYTHON)
@@ -73,7 +73,7 @@ SANITIZED := build/sanitized/kernel.so
 $(SANITIZED): $(KERNEL)
 	@mkdir -p $(@D)
 	$(or $(CXX),c++) -std=c++17 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=undefined -Wno-psabi -fPIC -shared \
-		graspd_core/kernel/src/kernel.cpp -o $@ -pthread
+		graspd_core/optimize/kernel/src/kernel.cpp -o $@ -pthread
 
 # Leaks are not looked for: Python keeps memory until it ends.
 sanitize: setup $(SANITIZED)  ## the kernel's tests with reads and writes checked (g++ or clang)

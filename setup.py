@@ -7,7 +7,7 @@ from setuptools import Extension, setup
 
 ROOT = Path(__file__).parent
 SHARE = Path("share")
-KERNEL = "graspd_core/kernel"
+KERNEL = "graspd_core/optimize/kernel"
 # Builds of the kernel: one of them is chosen when it is loaded (graspd_core/optimize/kernel/builds.py).
 TARGETS = {"baseline": []}
 if platform.machine() in ("x86_64", "AMD64"):

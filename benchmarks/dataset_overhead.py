@@ -16,8 +16,8 @@ from tempfile import TemporaryDirectory
 import psutil
 import torch
 
-from graspd_bench.tables import markdown_table
 from graspd_core import load_hand, load_scene, plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.runtime.worker_process import resident_mb
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore

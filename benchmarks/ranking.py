@@ -24,14 +24,14 @@ import trimesh
 from torch import nn
 
 from graspd_bench.study import all_shapes
-from graspd_bench.tables import markdown_table
 from graspd_core import load_hand, load_scene
 from graspd_core.optimize import ranking
 from graspd_core.optimize.candidates import PlannerInput, finished, staged
 from graspd_core.optimize.loop import Hooks
-from graspd_core.optimize.plan_config import METHODS, load_preset
+from graspd_core.optimize.plan_config import load_preset, method_row
 from graspd_core.optimize.ranking import FARTHEST, log_odds, ranking_figures
 from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
@@ -94,7 +94,7 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
     config = load_preset(preset)
     hand = load_hand(hand_name, candidates=config.problem.fine_candidates)
     scene = thing_scene(source, rng, friction, config.resolution)
-    found = METHODS[config.method].plan(PlannerInput(scene, hand, count, variant, config, Hooks()))
+    found = method_row(config.method).plan(PlannerInput(scene, hand, count, variant, config, Hooks()))
     some = staged(found.problem, hand, found.poses, config)
     grasps = finished(found.problem, hand, some)
     held = {}

@@ -28,7 +28,7 @@ from graspd_bench.figures import (
 )
 from graspd_bench.study import Record
 from graspd_bench.suites import SWEEPS
-from graspd_core.optimize.plan_config import METHODS
+from graspd_core.optimize.plan_config import method_row
 
 # Colours of Okabe and Ito (2008), which the colour-blind can tell apart; a marker's shape says the same.
 FRONT = "#222222"
@@ -133,7 +133,7 @@ _LABELS = {
     "resolution": "grid nodes a side",
     "steps": "steps",
 }
-_SUCCESS, _TIME = METHODS["closed_form"].colour, METHODS["graspd2022"].colour
+_SUCCESS, _TIME = method_row("closed_form").colour, method_row("graspd2022").colour
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
         axis.set_xlabel("CPU seconds to the first verified grasp")
         axis.set_xlim(left=0.0)
         names = [p.name for p in points]
-        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [METHODS[p.method].colour for p in points])
+        place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [method_row(p.method).colour for p in points])
         return save(made, path)
 
 
@@ -223,7 +223,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path) -> Path | None:
         made.supxlabel("CPU seconds per raw grasp (one thread, log scale)", fontsize=9)
         _legend(made, list(dict.fromkeys(row.method for group in presets.values() for row in group)))
         for axis, (_, points) in zip(axes[0], panels, strict=True):
-            names, colours = [short_name(p.name) for p in points], [METHODS[p.method].colour for p in points]
+            names, colours = [short_name(p.name) for p in points], [method_row(p.method).colour for p in points]
             place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, colours)
         return save(made, path)
 
@@ -244,13 +244,13 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
 def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
     place = {p.name: (p.x[1], p.y[1]) for p in points}
     for p in points:
-        (x, y), colour, parent = place[p.name], METHODS[p.method].colour, parent_of(p.name)
+        (x, y), colour, parent = place[p.name], method_row(p.method).colour, parent_of(p.name)
         if parent in place:
             axis.plot(*zip(place[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2)
         bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
         axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
         filling = "white" if parent else colour
-        axis.plot(x, y, METHODS[p.method].marker, color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
+        axis.plot(x, y, method_row(p.method).marker, color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
     # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
     spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
@@ -276,7 +276,7 @@ def _legend(made: Any, methods: Sequence[str]) -> None:
 
     plain = {"ls": "none", "ms": 7, "mew": 1.3}
     handles = [
-        Line2D([], [], marker=METHODS[m].marker, color=METHODS[m].colour, label=METHODS[m].label, **plain)
+        Line2D([], [], marker=method_row(m).marker, color=method_row(m).colour, label=method_row(m).label, **plain)
         for m in methods
     ]
     handles.append(Line2D([], [], marker="o", color="#666666", mfc="white", label="ablation", **plain))

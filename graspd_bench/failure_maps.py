@@ -25,7 +25,6 @@ from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.study import Case, Picture, Record, Request, Sections, raw_grasps
-from graspd_bench.tables import markdown_table
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.fingers import find_fingers
 from graspd_core.hands.kinematics import make_kinematics, points_in_base
@@ -37,6 +36,7 @@ from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.load_scene import load_scene, scene_from_views
 from graspd_core.perception.scene import ObjectModel, Scene, build_scene, object_parts
 from graspd_core.planning.feasibility import kind_of
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world

@@ -20,16 +20,17 @@ import numpy as np
 
 from graspd_bench.bullet.bullet_hold import bullet_hold_trial
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
-from graspd_bench.stopwatch import Stopwatch
-from graspd_bench.study import Case, Record, hand_hash, object_hash, raw_grasps, thing_name
+from graspd_bench.study import Case, Record, raw_grasps
 from graspd_bench.trials import gravity_trial
-from graspd_core.hands.library import load_hand
+from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.shapes import object_hash, thing_name
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.plan_config import PlanConfig, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import Stopwatch
 from graspd_core.types import Grasp, Progress, Stage, TrialResult, TriangleMesh, Verdict
 from graspd_core.verify.hold_trial import hold_trial, noisy_trial
 from graspd_core.verify.metrics import measure

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import platform
 import re
-import subprocess
-import traceback
 from collections.abc import Sequence
 from datetime import date
-from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from graspd_bench.study import Case, Record
 from graspd_core.errors import FormatError
 from graspd_core.io.grasps_json import save_text
+from graspd_core.runtime.records import code_version, commit, finite
 
 FORMAT, VERSION = "graspd/bench", 2
-# Parts of the package that no figure depends on; of the benchmark itself, a study names its own.
-_BESIDE = ("cli", "bags", "doctor.py", "formats", "bench", "viewer", "dataset")
+# Files of this package that the figures of every study depend on.
+_COUNTED = ("baselines/*.py", "rendering/*.py", "trials.py")
 
 
 def case_key(study: str, case: Case) -> str:
@@ -50,13 +45,6 @@ def head(study: str, case: Case, code: str) -> Record:
         "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}",
         "error": "",
     }
-
-
-def failure(error: BaseException, kind: str = "raised") -> Record:
-    """What is written of a case that raised, died or hung: the only failure record there is."""
-    where = "".join(traceback.format_exception(error))
-    told = " ".join(str(error).split())
-    return {"failed": kind, "error": f"{type(error).__name__}: {told}", "traceback": where}
 
 
 def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
@@ -99,43 +87,6 @@ def read_results(path: Path) -> list[Record]:
     return whole["records"]
 
 
-@lru_cache
-def code_version(sources: tuple[str, ...] = ()) -> str:
-    """The package's version and a hash of the sources that figures depend on: all but those of `_BESIDE`.
-
-    The kernel's C++ counts. Of the benchmark itself only the files that the globs `sources` name below `bench` do.
-    """
-    root = Path(__file__).parents[1]
-    files = {path for pattern in ("*.py", "*.cpp", "*.h", "*.hpp") for path in root.rglob(pattern)}
-    counted = {path for path in files if path.relative_to(root).parts[0] not in _BESIDE}
-    counted.update(path for pattern in sources for path in (root / "bench").glob(pattern))
-    digest = hashlib.sha256()
-    for path in sorted(counted):
-        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + path.read_bytes())
-    try:
-        released = version("graspd")
-    except PackageNotFoundError:
-        released = "unreleased"
-    return f"{released}+{digest.hexdigest()[:12]}"
-
-
-@lru_cache
-def commit() -> str:
-    """Short name of the commit that is checked out, with a plus where files differ from it; nothing outside a clone."""
-    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
-    try:
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip()
-
-
-def finite(value: Any) -> Any:
-    """The same, with None for every number that JSON does not know."""
-    if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def bench_version(sources: tuple[str, ...]) -> str:
+    """Return `code_version` of graspd_core and of the files of graspd_bench that the globs `sources` name."""
+    return code_version(tuple(f"graspd_bench/{pattern}" for pattern in (*_COUNTED, *sources)))

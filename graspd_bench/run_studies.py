@@ -18,12 +18,12 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from graspd_bench.result_store import code_version, failure, finite, head, read_record, write_record
-from graspd_bench.stopwatch import forget_peak, peak_mb
+from graspd_bench.result_store import bench_version, head, read_record, write_record
 from graspd_bench.study import Case, Picture, Record, Request, Study
 from graspd_bench.study_registry import STUDIES
 from graspd_bench.tables import sourced
 from graspd_core.errors import ConfigError
+from graspd_core.runtime.records import failure, finite, forget_peak, peak_mb
 
 # How often a stop is looked for [s].
 _POLL = 0.2
@@ -231,7 +231,7 @@ def make_plan(
             raise ConfigError(f"{field}: {', '.join(studies)} does not look at it; valid: {', '.join(sorted(taken))}")
     jobs, done = [], {}
     for name, study in studies.items():
-        code = code_version(study.sources)
+        code = bench_version(study.sources)
         for case in study.cases(request):
             jobs.append(Job(name, case, study.run, code, study.alone, study.patience(case)))
             record = read_record(folder, name, case, None if any_code else code, failed=failed)

@@ -5,22 +5,18 @@ The case of most studies: grasps of an object, and what is loaded for them.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from graspd_core.errors import ConfigError, MeshError
-from graspd_core.hands.library import load_hand
+from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
-from graspd_core.mesh.shapes import SHAPES, make_shape
+from graspd_core.mesh.shapes import SHAPES, object_hash, object_sources, thing_name
 from graspd_core.optimize.candidates import find_candidates
 from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
-from graspd_core.paths import config_dir
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp
@@ -130,7 +126,7 @@ class Study:
         run: a case to its figures, in a process that does one case after another; a function of a module.
         sections: records, and the path that charts begin with (None: draw none), to what pages hold of them.
         failures: the sections are of records of cases that failed, too.
-        sources: files below `bench`, by glob, that figures depend on beside the package itself.
+        sources: files of graspd_bench, by glob, that figures depend on beside graspd_core.
         takes: names of the fields of `Request` that it looks at.
         seconds: CPU seconds of a case, roughly.
         faults: what is wrong with a record, a line each.
@@ -160,29 +156,6 @@ def all_shapes() -> tuple[str, ...]:
     return tuple(f"shape:{name}" for name in SHAPES)
 
 
-def thing_name(source: Any) -> str:
-    """What an object goes by: the shape, or the file without its ending; other values as they are."""
-    text = f"{source:g}" if isinstance(source, float) else str(source)
-    path = Path(text)
-    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
-
-
-def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
-    """Shapes, mesh files and the meshes of folders. Raises MeshError: there is no such thing."""
-    found: list[str] = []
-    for source in sources:
-        path = Path(source)
-        if not source.startswith("shape:") and path.is_dir():
-            files = sorted(p for p in path.iterdir() if p.suffix.lower().lstrip(".") in MESH_ENDINGS)
-            if not files:
-                raise MeshError(f"{source}: no mesh in this folder; valid endings: {', '.join(MESH_ENDINGS)}")
-            found += map(str, files)
-        else:
-            object_hash(source)
-            found.append(source)
-    return tuple(found)
-
-
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
     """As `object_sources`; raises MeshError also where two of them go by the same name."""
     found = object_sources(sources)
@@ -190,28 +163,6 @@ def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise MeshError(f"two objects are called {twice[0]!r}: results go by that name")
     return found
-
-
-@lru_cache
-def object_hash(source: str) -> str:
-    """Hash of the content of a shape or a mesh file. Raises MeshError: there is no such thing."""
-    if source.startswith("shape:"):
-        return content_hash(make_shape(source.removeprefix("shape:")))
-    path = Path(source)
-    if not path.is_file():
-        raise MeshError(f"{path}: no such mesh file; shape:NAME is an authored shape: {', '.join(sorted(SHAPES))}")
-    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
-        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-@lru_cache
-def hand_hash(name: str) -> str:
-    """Hash of a hand's URDF and description. Raises HandError: there is no such hand, or it cannot be used."""
-    hand = load_hand(name, candidates=1)
-    boxed = config_dir() / "hands" / f"{name}.yaml"
-    files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from graspd_bench import failure_maps as map_registry
-from graspd_bench import suites, tables
+from graspd_bench import failure_maps, suites, tables
 from graspd_bench.bullet.bullet_world import bullet_available
-from graspd_bench.failure_maps import map_sections
 from graspd_bench.measurement import run_cell
 from graspd_bench.stress import stress_cases
 from graspd_bench.studies import (
@@ -14,20 +12,17 @@ from graspd_bench.studies import (
     frames,
     human_hand,
     imported,
+    piles,
     robust_ranking,
     seen_objects,
     simulators,
     steered,
     throughput,
 )
-from graspd_bench.studies import piles as clear_pile
-from graspd_bench.studies import piles as pile_case
-from graspd_bench.studies import piles as pile_report
 from graspd_bench.study import Study
 
-_CELLS = ("measurements/*.py", "bullet/*.py", "object_case.py")
-_IMPORTED = ("studies/imported.py", "object_case.py", "measurements/benchmark_trials.py", "bullet/*.py")
-_IMPORTED = (*_IMPORTED, "../formats/foreign/*.py")
+_CELLS = ("measurement.py", "bullet/*.py")
+_IMPORTED = ("studies/imported.py", "measurement.py", "bullet/*.py", "../graspd_dataset/*_grasps.py")
 _RAW = ("objects", "seeds", "count", "hand", "trials", "quick")
 _PLANS = ("presets", "objects", "seeds", "count", "hand", "quick")
 
@@ -74,38 +69,38 @@ STUDIES: dict[str, Study] = {
         seen_objects.seen_cases,
         seen_objects.run_seen,
         seen_objects.rgbd_sections,
-        ("studies/seen_objects.py", "object_case.py"),
+        ("studies/seen_objects.py",),
         _PLANS,
         seen_objects.seen_seconds,
         came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
     ),
     "piles": Study(
         "piles of things on a table, seen by a camera, grasped and lifted out one after another on the truth",
-        pile_case.pile_cases,
-        clear_pile.run_pile,
-        pile_report.pile_sections,
-        ("piles/*.py",),
+        piles.pile_cases,
+        piles.run_pile,
+        piles.pile_sections,
+        ("studies/piles.py",),
         ("presets", "objects", "cases", "seeds", "hand", "quick"),
-        pile_case.pile_seconds,
-        came=pile_report.pile_came,
+        piles.pile_seconds,
+        came=piles.pile_came,
     ),
     "robust": Study(
         "what ranking by noisy trials buys and costs",
         robust_ranking.robust_cases,
         robust_ranking.run_robust,
         robust_ranking.robust_sections,
-        ("studies/robust_ranking.py", "object_case.py"),
+        ("studies/robust_ranking.py",),
         _PLANS,
         lambda case: 2.0 + 2.5 * case.count,
     ),
     "maps": Study(
         "where methods stop working: friction and mass, size, view, wall",
-        map_registry.map_cases,
-        map_registry.run_map,
-        map_sections,
-        ("failure_maps/*.py", "object_case.py"),
+        failure_maps.map_cases,
+        failure_maps.run_map,
+        failure_maps.map_sections,
+        ("failure_maps.py",),
         ("cases", "quick"),
-        map_registry.map_seconds,
+        failure_maps.map_seconds,
     ),
     "stress": Study(
         "what breaks methods, each case in a process of its own",
@@ -126,7 +121,7 @@ STUDIES: dict[str, Study] = {
         early_ends.early_cases,
         early_ends.run_early,
         early_ends.early_sections,
-        ("studies/early_ends.py", "object_case.py"),
+        ("studies/early_ends.py",),
         _PLANS,
         lambda case: 2.0 + 1.2 * case.count,
     ),
@@ -135,7 +130,7 @@ STUDIES: dict[str, Study] = {
         simulators.simulator_cases,
         simulators.run_simulators,
         simulators.simulator_sections,
-        ("studies/simulators.py", "object_case.py", "bullet/*.py"),
+        ("studies/simulators.py", "bullet/*.py"),
         _PLANS,
         lambda case: 2.0 + 2.5 * case.count,
         usual=bullet_available(),
@@ -145,7 +140,7 @@ STUDIES: dict[str, Study] = {
         steered.steered_cases,
         steered.run_steered,
         steered.steered_sections,
-        ("studies/steered.py", "object_case.py"),
+        ("studies/steered.py",),
         _PLANS,
         lambda case: 1.2,
     ),
@@ -154,7 +149,7 @@ STUDIES: dict[str, Study] = {
         arm_reach.reach_cases,
         arm_reach.run_reach,
         arm_reach.reach_sections,
-        ("studies/arm_reach.py", "object_case.py"),
+        ("studies/arm_reach.py",),
         _PLANS,
         lambda case: 3.0,
         came=arm_reach.came,
@@ -164,7 +159,7 @@ STUDIES: dict[str, Study] = {
         throughput.throughput_cases,
         throughput.run_throughput,
         throughput.throughput_sections,
-        ("studies/throughput.py", "object_case.py"),
+        ("studies/throughput.py",),
         _PLANS,
         lambda case: 3.0 + 0.06 * case.count,
         usual=False,
@@ -184,7 +179,7 @@ STUDIES: dict[str, Study] = {
         human_hand.mano_cases,
         human_hand.run_mano,
         human_hand.mano_sections,
-        ("studies/human_hand.py", "object_case.py", "bullet/*.py"),
+        ("studies/human_hand.py", "bullet/*.py"),
         _PLANS,
         usual=False,
     ),

@@ -10,7 +10,7 @@ from graspd_bench.measurement import TRIALS, USUAL, Cell, Kind
 from graspd_bench.study import Request, all_shapes, find_objects
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import hand_names
-from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, preset_names
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, method_row, override, preset_names
 
 # Verified grasps that a planned cell asks for, and the batch that pace is taken at.
 VERIFIED, BATCH = 8, 32
@@ -159,7 +159,7 @@ def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _count(request: Request, config: PlanConfig) -> int:
-    usual = _LONG_COUNT if _steps(config) > _LONG else METHODS[config.method].benchmark_count
+    usual = _LONG_COUNT if _steps(config) > _LONG else method_row(config.method).benchmark_count
     return request.count or (_QUICK_COUNT if request.quick else usual)
 
 

@@ -15,13 +15,8 @@ from graspd_bench.study import Picture, Record, Sections
 from graspd_bench.suites import DECADES
 from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import save_text
+from graspd_core.runtime.records import markdown_table
 from graspd_core.verify.metrics import METRICS
-
-
-def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; cells must not have bars of their own."""
-    lines = [headings, ["---"] * len(headings), *body]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")
 
 
 def provenance(command: str, records: Sequence[Record]) -> str:

@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 PROBE_TIMEOUT = 60.0  # seconds; a cold disk takes several for torch or Open3D
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
@@ -124,6 +125,11 @@ def format_checks(checks: Iterable[Check]) -> str:
         if check.hint and not check.ok:
             lines.append(f"     {'':<20} -> {check.hint}")
     return "\n".join(lines)
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    commands.add_parser("doctor", help="check the installation").set_defaults(run=lambda options: main())
 
 
 def main() -> int:

@@ -15,8 +15,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from graspd_bench.result_store import code_version
-from graspd_bench.stopwatch import forget_peak, peak_mb
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.io.grasps_json import grasp_figures
 from graspd_core.optimize.plan_config import PlanConfig
@@ -24,6 +22,7 @@ from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, Scene, object_parts, object_sharp_points
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
+from graspd_core.runtime.records import code_version, forget_peak, peak_mb
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context

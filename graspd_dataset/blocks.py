@@ -12,8 +12,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from graspd_bench.study import hand_hash, object_hash, object_sources, thing_name
 from graspd_core.errors import ConfigError
+from graspd_core.hands.library import hand_hash
+from graspd_core.mesh.shapes import object_hash, object_sources, thing_name
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.planning.plan_grasps import check_request
 

@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from graspd_bench.baselines.random_closure import RandomClosureConfig
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import finished, staged
-from graspd_core.optimize.finger_closing import make_closing
+from graspd_core.optimize.finger_closing import CLOSE_STEPS, make_closing
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, build_problem
@@ -52,7 +51,7 @@ def complete_grasps(
         poses = _poses(problem, [grasp.grasp for grasp in some])
         own = finished(problem, hand, staged(problem, hand, poses, config))
         if opened := [row for row, grasp in enumerate(some) if not grasp.closed]:
-            closing = make_closing(problem, hand, RandomClosureConfig().close_steps)
+            closing = make_closing(problem, hand, CLOSE_STEPS)
             closed = minimise(closing, problem, poses[torch.tensor(opened)], Hooks()).poses
             for row, grasp in zip(opened, finished(problem, hand, staged(problem, hand, closed, config)), strict=True):
                 own[row] = grasp

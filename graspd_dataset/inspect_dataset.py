@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from graspd_bench.tables import markdown_table
 from graspd_core.errors import FormatError
+from graspd_core.runtime.records import markdown_table
 from graspd_dataset.block_rows import kind_of_reason
 from graspd_dataset.blocks import content_key
 from graspd_dataset.dataset_store import DatasetStore, block_path, key_of, read_parquet

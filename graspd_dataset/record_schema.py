@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from graspd_bench.tables import markdown_table
+from graspd_core.runtime.records import markdown_table
 from graspd_core.verify.metrics import METRICS
 
 

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from datetime import date
 from typing import Any
 
-from graspd_bench.result_store import code_version, commit
 from graspd_core.errors import ConfigError
+from graspd_core.runtime.records import code_version, commit
 from graspd_dataset.blocks import FORMAT, SCHEMA_VERSION, Block, DatasetObject, DatasetRequest, by_object, content_key
 from graspd_dataset.dataset_store import DatasetStore, keys_below
 from graspd_dataset.guarded_calls import Report

@@ -29,7 +29,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import SHAPES
 from graspd_core.optimize.candidates import find_candidates
 from graspd_core.optimize.loop import Hooks
-from graspd_core.optimize.plan_config import METHODS, plan_config
+from graspd_core.optimize.plan_config import method_row, plan_config
 from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
 from graspd_core.perception.scene import object_parts
 from graspd_core.types import StopHook, Verdict
@@ -84,7 +84,7 @@ def page_data(runs: Sequence[Record]) -> dict[str, Any]:
 
 
 def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
-    method, (low, middle, high) = METHODS[point.method], point.x
+    method, (low, middle, high) = method_row(point.method), point.x
     if time == "cpu_per_verified":  # as the tables have it, all objects together
         middle = per_verified(group)
     x = (low, middle, high)

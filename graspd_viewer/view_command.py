@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graspd_core.cli.running import EXIT_OK, Interrupt
+from graspd_core.cli.options import add_address
+from graspd_core.cli.running import EXIT_OK, Interrupt, Watched
 from graspd_core.errors import ConfigError
-from graspd_core.types import GraspResult, ProgressHook, WatchHook
+from graspd_core.types import GraspResult
 
 if TYPE_CHECKING:
     from graspd_core.hands.model import HandModel
@@ -37,12 +37,6 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="instead of the one that the file names")
     parser.add_argument("--html", type=Path, default=None, metavar="page.html", help="of a benchmark: one file")
     add_address(parser)
-
-
-def add_address(parser: argparse.ArgumentParser) -> None:
-    """Where a page is served."""
-    parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
-    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -70,34 +64,9 @@ def run(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-@dataclass(frozen=True)
-class Watched:
-    """How a run is followed in a browser; as it stands, by nobody.
-
-    Attributes:
-        watch: hook of `plan_grasps`.
-        told: as its progress hook.
-        show: shows what was found until Ctrl-C.
-    """
-
-    watch: WatchHook | None = None
-    told: ProgressHook | None = None
-    show: Callable[[GraspResult], None] = lambda result: None
-
-    def progress(self, reporter: ProgressHook) -> ProgressHook:
-        """The progress hook of a run that `reporter` follows too."""
-        told = self.told
-        if told is None:
-            return reporter
-        return lambda progress: (reporter(progress), told(progress))[0]
-
-
 @contextmanager
 def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: PlanConfig) -> Iterator[Watched]:
-    """A page for a run with --view, which begins when somebody is there or a minute has passed; else nothing."""
-    if not options.view:
-        yield Watched()
-        return
+    """A page for a run with --view, which begins when somebody is there or a minute has passed."""
     from graspd_viewer.session import make_session, seen_points
     from graspd_viewer.viewer import Viewer
 

@@ -1,12 +1,10 @@
-"""Settings of simulated annealing.
+"""A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
 
-A low-dimensional space of postures for any hand, and the places on the inside of its links.
+It searches a low-dimensional space of postures for any hand, and the places on the inside of its links.
 
 Eigengrasps (Ciocarlie and Allen, IJRR 2009) are the principal components of how people shape their hands. No such
 recordings exist for an arbitrary hand, so here they are those of seeded random postures between open and closed, in
 which the fingers mostly close together: the first is the hand's closing, the next are how fingers differ.
-
-A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
 
 A chain's state is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, the mean over
 chosen places on the inside of the hand of their distance to the object and of how far they face away from it,
@@ -39,6 +37,7 @@ from graspd_core.optimize.grasp_postures import ContactSet, find_contacts
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
+from graspd_core.optimize.plan_config import Method
 from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
 
 
@@ -382,3 +381,6 @@ def plan(task: PlannerInput) -> PlannerOutput:
     epsilon = sampled_epsilon(problem, contact_set, directions)
     kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
     return PlannerOutput(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)
+
+
+METHOD = Method(__name__, AnnealingConfig, "annealing", "#009E73", "^", 8)

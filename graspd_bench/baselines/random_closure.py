@@ -1,6 +1,4 @@
-"""Settings of the random baseline.
-
-The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
+"""The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
 
 The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open, and moves along
 its normal until the hand first touches; then the fingers close (`closing`). Nothing is chosen by quality: of the hands
@@ -18,9 +16,10 @@ from torch import Tensor
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, allowed_of, problem_of
-from graspd_core.optimize.finger_closing import Closing, link_gaps, make_closing
+from graspd_core.optimize.finger_closing import CLOSE_STEPS, Closing, link_gaps, make_closing
 from graspd_core.optimize.loop import Poses, minimise
 from graspd_core.optimize.obstacle_distance import hand_reach, obstacle_gaps
+from graspd_core.optimize.plan_config import Method
 from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
 
@@ -37,7 +36,7 @@ class RandomClosureConfig:
 
     rounds: int = 4
     touching: int = 3
-    close_steps: int = 60
+    close_steps: int = CLOSE_STEPS
 
 
 # The advance ends this far from the object, or after so many steps of the nearest distance each [m].
@@ -119,3 +118,6 @@ def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
         return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
     links = forward(problem.hand.kinematics, poses.joints)
     return obstacle_gaps(problem.obstacles, poses.base, links).amin(-1) >= 0.0
+
+
+METHOD = Method(__name__, RandomClosureConfig, "random closure", "#7F7F7F", "D", 16)

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from graspd_bench.stopwatch import peak_mb
 from graspd_core.errors import GraspdError
 from graspd_core.perception.scene import ObjectModel, Scene, object_parts
+from graspd_core.runtime.records import peak_mb
 from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
 
 Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]

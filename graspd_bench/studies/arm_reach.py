@@ -21,7 +21,6 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from graspd_bench.study import Case, ObjectCase, Record, Request, Sections, find_objects
-from graspd_bench.tables import markdown_table
 from graspd_core.arms.arm import Arm, arm_links, arm_names, load_arm
 from graspd_core.arms.arm_paths import arm_paths
 from graspd_core.arms.inverse_kinematics import (
@@ -37,6 +36,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.optimize.restrictions import BoundRestriction, Refusal
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.se3 import SE3, axis_rotation
 from graspd_core.types import ArmPath, Grasp, Plane, Progress, TriangleMesh
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from graspd_bench.study import ObjectCase, Record, Request, Sections, find_objects, raw_grasps
-from graspd_bench.tables import markdown_table
 from graspd_bench.trials import gravity_trial
 from graspd_core.config import RobustConfig
 from graspd_core.hands.library import hand_names
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Plane, TriangleMesh
 from graspd_core.verify.hold_trial import displaced, hold_trial, pose_errors
 from graspd_core.verify.lift_trial import lift_trial

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from graspd_bench.study import Case, Record, Request, Sections
-from graspd_bench.tables import markdown_table
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.topology import is_closed
@@ -26,6 +25,7 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.load_scene import scene_from_views
 from graspd_core.perception.segment.segment import Target, segment
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Verdict
 
 # Clouds are compared by the cubes of this side that they touch [m].

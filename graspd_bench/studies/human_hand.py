@@ -25,15 +25,16 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
-from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, object_hash, raw_grasps, thing_name
-from graspd_bench.tables import markdown_table
+from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.shapes import object_hash, thing_name
 from graspd_core.mesh.surface_queries import DistanceQuery, inside, make_distance_query, signed_distance
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, build_world

@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 
 from graspd_bench.measurement import TRIALS, Tried
-from graspd_bench.study import ObjectCase, Record, Request, Sections, raw_grasps, thing_name
-from graspd_bench.tables import markdown_table
+from graspd_bench.study import ObjectCase, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.shapes import thing_name
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import METRICS, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context

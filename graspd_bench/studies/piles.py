@@ -25,14 +25,13 @@ from scipy.spatial import KDTree
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.render import look_at, render_shaded, save_png
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, depth_views, moved, ring_poses, tabletop
-from graspd_bench.study import Case, Picture, Record, Request, Sections, find_objects, object_hash, thing_name
-from graspd_bench.tables import markdown_table
+from graspd_bench.study import Case, Picture, Record, Request, Sections, find_objects
 from graspd_bench.trials import Lifted, lift_out, settle
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import SHAPES
+from graspd_core.mesh.shapes import SHAPES, object_hash, thing_name
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.cloud.camera import cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
@@ -41,6 +40,7 @@ from graspd_core.perception.scene import object_parts
 from graspd_core.perception.segment.segment import find_things
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.se3 import random_rotations, rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Posture, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings

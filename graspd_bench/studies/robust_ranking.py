@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_bench.charts import figure, save
-from graspd_bench.study import ObjectCase, Picture, Record, Request, Sections, object_cases, thing_name
-from graspd_bench.tables import markdown_table
-from graspd_core.optimize.plan_config import METHODS
+from graspd_bench.study import ObjectCase, Picture, Record, Request, Sections, object_cases
+from graspd_core.mesh.shapes import thing_name
+from graspd_core.optimize.plan_config import method_row
 from graspd_core.perception.scene import object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Verdict
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
@@ -28,7 +29,7 @@ SHAPES = ("shape:box", "shape:plate", "shape:torus", "shape:bottle", "shape:l_bl
 # Errors of the evaluating trials: as many for each grasp, from a seed that no plan draws from.
 EVALUATIONS, EVALUATION_SEED = 16, 977
 FRICTION = 0.6
-_SCORE, _NOISE, _BEST = (METHODS[name].colour for name in ("graspd2022", "closed_form", "random_closure"))
+_SCORE, _NOISE, _BEST = (method_row(name).colour for name in ("graspd2022", "closed_form", "random_closure"))
 
 
 def robust_cases(request: Request) -> tuple[ObjectCase, ...]:

@@ -17,13 +17,13 @@ import numpy as np
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
-from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, thing_name
-from graspd_bench.tables import markdown_table
+from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import load_mesh, surface_samples
 from graspd_core.mesh.sdf import build_sdf
+from graspd_core.mesh.shapes import thing_name
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.load_scene import scene_from_views
@@ -31,6 +31,7 @@ from graspd_core.perception.scene import Obstacle, Scene, build_scene, object_pa
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, GraspResult, Verdict
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.lift_trial import lift_trial

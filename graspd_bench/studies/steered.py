@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from graspd_bench.study import ObjectCase, Record, Request, Sections, find_objects, thing_name
-from graspd_bench.tables import markdown_table
+from graspd_bench.study import ObjectCase, Record, Request, Sections, find_objects
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.shapes import thing_name
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.regions import Box, entered
 from graspd_core.planning.steering import Steering
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Verdict
 
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, thing_name
-from graspd_bench.tables import markdown_table
-from graspd_core.mesh.shapes import SHAPES
+from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases
+from graspd_core.mesh.shapes import SHAPES, thing_name
 from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Verdict
 
 THREADS = (1, 2)

@@ -1,28 +1,22 @@
-"""The command line, one file a command; heavy imports wait for who needs them.
+"""The command line, one file a command. Each command imports heavy libraries when it runs.
 
-graspd synthesize | view | replay | reconstruct | bench | dataset | import | library | hands | doctor
+graspd synthesize | replay | reconstruct | library | hands | doctor are graspd_core's own. Other packages add commands
+by entry points of the group `graspd.commands`: view, bench, dataset and import.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import importlib
 import sys
 import time
 from collections.abc import Sequence
+from importlib.metadata import entry_points
 from typing import NoReturn
 
-from graspd_bench import bench_command as bench
-from graspd_core.cli import hands_command as hands
-from graspd_core.cli import library_command as library
-from graspd_core.cli import reconstruct_command as reconstruct
-from graspd_core.cli import replay_command as replay
-from graspd_core.cli import synthesize_command as synthesize
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, process_began
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_dataset import dataset_command as dataset
-from graspd_dataset import import_command as imports
-from graspd_viewer import view_command as view
 
 # New objects between two looks for garbage, by default 700. What libraries make when they are imported stays, and
 # looking through it takes a tenth of the time.
@@ -37,7 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own_process:
         gc.set_threshold(_YOUNG)
     try:
-        options = build_parser().parse_args(arguments)
+        words = sys.argv[1:] if arguments is None else list(arguments)
+        options = build_parser(*words[:1]).parse_args(words)
         options.began = began
         return int(options.run(options))
     except (GraspdError, OSError) as error:
@@ -59,25 +54,33 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(f"{message} (see {self.prog} --help)")
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; raises ConfigError for options that it does not know."""
+# The commands of graspd_core, in the order of `graspd --help`.
+_COMMANDS = {
+    "synthesize": "graspd_core.cli.synthesize_command",
+    "replay": "graspd_core.cli.replay_command",
+    "reconstruct": "graspd_core.cli.reconstruct_command",
+    "library": "graspd_core.cli.library_command",
+    "hands": "graspd_core.cli.hands_command",
+    "doctor": "graspd_core.doctor",
+}
+
+
+def build_parser(command: str = "") -> argparse.ArgumentParser:
+    """Build the parser of `command` alone, or of all commands if there is no such command.
+
+    Raises ConfigError: the parser meets options that it does not know.
+    """
     parser = _Parser(prog="graspd", description="Verified grasps for multi-fingered hands.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    synthesize.add_command(commands)
-    view.add_command(commands)
-    replay.add_command(commands)
-    reconstruct.add_command(commands)
-    bench.add_command(commands)
-    dataset.add_command(commands)
-    imports.add_command(commands)
-    library.add_command(commands)
-    hands.add_command(commands)
-    doctor = commands.add_parser("doctor", help="check the installation")
-    doctor.set_defaults(run=_doctor)
+    modules = {command: _COMMANDS[command]} if command in _COMMANDS else _with_siblings(command)
+    for module in modules.values():
+        importlib.import_module(module).add_command(commands)
     return parser
 
 
-def _doctor(options: argparse.Namespace) -> int:
-    from graspd_core import doctor
-
-    return doctor.main()
+def _with_siblings(command: str) -> dict[str, str]:
+    """Return the module of each command of all installed packages, or only that of `command` if it is one of them."""
+    registered = {point.name: point.value for point in entry_points(group="graspd.commands")}
+    if command in SIBLINGS and command not in registered:
+        raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
+    return {command: registered[command]} if command in registered else _COMMANDS | registered

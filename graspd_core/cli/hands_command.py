@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.cli.running import EXIT_OK
+from graspd_core.cli.running import EXIT_OK, sibling
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import link_depths
 from graspd_core.hands.model import HandModel, all_joint_names
@@ -54,7 +54,6 @@ def run_inspect(options: argparse.Namespace) -> int:
     """Print what is known of one hand."""
     import torch
 
-    from graspd_bench.rendering.render import hand_picture, save_png
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable, save_text
 
@@ -70,7 +69,8 @@ def run_inspect(options: argparse.Namespace) -> int:
     found = report(hand)
     print(as_text(found))
     if options.picture is not None:
-        save_png(hand_picture(hand), options.picture)
+        render = sibling("graspd_bench.rendering.render")
+        render.save_png(render.hand_picture(hand), options.picture)
         print(f"{options.picture}: open (left) and closed (right), from the side and onto the palm")
     if options.yaml is not None:
         urdf = os.path.relpath(hand.urdf, options.yaml.parent)

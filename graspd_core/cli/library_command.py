@@ -32,9 +32,9 @@ def add_command(commands: Any) -> None:
 
 def _build(options: argparse.Namespace) -> int:
     """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 after Ctrl-C."""
-    from graspd_bench.study import object_sources
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
+    from graspd_core.mesh.shapes import object_sources
 
     config, request = planning_options(options)
     if options.verify == "none":

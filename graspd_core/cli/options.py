@@ -21,7 +21,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
-from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, preset_names
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.types import GraspResult, Outcome, Timing
 
@@ -42,7 +42,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     """Hand, number, method and trial of the grasps, and what is known of the object."""
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="graspd hands lists the names")
     parser.add_argument("-n", "--count", type=int, default=16, help="verified grasps wanted (default 16)")
-    parser.add_argument("--method", choices=METHODS, default=None)
+    parser.add_argument("--method", default=None, metavar="NAME", help="instead of the preset's, at its defaults")
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mass", type=float, default=0.1, metavar="KG", help="of the object (default 0.1)")
@@ -340,3 +340,9 @@ def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
     x, y, z, *turn = base
     w, i, j, k = turn or (1.0, 0.0, 0.0, 0.0)
     return (Reach(arm, (x, y, z), (w, i, j, k)),)
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Where a page is served."""
+    parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
+    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")

@@ -10,13 +10,17 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from graspd_core.types import Progress, Stage
+from graspd_core.errors import ConfigError
+from graspd_core.types import GraspResult, Progress, ProgressHook, Stage, WatchHook
 
 EXIT_OK, EXIT_BAD_INPUT, EXIT_TOO_FEW, EXIT_INTERRUPTED = 0, 2, 3, 130
 
@@ -150,3 +154,41 @@ def process_began() -> float:
     except (OSError, AttributeError, ValueError, IndexError):
         return now
     return now - max(age, 0.0)
+
+
+@dataclass(frozen=True)
+class Watched:
+    """How a run is followed in a browser; as it stands, by nobody.
+
+    Attributes:
+        watch: hook of `plan_grasps`.
+        told: as its progress hook.
+        show: shows what was found until Ctrl-C.
+    """
+
+    watch: WatchHook | None = None
+    told: ProgressHook | None = None
+    show: Callable[[GraspResult], None] = lambda result: None
+
+    def progress(self, reporter: ProgressHook) -> ProgressHook:
+        """The progress hook of a run that `reporter` follows too."""
+        told = self.told
+        if told is None:
+            return reporter
+        return lambda progress: (reporter(progress), told(progress))[0]
+
+
+# Packages beside graspd_core by the command, or the option, that needs them.
+SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd_dataset", "import": "graspd_dataset"}
+
+
+def sibling(module: str) -> Any:
+    """Import a module of a package beside graspd_core.
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+    package = module.partition(".")[0]
+    if find_spec(package) is None:
+        raise ConfigError(f"{package} is not installed; run: pip install graspd")
+    return import_module(module)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import (
+    add_address,
     add_object_options,
     add_planning_options,
     add_restriction_options,
@@ -21,9 +23,8 @@ from graspd_core.cli.options import (
     summary,
     target_of,
 )
-from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Reporter
+from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Reporter, Watched, sibling
 from graspd_core.types import GraspResult
-from graspd_viewer.view_command import add_address, watched
 
 if TYPE_CHECKING:
     from graspd_core.hands.model import HandModel
@@ -83,7 +84,10 @@ def run(options: argparse.Namespace) -> int:
         return exit_status(result)
     for warning in scene.object.warnings:
         print(f"graspd: {warning}", file=sys.stderr)
-    with watched(options, scene, hand, config) as page:
+    page_of_run = nullcontext(Watched())
+    if options.view:
+        page_of_run = sibling("graspd_viewer.view_command").watched(options, scene, hand, config)
+    with page_of_run as page:
         with Reporter() as reporter, Interrupt() as interrupt:
             hooks = {"progress": page.progress(reporter), "watch": page.watch, "stop": interrupt.came}
             result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
@@ -102,9 +106,8 @@ def _report(
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html:
-        from graspd_viewer.grasp_page import save_view
-
-        save_view(options.html, scene.object.mesh, hand, result.grasps, name=Path(options.object).name)
+        page = sibling("graspd_viewer.grasp_page")
+        page.save_view(options.html, scene.object.mesh, hand, result.grasps, name=Path(options.object).name)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
     if options.out:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +101,12 @@ def _with_effort(hand: HandModel) -> HandModel:
     """Efforts that the URDF leaves open (absent or zero, a common placeholder) set to the default."""
     default = np.where(hand.slides, DEFAULT_FORCE, DEFAULT_EFFORT)
     return replace(hand, effort=np.where(np.isfinite(hand.effort), hand.effort, default))
+
+
+@lru_cache
+def hand_hash(name: str) -> str:
+    """Hash of a hand's URDF and description. Raises HandError: there is no such hand, or it cannot be used."""
+    hand = load_hand(name, candidates=1)
+    boxed = config_dir() / "hands" / f"{name}.yaml"
+    files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

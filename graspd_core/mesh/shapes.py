@@ -7,14 +7,19 @@ winding number is not zero.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from math import asin, pi, sqrt
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import MeshError
+from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
 from graspd_core.types import TriangleMesh
 
 SEGMENTS = 64
@@ -215,3 +220,39 @@ VOLUMES: dict[str, Callable[[], float]] = {
     "l_block": lambda: (L_LONG + L_SHORT - L_THICK) * L_THICK * 2 * L_HALF_WIDTH,
     "hammer": lambda: _box_volume(HEAD_HALF) + pi * SHAFT_RADIUS**2 * (HEAD_LOW - SHAFT_LOW),
 }
+
+
+def thing_name(source: Any) -> str:
+    """What an object goes by: the shape, or the file without its ending; other values as they are."""
+    text = f"{source:g}" if isinstance(source, float) else str(source)
+    path = Path(text)
+    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
+
+
+def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
+    """Shapes, mesh files and the meshes of folders. Raises MeshError: there is no such thing."""
+    found: list[str] = []
+    for source in sources:
+        path = Path(source)
+        if not source.startswith("shape:") and path.is_dir():
+            files = sorted(p for p in path.iterdir() if p.suffix.lower().lstrip(".") in MESH_ENDINGS)
+            if not files:
+                raise MeshError(f"{source}: no mesh in this folder; valid endings: {', '.join(MESH_ENDINGS)}")
+            found += map(str, files)
+        else:
+            object_hash(source)
+            found.append(source)
+    return tuple(found)
+
+
+@lru_cache
+def object_hash(source: str) -> str:
+    """Hash of the content of a shape or a mesh file. Raises MeshError: there is no such thing."""
+    if source.startswith("shape:"):
+        return content_hash(make_shape(source.removeprefix("shape:")))
+    path = Path(source)
+    if not path.is_file():
+        raise MeshError(f"{path}: no such mesh file; shape:NAME is an authored shape: {', '.join(sorted(SHAPES))}")
+    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
+        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -19,7 +19,7 @@ from graspd_core.optimize.grasp_postures import approach_depth, find_contacts, f
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses
 from graspd_core.optimize.obstacle_distance import gap_on_the_way
-from graspd_core.optimize.plan_config import METHODS, PlanConfig
+from graspd_core.optimize.plan_config import PlanConfig, method_row
 from graspd_core.optimize.problem import Problem, build_problem
 from graspd_core.optimize.ranking import Staged, score
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
@@ -132,7 +132,7 @@ def find_candidates(
     """
     task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
     found = _searched(task)
-    for again in range(1, METHODS[config.method].searches(config.settings)):
+    for again in range(1, method_row(config.method).searches(config.settings)):
         if found.interrupted or expected_to_hold(found.grasps[:count]) >= _LEAST_EXPECTED * count:
             break
         more = _searched(replace(task, seed=seed + _SEED_STEP * again))
@@ -146,7 +146,7 @@ def expected_to_hold(grasps: Sequence[Grasp]) -> float:
 
 
 def _searched(task: PlannerInput) -> Candidates:
-    found = METHODS[task.config.method].plan(task)
+    found = method_row(task.config.method).plan(task)
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
     return Candidates(assemble(found.problem, task.hand, found.poses, task.config, task.hooks.stop), found.interrupted)

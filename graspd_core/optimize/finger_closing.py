@@ -23,6 +23,8 @@ from graspd_core.optimize.grasp_postures import nearest_features
 from graspd_core.optimize.loop import Poses
 from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
 
+# Steps of a closing from open to closed.
+CLOSE_STEPS = 60
 # A finger whose step is halved to this share has arrived; steps are full travels of the closing over `close_steps`.
 _ARRIVED = 1 / 32
 # Overlap of proxy spheres beyond that at the start that counts as a collision of the hand with itself [m].

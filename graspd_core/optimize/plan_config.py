@@ -1,6 +1,7 @@
-"""The methods: a row each. To add one, write its folder and its row; nothing else is edited.
+"""Everything that a run of `plan_grasps` is set by: the methods, their settings, and the presets that hold them.
 
-Everything that a run of `plan_grasps` is set by, and the presets that hold it.
+A method of graspd_core is a row of `METHODS`. A method of another package registers itself: an entry point of the group
+`graspd.methods` names its row, which is loaded when the method is first asked for.
 """
 
 from __future__ import annotations
@@ -9,12 +10,12 @@ import dataclasses
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graspd_bench.baselines.annealing import AnnealingConfig
-from graspd_bench.baselines.random_closure import RandomClosureConfig
 from graspd_core.config import CertaintyConfig, GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
 from graspd_core.config.mapping import coerced, read_yaml
 from graspd_core.errors import ConfigError, shown
@@ -76,19 +77,32 @@ METHODS: dict[str, Method] = {
     "graspd2022": Method(
         "graspd_core.optimize.graspd2022.graspd2022", Graspd2022Config, "Grasp'D (2022)", "#D55E00", "s", 8
     ),
-    "annealing": Method("graspd_bench.baselines.annealing", AnnealingConfig, "annealing", "#009E73", "^", 8),
-    "random_closure": Method(
-        "graspd_bench.baselines.random_closure",
-        RandomClosureConfig,
-        "random closure",
-        "#7F7F7F",
-        "D",
-        16,
-    ),
 }
 
+_DEFAULT_METHOD, _GROUP = "closed_form", "graspd.methods"
 
-_DEFAULT_METHOD = "closed_form"
+
+@cache
+def _registered() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=_GROUP)}
+
+
+def method_names() -> tuple[str, ...]:
+    """Return the names of all methods: those of graspd_core and those that other packages register."""
+    return tuple(dict.fromkeys((*METHODS, *_registered())))
+
+
+def method_row(name: Any, where: str = "config") -> Method:
+    """Return the row of a method.
+
+    Raises:
+        ConfigError: there is no such method.
+    """
+    if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
+        raise ConfigError(f"{where}.method: {shown(name)} is not one of {', '.join(method_names())}")
+    if name not in METHODS:
+        METHODS[name] = _registered()[name].load()
+    return METHODS[name]
 
 
 @dataclass(frozen=True)
@@ -97,7 +111,7 @@ class PlanConfig:
 
     Attributes:
         resolution: the signed distance grid has at most the cube of it in nodes; a cube has as many along each side.
-        method: how poses are searched for, a name of `METHODS`.
+        method: how poses are searched for, one of `method_names`.
         settings: of that method, of the type that its row names; None takes the defaults.
         problem: how scene and hand are laid out.
         grasp_stages: pregrasp and squeeze.
@@ -119,7 +133,7 @@ class PlanConfig:
     certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
 
     def __post_init__(self) -> None:
-        config = _row(self.method, "config").config
+        config = method_row(self.method).config
         if self.settings is None:
             object.__setattr__(self, "settings", config())
         elif not isinstance(self.settings, config):
@@ -127,17 +141,11 @@ class PlanConfig:
 
     def at_budget(self, budget: float) -> PlanConfig:
         """The same method with more or less effort; 1 is its settings as they are."""
-        return dataclasses.replace(self, settings=METHODS[self.method].at_budget(self.settings, budget))
+        return dataclasses.replace(self, settings=method_row(self.method).at_budget(self.settings, budget))
 
     def with_method(self, method: str) -> PlanConfig:
         """The settings with another method at its defaults; unchanged where it is the same method."""
         return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
-
-
-def _row(method: Any, where: str) -> Any:
-    if not isinstance(method, str) or method not in METHODS:
-        raise ConfigError(f"{where}.method: {shown(method)} is not one of {', '.join(METHODS)}")
-    return METHODS[method]
 
 
 def to_mapping(config: PlanConfig) -> dict[str, Any]:
@@ -153,12 +161,13 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
         ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
     """
     named = values.get("method", _DEFAULT_METHOD) if isinstance(values, Mapping) else _DEFAULT_METHOD
-    row = _row(named, where)
-    others = sorted((set(values) & set(METHODS)) - {named}) if isinstance(values, Mapping) else []
-    if others:
-        raise ConfigError(f"{where}.{others[0]}: settings of another method; this one has method: {named}")
+    row = method_row(named, where)
     hints = {f.name: f.default_factory for f in dataclasses.fields(PlanConfig) if f.name not in ("settings", "method")}
     hints |= {"resolution": int, "method": str, named: row.config}
+    unknown = set(values) - set(hints) if isinstance(values, Mapping) else ()
+    # Only an unknown key is worth the search for other packages' methods.
+    if others := sorted(name for name in unknown if name in method_names()):
+        raise ConfigError(f"{where}.{others[0]}: settings of another method; this one has method: {named}")
     found = coerced(hints, values, where)
     return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
 

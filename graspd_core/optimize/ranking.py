@@ -134,5 +134,5 @@ def _spread(rows: Float[Tensor, "batch slots 3"], count: Float[Tensor, "batch"])
 @lru_cache(maxsize=1)
 def _fitted() -> dict[str, Tensor]:
     """The network: mean and deviation of the figures, weights and biases of its layers."""
-    with files("graspd_core.methods.stages").joinpath("ranking.npz").open("rb") as file, np.load(file) as arrays:
+    with files("graspd_core.optimize").joinpath("ranking.npz").open("rb") as file, np.load(file) as arrays:
         return {name: torch.as_tensor(arrays[name]).double() for name in arrays.files}

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from graspd_bench.result_store import case_file, case_key, code_version
+from graspd_bench.result_store import case_file, case_key
 from graspd_bench.run_studies import Job, make_plan, run_job, studies_of
 from graspd_bench.studies.human_hand import SOFTNESS
 from graspd_bench.study import Request
 from graspd_bench.study_registry import STUDIES
 from graspd_bench.tables import sourced, written
 from graspd_core.errors import ConfigError
+from graspd_core.runtime.records import code_version
 
 ROOT = Path(__file__).parents[2]
 # Of each the marker of a section that its report fills, and the page that has it; their smallest runs take seconds.

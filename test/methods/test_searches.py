@@ -9,7 +9,7 @@ import pytest
 from graspd_core.hands.library import load_hand
 from graspd_core.optimize.candidates import expected_to_hold, find_candidates
 from graspd_core.optimize.loop import Hooks
-from graspd_core.optimize.plan_config import METHODS, load_preset
+from graspd_core.optimize.plan_config import METHODS, load_preset, method_row
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import Grasp
 
@@ -57,7 +57,7 @@ def test_a_search_that_is_cancelled_is_the_last():
 
 @pytest.mark.parametrize("name", sorted(set(METHODS) - {"closed_form"}))
 def test_other_methods_search_once_as_published(name: str):
-    assert METHODS[name].searches(METHODS[name].config()) == 1
+    assert method_row(name).searches(method_row(name).config()) == 1
 
 
 def test_no_score_is_too_far_for_a_probability():
