@@ -102,12 +102,11 @@ _MODULES = {
 # Names that version 0.1 had here: they are found with a warning until 0.3.
 _MOVED = {
     "io.grasps_json": "grasp_figures grasps_of load_document",
-    "hands.kinematics": "link_poses",
+    "hands.kinematics": "link_poses retreat_posture",
     "hands.model": "Mount all_joint_names all_joint_positions",
     "planning.plan_grasps": "check_request",
     "runtime.worker_process": "limit_malloc_arenas run_isolated start_planning_worker trim_heap",
     "perception.cloud.point_cloud": "transform_cloud",
-    "verify.lift_trial": "retreat_posture",
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 _MOVED_TO = {name: module for module, names in _MOVED.items() for name in names.split()}

@@ -54,6 +54,13 @@ class TriangleMesh:
     faces: Int[np.ndarray, "faces 3"]
 
 
+def joined(*meshes: TriangleMesh) -> TriangleMesh:
+    """Return meshes as one, their vertices and faces in order."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    return TriangleMesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
+
+
 @dataclass(frozen=True)
 class Plane:
     """A flat support that fills the half-space n·x < offset.

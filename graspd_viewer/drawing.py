@@ -1,4 +1,4 @@
-"""What is drawn, as plain meshes: the browser (`scene_nodes`) and the docs (`pictures`) show the same.
+"""What is drawn, as plain meshes: the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`) show the same.
 
 What a grasp does to its object: the forces of its squeeze, and the push that it resists least.
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, primitive_mesh
+from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, primitive_mesh, retreat_posture
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.grasp_postures import find_contacts, squeeze
@@ -22,8 +22,7 @@ from graspd_core.optimize.loop import Poses
 from graspd_core.optimize.problem import build_problem
 from graspd_core.perception.scene import ObjectModel, Scene, sample_confidence
 from graspd_core.se3 import SE3, perpendicular, quaternion_from_rotation, rotation_from_quaternion
-from graspd_core.types import Contact, Grasp, Plane, Posture, Snapshot, TriangleMesh, Verdict
-from graspd_core.verify.lift_trial import retreat_posture
+from graspd_core.types import Contact, Grasp, Plane, Posture, Snapshot, TriangleMesh, Verdict, joined
 from graspd_core.verify.prepared_grasp import make_metrics_context, prepare_grasp
 from graspd_viewer.session import Session
 
@@ -57,7 +56,7 @@ def hand_parts(hand: HandModel) -> dict[int, Part]:
     parts = {}
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
-            mesh = joined([primitive_mesh(primitive) for primitive in primitives])
+            mesh = joined(*(primitive_mesh(primitive) for primitive in primitives))
             parts[link] = Part(f"hand/{link}", mesh, HAND)
     return parts
 
@@ -151,14 +150,7 @@ def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], rad
         for body, offset in ((shaft, 0.5 * (length - head)), (cone, length - head)):
             local = np.asarray(body.vertices) + np.array([0.0, 0.0, offset])
             bodies.append(TriangleMesh(local @ turn.T + start, np.asarray(body.faces, dtype=np.int64)))
-    return joined(bodies)
-
-
-def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """All of them as one."""
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
-    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+    return joined(*bodies)
 
 
 def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:

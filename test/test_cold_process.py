@@ -16,7 +16,6 @@ UNUSED = [
     "scipy.stats",
     "scipy.optimize",
     "fast_simplification",
-    "vhacdx",
     "pybullet",
 ]
 UNUSED += [

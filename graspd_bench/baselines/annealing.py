@@ -31,6 +31,7 @@ from graspd_core.hands.kinematics import link_poses, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.mesh.sharp_features import farthest_first
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, initial_poses_of, problem_of
 from graspd_core.optimize.finger_closing import finger_of, link_gaps, make_closing, sphere_overlap
 from graspd_core.optimize.grasp_postures import ContactSet, find_contacts
@@ -126,20 +127,21 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
     facing = _facing(hand)
     group = hand.link_group[hand.candidate_link]
     rotation, translation = link_poses(hand, hand.open_posture)
-    hand_forward = np.einsum("pij,pj->pi", rotation[hand.candidate_link], hand.candidate_points)
-    hand_forward += translation[hand.candidate_link]
+    position = np.einsum("pij,pj->pi", rotation[hand.candidate_link], hand.candidate_points)
+    position += translation[hand.candidate_link]
     for number in np.unique(group):
         most = float(facing[group == number].max())
         if most < _LEAST_FACING:
             continue
         inside = np.flatnonzero((group == number) & (facing >= min(most, _FACING)))
-        middle = hand.palm_center if number == hand.link_group[0] else hand_forward[inside].mean(0)
-        away = np.linalg.norm(hand_forward[inside] - middle, axis=1)
-        picks = [int(away.argmin())]
-        for _ in range(min(per_link, len(inside)) - 1):
-            nearest = np.linalg.norm(hand_forward[inside][:, None] - hand_forward[inside][picks], axis=-1).min(1)
-            picks.append(int(nearest.argmax()))
-        chosen += inside[picks].tolist()
+        middle = hand.palm_center if number == hand.link_group[0] else position[inside].mean(0)
+        points = position[inside]
+
+        def distances(index: int, points: np.ndarray = points) -> np.ndarray:
+            return np.linalg.norm(points - points[index], axis=-1)
+
+        first = int(np.linalg.norm(points - middle, axis=1).argmin())
+        chosen += inside[farthest_first(len(inside), per_link, [first], distances)].tolist()
     return np.array(chosen, dtype=np.int64)
 
 

@@ -1,8 +1,8 @@
 """The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
 
 The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open, and moves along
-its normal until the hand first touches; then the fingers close (`closing`). Nothing is chosen by quality: of the hands
-that touch with enough links, and reach through no obstacle, the first are taken. No gradients.
+its normal until the hand first touches; then the fingers close (`finger_closing`). Nothing is chosen by quality: of the
+hands that touch with enough links, and reach through no obstacle, the first are taken. No gradients.
 """
 
 from __future__ import annotations

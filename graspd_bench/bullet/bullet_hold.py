@@ -1,4 +1,4 @@
-"""The hold trial in the second simulator: same stages, gains, effort limits, pulls and limits as `trial.hold_trial`.
+"""The hold trial in the second simulator: same stages, gains, effort limits, pulls and limits as `hold_trial`.
 
 What Bullet does in another way, and how it is matched: docs/metrics.md.
 """

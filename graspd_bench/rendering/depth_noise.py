@@ -151,10 +151,10 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
     if not baseline:
         return np.zeros(depth.shape, dtype=bool)
     with np.errstate(divide="ignore"):
-        place_points = np.arange(camera.width) - np.where(depth > 0, camera.fx * baseline / depth, -np.inf)
-    leftmost = np.minimum.accumulate(place_points[:, ::-1], axis=1)[:, ::-1]
+        other_column = np.arange(camera.width) - np.where(depth > 0, camera.fx * baseline / depth, -np.inf)
+    leftmost = np.minimum.accumulate(other_column[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros(depth.shape, dtype=bool)
-    hidden[:, :-1] = (depth[:, :-1] > 0) & (leftmost[:, 1:] <= place_points[:, :-1])
+    hidden[:, :-1] = (depth[:, :-1] > 0) & (leftmost[:, 1:] <= other_column[:, :-1])
     return hidden
 
 

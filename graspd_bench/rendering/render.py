@@ -17,11 +17,10 @@ from jaxtyping import Float, Int, UInt8
 
 from graspd_core.hands.kinematics import hand_mesh, link_poses
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import joined
 from graspd_core.mesh.surface_queries import first_hits
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_core.se3 import perpendicular
-from graspd_core.types import TriangleMesh
+from graspd_core.types import TriangleMesh, joined
 
 Vector = Sequence[float | int] | Float[np.ndarray, "3"]
 

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from graspd_bench.stress.run_stress_case import GRASP, Case
-from graspd_core.mesh.shapes import joined, make_shape
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene
-from graspd_core.types import TriangleMesh
+from graspd_core.types import TriangleMesh, joined
 
 _SEED = 7
 _FEW = ("TOO_FEW", "NO_CANDIDATES")

@@ -20,13 +20,14 @@ from torch import Tensor
 from graspd_core.arms.arm import Arm, arm_links, placed, tip_hand
 from graspd_core.arms.arm_collision import Hits, hits_of_hand, hits_of_scene, hits_of_self, hits_of_support, joined
 from graspd_core.arms.inverse_kinematics import nearest_postures, reach_bounds, solve, start_table, why_unreached
+from graspd_core.hands.kinematics import drawn_back
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import ArmPath, Grasp, Posture
 
-# The hand comes straight along its approach from as far as this, and goes up by as much [m].
-RETREAT, LIFT = 0.1, 0.1
+# How far up the hand goes after the grasp [m].
+LIFT = 0.1
 # Steps from retreat to pregrasp, pregrasp to grasp, grasp to lift: about 2 cm each.
 STEPS = (5, 2, 5)
 # Rows of the way at the ends of these steps.
@@ -42,11 +43,11 @@ def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Flo
         up: unit direction of the lift, scene frame.
     """
     before, there = (_stacked([getattr(grasp, stage) for grasp in grasps]) for stage in ("pregrasp", "grasp"))
-    back = -RETREAT * (rotation_from_quaternion(before[1]) @ torch.as_tensor(approach)[:, None]).squeeze(-1)
+    begun = drawn_back(before[0], rotation_from_quaternion(before[1]), torch.as_tensor(approach))
     # Both signs of a quaternion are one rotation: the nearer is turned to.
     sign = torch.where((before[1] * there[1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     raised = there[0] + LIFT * torch.as_tensor(up)
-    corners = torch.stack([before[0] + back, before[0], there[0], raised], 1)
+    corners = torch.stack([begun, before[0], there[0], raised], 1)
     turns = torch.stack([before[1], before[1], sign * there[1], sign * there[1]], 1)
     shares = torch.as_tensor(_SHARES)
     return SE3(rotation_from_quaternion(shares @ turns), shares @ corners)

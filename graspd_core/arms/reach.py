@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 
 from graspd_core.arms.arm import Arm, tip_hand
-from graspd_core.arms.arm_paths import LIFT, RETREAT, ArmTask, arm_paths, make_task, tip_poses
+from graspd_core.arms.arm_paths import LIFT, ArmTask, arm_paths, make_task, tip_poses
 from graspd_core.arms.inverse_kinematics import start_table, within_reach
 from graspd_core.errors import ConfigError
+from graspd_core.hands.kinematics import drawn_back
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.restrictions import BoundRestriction, Refusal
 from graspd_core.perception.scene import Scene
@@ -84,7 +85,7 @@ class BoundReach(BoundRestriction):
         """Which initial poses are no farther away than the arm reaches, nor nearer; retreated and lifted ones too."""
         task, at = self.task, torch.as_tensor(positions)
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
-        retreat = at - RETREAT * (rotation @ torch.as_tensor(task.hand.approach))
+        retreat = drawn_back(at, rotation, torch.as_tensor(task.hand.approach))
         lift = at + LIFT * torch.as_tensor(task.up)
         allowed = torch.arange(len(at))
         for there in (at, retreat, lift):

@@ -18,9 +18,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.mesh.shapes import joined
-from graspd_core.se3 import SE3
-from graspd_core.types import TriangleMesh
+from graspd_core.se3 import SE3, rotation_from_quaternion
+from graspd_core.types import Posture, TriangleMesh, joined
+
+# From how far a hand comes to its pregrasp, straight along its approach [m].
+RETREAT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +114,9 @@ def placement(
 ) -> Float[Tensor, "points columns"]:
     """A constant matrix that places link-frame points (or directions, which are only turned) by one product.
 
-    Row p holds the homogeneous coordinates of point p in the four columns of its link, so that `place` is one matrix
-    product for the whole batch: half the time of gathering a rotation per point, whose backward pass is a scatter.
+    Row p holds the homogeneous coordinates of point p in the four columns of its link, so that `place_points` is one
+    matrix product for the whole batch: half the time of gathering a rotation per point, whose backward pass is a
+    scatter.
     """
     matrix = points.new_zeros(len(points), num_links, 4)
     rows = torch.arange(len(points), device=points.device)
@@ -195,6 +198,22 @@ def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     for link in range(1, hand.num_links):
         behind[:, link] |= behind[:, hand.link_parent[link]]
     return behind
+
+
+def drawn_back(
+    position: Float[Tensor, "*batch 3"],
+    rotation: Float[Tensor, "*batch 3 3"],
+    approach: Float[Tensor, "3"],
+    distance: float = RETREAT,
+) -> Float[Tensor, "*batch 3"]:
+    """Return where base frames stand [m] that are moved straight back against the hand's approach direction."""
+    return position - distance * (rotation @ approach)
+
+
+def retreat_posture(hand: HandModel, pregrasp: Posture, distance: float = RETREAT) -> Posture:
+    """Return the pregrasp moved straight back against the hand's approach direction by `distance` [m]."""
+    rotation = rotation_from_quaternion(torch.as_tensor(pregrasp.quaternion_wxyz, dtype=torch.float64)).numpy()
+    return replace(pregrasp, position=pregrasp.position - distance * rotation @ hand.approach)
 
 
 def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:

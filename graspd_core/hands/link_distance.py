@@ -123,7 +123,7 @@ def capsule_sdf(
 
 def box_sdf(points: Float[Tensor, "*batch 3"], half_extents: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch"]:
     """Distance [m] to an axis-aligned box about the origin."""
-    return _corner_sdf(points.abs() - half_extents)
+    return corner_sdf(points.abs() - half_extents)
 
 
 def cylinder_sdf(
@@ -132,11 +132,11 @@ def cylinder_sdf(
     half_length: float | Float[Tensor, "*#batch"],
 ) -> Float[Tensor, "*batch"]:
     """Distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
-    return _corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
+    return corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
 
 
-def _corner_sdf(past: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
-    """Distance to a corner of `n` orthogonal faces from the signed distances past each face."""
+def corner_sdf(past: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    """Return the distance [m] to a corner of `n` orthogonal faces, from the signed distances past each face."""
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
 
 
@@ -266,4 +266,4 @@ def _distance(
     x = torch.where(is_round > 0, radial, reach[..., 0])
     y = torch.where(is_round > 0, torch.zeros_like(radial), reach[..., 1])
     past = torch.stack([x, y, reach[..., 2]], -1) - core
-    return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0) - radius
+    return corner_sdf(past) - radius

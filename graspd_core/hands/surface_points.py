@@ -22,6 +22,7 @@ from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.link_distance import primitive_sdf, within_bounds
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.mesh.sharp_features import farthest_first
 from graspd_core.mesh.surface_queries import closest_points, make_surface
 from graspd_core.runtime import disk_cache as cache
 
@@ -444,17 +445,11 @@ def _farthest(
 ) -> Int[np.ndarray, "count"]:
     """Farthest-point sampling of weighted distances; points of different groups are infinitely far from each other."""
     members = {group: np.flatnonzero(groups == group) for group in np.unique(groups)}
-    gap = np.full(len(points), np.inf)
-    picked = [int(i) for i in chosen]
 
-    def include(index: int) -> None:
-        mates = members[groups[index]]
-        distance = np.linalg.norm(points[mates] - points[index], axis=1) * weights[mates]
-        gap[mates] = np.minimum(gap[mates], distance)
+    def mates(index: int) -> np.ndarray:
+        return members[groups[index]]
 
-    for index in picked:
-        include(index)
-    while len(picked) < min(count, len(points)):
-        picked.append(int(gap.argmax()))
-        include(picked[-1])
-    return np.array(picked, dtype=np.int64)
+    def distances(index: int) -> np.ndarray:
+        return np.linalg.norm(points[mates(index)] - points[index], axis=1) * weights[mates(index)]
+
+    return farthest_first(len(points), count, chosen.tolist(), distances, mates)

@@ -150,7 +150,8 @@ def _sums_below(
     """Along each direction, the sum of the weights that lie in the slices below each cut."""
     directions = slices.shape[1]
     flat = (slices + SLICES * np.arange(directions)).ravel()
-    sums = np.bincount(flat, np.repeat(weights, directions), minlength=SLICES * directions)
+    # Of no weights at all numpy counts in integers.
+    sums = np.bincount(flat, np.repeat(weights, directions), minlength=SLICES * directions).astype(float, copy=False)
     return np.cumsum(sums.reshape(directions, SLICES), axis=1)[:, :-1]
 
 
@@ -288,7 +289,7 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
             gaps = (np.c_[corners, np.ones(len(corners))] @ found.equations.T).max(1)
             chosen |= set(np.argsort(gaps)[-min(4, most - len(chosen)) :].tolist())
         corners = corners[sorted(chosen)]
-    return _closed(corners)
+    return hull_surface(corners)
 
 
 def _slab(points: Points) -> TriangleMesh:
@@ -298,14 +299,14 @@ def _slab(points: Points) -> TriangleMesh:
     spread = np.vstack([points - lift, points + lift])
     hull = _hull(spread)
     if hull is not None:
-        return _closed(spread[hull.vertices])
+        return hull_surface(spread[hull.vertices])
     # All on a line, or one point: a small box about them.
     corners = np.stack(np.meshgrid(*[(-OVERLAP, OVERLAP)] * 3), -1).reshape(-1, 3)
-    return _closed(np.vstack([points.min(0) + corners, points.max(0) + corners]))
+    return hull_surface(np.vstack([points.min(0) + corners, points.max(0) + corners]))
 
 
-def _closed(corners: Points) -> TriangleMesh:
-    """The hull's surface, wound outwards."""
+def hull_surface(corners: Points) -> TriangleMesh:
+    """Return the surface of the convex hull of points, wound outwards."""
     hull = ConvexHull(corners)
     a, b, c = corners[hull.simplices].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0

@@ -165,13 +165,6 @@ def _subdivide(mesh: TriangleMesh, times: int) -> TriangleMesh:
     return TriangleMesh(np.asarray(vertices), np.asarray(faces))
 
 
-def joined(*bodies: TriangleMesh) -> TriangleMesh:
-    """All of them as one mesh, their faces in order."""
-    offsets = np.cumsum([0] + [len(body.vertices) for body in bodies[:-1]])
-    faces = [body.faces + offset for body, offset in zip(bodies, offsets, strict=True)]
-    return TriangleMesh(np.vstack([body.vertices for body in bodies]), np.vstack(faces))
-
-
 def _mug_volume() -> float:
     """Cup, half-ring handle, and the handle's two arms from the cup's outer wall to the bend.
 

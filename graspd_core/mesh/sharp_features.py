@@ -5,6 +5,8 @@ A hand sampled every few millimetres does not notice an edge that sinks in betwe
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -62,12 +64,37 @@ def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
     if len(points) == 0:
         return np.zeros(0, dtype=int)
     columns = np.ascontiguousarray(points.T)
-    chosen, nearest = [0], np.full(len(points), np.inf)
-    while len(chosen) < min(count, len(points)):
-        x, y, z = (column - column[chosen[-1]] for column in columns)
-        nearest = np.minimum(nearest, x * x + y * y + z * z)
-        chosen.append(int(nearest.argmax()))
-    return np.array(chosen)
+
+    def squared(chosen: int) -> np.ndarray:
+        x, y, z = (column - column[chosen] for column in columns)
+        return x * x + y * y + z * z
+
+    return farthest_first(len(points), count, [0], squared)
+
+
+def farthest_first(
+    size: int,
+    count: int,
+    chosen: Sequence[int],
+    distances: Callable[[int], np.ndarray],
+    mates: Callable[[int], np.ndarray | slice] = lambda _: slice(None),
+) -> Int[np.ndarray, "count"]:
+    """Choose points, each the farthest from all that were chosen before (Gonzalez 1985).
+
+    Args:
+        size: how many points there are.
+        count: how many are chosen at most; all of `chosen` are.
+        chosen: indices of the first ones.
+        distances: of a chosen point to its mates, in any unit that grows with the distance.
+        mates: the points that a chosen point counts for; all others are infinitely far from it.
+    """
+    picked, gap = [int(index) for index in chosen], np.full(size, np.inf)
+    for number in range(max(min(count, size), len(picked))):
+        if number == len(picked):
+            picked.append(int(gap.argmax()))
+        rows = mates(picked[number])
+        gap[rows] = np.minimum(gap[rows], distances(picked[number]))
+    return np.array(picked, dtype=np.int64)
 
 
 def neighbours_together(points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:

@@ -19,15 +19,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.config import GraspStagesConfig
-from graspd_core.hands.kinematics import forward, place_points
+from graspd_core.hands.kinematics import RETREAT, drawn_back, forward, place_points
 from graspd_core.hands.link_distance import pair_distance, solid_distance
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize import losses
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.kernel.builds import call
 from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
-from graspd_core.optimize.loop import Poses, pack
-from graspd_core.optimize.obstacle_distance import RETREAT, RETREAT_SHARES, ObstacleTensors, obstacle_gaps
+from graspd_core.optimize.loop import Poses, adam_moments, pack
+from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors, obstacle_gaps
 from graspd_core.optimize.problem import OBSTACLE_MARGIN, Problem, hand_forward
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
@@ -192,10 +192,9 @@ def _find_pregrasp(
             loss = loss + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         gradient = torch.nan_to_num(gradient)
-        mean = 0.9 * mean + 0.1 * gradient
-        square = 0.98 * square + 0.02 * gradient * gradient
+        mean, square, top, root = adam_moments(mean, square, gradient, count)
         fade = 1.0 - 0.9 * count / config.open_steps
-        x = x.detach() - fade * rates * (mean / (1 - 0.9**count)) / ((square / (1 - 0.98**count)).sqrt() + 1e-8)
+        x = x.detach() - fade * rates * top / root
         x = torch.cat([x[:, :3], x[:, 3:].clamp(problem.hand.lower, problem.hand.upper)], -1)
     with torch.no_grad():
         share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
@@ -233,11 +232,8 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
     What a pregrasp itself leaves is not looked at here.
     """
     rotation = rotation_from_quaternion(pregrasp.quaternion)
-    back = rotation @ obstacles.retreat
-    nearest = [
-        hand_distance(problem, SE3(rotation, pregrasp.translation + RETREAT * share * back), pregrasp.joints).amin(-1)
-        for share in RETREAT_SHARES
-    ]
+    begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
+    nearest = [hand_distance(problem, SE3(rotation, at), pregrasp.joints).amin(-1) for at in begun]
     return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
 
 

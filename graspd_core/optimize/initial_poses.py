@@ -11,11 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.hands.fingers import find_fingers, placed_tips
-from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, points_in_base
+from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_kinematics, points_in_base
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.optimize.loop import Poses
-from graspd_core.optimize.obstacle_distance import RETREAT, ObstacleTensors, make_obstacle_tensors, obstacle_gaps
+from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions, StartPool, aimed, open_joints, uniform
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
@@ -137,7 +137,7 @@ def raise_clear(
     if obstacles.normal is not None:
         depth = -obstacle_gaps(replace(obstacles, sdfs=()), base, links).amin(-1)
         translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
-    behind = translation + RETREAT * (base.rotation @ obstacles.retreat)
+    behind = drawn_back(translation, base.rotation, obstacles.approach)
     gaps = [obstacle_gaps(obstacles, SE3(base.rotation, at), links).amin(-1) for at in (translation, behind)]
     return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
 

@@ -58,6 +58,8 @@ def moved_along(poses: Poses, point: Float[Tensor, "*batch 3"]) -> Poses:
 
 
 S = TypeVar("S")
+# How fast Adam's running means forget, of the gradient and of its square.
+_BETA1, _BETA2, _EPSILON = 0.9, 0.98, 1e-8
 
 
 @runtime_checkable
@@ -141,3 +143,24 @@ def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -
             last_report = now
     poses, loss = solver.best(state)
     return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), done, interrupted)
+
+
+def adam_moments(
+    mean: Float[Tensor, "batch variables"],
+    square: Float[Tensor, "batch variables"],
+    gradient: Float[Tensor, "batch variables"],
+    count: int,
+) -> tuple[
+    Float[Tensor, "batch variables"],
+    Float[Tensor, "batch variables"],
+    Float[Tensor, "batch variables"],
+    Float[Tensor, "batch variables"],
+]:
+    """Return Adam's moments after step number `count`, from one (Kingma & Ba 2015, §2).
+
+    Returns:
+        The running means of the gradient and of its square, and the two whose quotient is the direction of the step.
+    """
+    mean = _BETA1 * mean + (1 - _BETA1) * gradient
+    square = _BETA2 * square + (1 - _BETA2) * gradient * gradient
+    return mean, square, mean / (1 - _BETA1**count), (square / (1 - _BETA2**count)).sqrt() + _EPSILON

@@ -1,9 +1,9 @@
 """Room for the hand: how far it is from what the object stands on and from the things around it.
 
 A solid is convex, so it is clear of a half-space exactly when its extreme points are: boxes and hulls by their corners,
-spheres and capsules by their ends less their radius, cylinders by points of their rims. Against neighbours the proxy
-spheres (`hands.proxies`), which bulge a little out of flat faces, stand in for what lies between the corners. Gradients
-are exact but for that of the neighbours' interpolated distance.
+spheres and capsules by their ends less their radius, cylinders by points of their rims. Against neighbours the
+collision spheres (`hands.collision_spheres`), which bulge a little out of flat faces, stand in for what lies between
+the corners. Gradients are exact but for that of the neighbours' interpolated distance.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.hands.kinematics import Kinematics, forward, link_poses, place_points, placement
+from graspd_core.hands.kinematics import RETREAT, Kinematics, drawn_back, forward, link_poses, place_points, placement
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.hands.surface_points import outermost
@@ -23,8 +23,7 @@ from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-# The hand comes to the pregrasp straight along its approach, from as far as this [m]; where it is looked at on the way.
-RETREAT = 0.1
+# Shares of the straight way from the retreat to the pregrasp at which the hand is looked at, and of that to the grasp.
 RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
 _WAY_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 # What the optimiser makes of gaps ends below this [m].
@@ -45,7 +44,7 @@ class ObstacleTensors:
         normal: of the support, into the free side; None without a support.
         offset: n·x of the support's points [m].
         sdfs: signed distances of the things that this hand can reach.
-        retreat: unit direction in which the hand leaves its pregrasp backwards, base frame.
+        approach: unit direction in which the hand comes to its pregrasp, base frame.
     """
 
     corner_matrix: Float[Tensor, "corners columns"]
@@ -55,7 +54,7 @@ class ObstacleTensors:
     normal: Float[Tensor, "3"] | None
     offset: float
     sdfs: tuple[GridSDF, ...]
-    retreat: Float[Tensor, "3"]
+    approach: Float[Tensor, "3"]
 
 
 def make_obstacle_tensors(
@@ -82,7 +81,7 @@ def make_obstacle_tensors(
         normal=None if scene.support is None else tensor(scene.support.normal),
         offset=0.0 if scene.support is None else scene.support.offset,
         sdfs=tuple(n.sdf.to(device, dtype) for n in obstacles),
-        retreat=tensor(-hand.approach),
+        approach=tensor(hand.approach),
     )
 
 
@@ -179,8 +178,8 @@ def gap_on_the_way(
     and joints; the base is turned alike in both.
     """
     rotation = rotation_from_quaternion(quaternion)
-    back = rotation @ obstacles.retreat
-    way = [(pregrasp[0] + RETREAT * share * back, pregrasp[1]) for share in RETREAT_SHARES]
+    begun = [drawn_back(pregrasp[0], rotation, obstacles.approach, RETREAT * share) for share in RETREAT_SHARES]
+    way = [(at, pregrasp[1]) for at in begun]
     way += [(a * pregrasp[0] + (1 - a) * grasp[0], a * pregrasp[1] + (1 - a) * grasp[1]) for a in _WAY_SHARES]
     placed = [(SE3(rotation, at), forward(kinematics, joints)) for at, joints in way]
     gaps = [obstacle_gaps(obstacles, base, links, wide).amin(-1) for base, links in placed]

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from graspd_core.config import ObstacleConfig, SceneConfig
+from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
@@ -100,17 +101,7 @@ def padded_hull(points: Float[np.ndarray, "n 3"], support: Plane | None, padding
     with suppress(QhullError):
         corners = corners[ConvexHull(corners).vertices]
     skin = padding * np.vstack([np.eye(3), -np.eye(3)])
-    return _closed((corners[:, None] + skin).reshape(-1, 3))
-
-
-def _closed(points: Float[np.ndarray, "n 3"]) -> TriangleMesh:
-    """The convex hull's surface, wound outwards."""
-    hull = ConvexHull(points)
-    a, b, c = points[hull.simplices].transpose(1, 0, 2)
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
-    faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64)
-    used, compact = np.unique(faces, return_inverse=True)
-    return TriangleMesh(points[used], compact.reshape(-1, 3))
+    return hull_surface((corners[:, None] + skin).reshape(-1, 3))
 
 
 # From this share of what the hulls of a thing and of the object fill together, the thing is the object itself: a box

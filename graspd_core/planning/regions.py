@@ -19,10 +19,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from graspd_core.errors import ConfigError, shown
-from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.kinematics import RETREAT, forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
-from graspd_core.optimize.obstacle_distance import RETREAT, extreme_points_of_solids, hand_reach
+from graspd_core.optimize.obstacle_distance import extreme_points_of_solids, hand_reach
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh

@@ -18,12 +18,11 @@ import torch
 from jaxtyping import Bool, Float
 
 from graspd_core.errors import ConfigError, shown
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import RETREAT, link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.optimize.initial_poses import closing_axis, depth_of_starts
-from graspd_core.optimize.obstacle_distance import RETREAT
 from graspd_core.optimize.restrictions import Aim, BoundRestriction, BoundRestrictions, Refusal, Roll
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Sphere, boxes_in_reach, entered, numbers

@@ -11,17 +11,16 @@ weight. MuJoCo gives bodies that follow commands no velocity, so a base that rea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
+from graspd_core.hands.kinematics import RETREAT, retreat_posture
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import moved_grasp
-from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TrialResult
 from graspd_core.verify.early_stop import CHECK_EVERY
 from graspd_core.verify.hold_trial import (
@@ -58,18 +57,12 @@ class LiftSettings:
         max_reach_through: deepest that a commanded posture may lie in the support or a neighbour [m].
     """
 
-    retreat: float = 0.1
+    retreat: float = RETREAT
     approach_time: float = 0.4
     lift_height: float = 0.2
     lift_time: float = 1.0
     hold_time: float = 3.0
     max_reach_through: float = 0.002
-
-
-def retreat_posture(hand: HandModel, pregrasp: Posture, distance: float = LiftSettings.retreat) -> Posture:
-    """The pregrasp moved straight back against the hand's approach direction by `distance` [m]."""
-    rotation = rotation_from_quaternion(torch.as_tensor(pregrasp.quaternion_wxyz, dtype=torch.float64)).numpy()
-    return replace(pregrasp, position=pregrasp.position - distance * rotation @ hand.approach)
 
 
 def lift_trial(

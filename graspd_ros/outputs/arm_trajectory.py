@@ -8,7 +8,8 @@ import numpy as np
 from builtin_interfaces.msg import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from graspd_core.arms.arm_paths import LIFT, RETREAT
+from graspd_core.arms.arm_paths import LIFT
+from graspd_core.hands.kinematics import RETREAT
 from graspd_core.types import ArmPath, Grasp
 from graspd_ros.outputs.trajectory import Pace
 

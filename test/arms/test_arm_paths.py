@@ -12,13 +12,12 @@ import torch
 from graspd_core import load_hand, load_scene, make_shape
 from graspd_core.arms.arm import Arm, arm_links, placed, tip_hand
 from graspd_core.arms.arm_collision import hits_of_hand, hits_of_scene, hits_of_self, hits_of_support
-from graspd_core.arms.arm_paths import LARGEST_JUMP, LIFT, RETREAT, STAGE_ROWS, ArmTask, arm_paths, hand_ways, make_task
+from graspd_core.arms.arm_paths import LARGEST_JUMP, LIFT, STAGE_ROWS, ArmTask, arm_paths, hand_ways, make_task
 from graspd_core.arms.inverse_kinematics import random_postures
-from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.kinematics import RETREAT, forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf
-from graspd_core.optimize import obstacle_distance
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, quaternion_from_rotation
 from graspd_core.types import ARM_STAGES, ArmPath, Grasp, Plane, Posture, TriangleMesh
@@ -55,7 +54,6 @@ def task_of(arm: Arm, hand: HandModel, scene: Scene, away: float) -> ArmTask:
 
 def test_the_way_of_a_hand_is_that_of_the_trial(hand: HandModel):
     """It retreats as far as the trials come from; rows of the stages are where the postures say."""
-    assert obstacle_distance.RETREAT == RETREAT
     grasp = from_above(hand, 0.2, 0.5)
     way = hand_ways([grasp], hand.approach, np.array([0.0, 0.0, 1.0]))
     heights = way.translation[0, list(STAGE_ROWS), 2].tolist()

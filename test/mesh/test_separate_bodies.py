@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from graspd_core.mesh.components import bodies_apart
-from graspd_core.mesh.shapes import joined, make_shape
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import build_scene
-from graspd_core.types import TriangleMesh
+from graspd_core.types import TriangleMesh, joined
 
 
 def block(size, centre=(0, 0, 0)) -> TriangleMesh:

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.mesh.components import drop_small_components, face_components
-from graspd_core.mesh.shapes import joined, make_shape
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.scene import build_scene
-from graspd_core.types import TriangleMesh
+from graspd_core.types import TriangleMesh, joined
 
 BOX = make_shape("box")
 

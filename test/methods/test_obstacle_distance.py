@@ -12,14 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.kinematics import forward, hand_mesh, place_points
+from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, place_points
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import find_candidates
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, pack
 from graspd_core.optimize.obstacle_distance import (
-    RETREAT,
     WIDE,
     gap_on_the_way,
     hand_reach,

@@ -127,10 +127,10 @@ def test_every_method_ends_where_a_restriction_leaves_nothing(scene, hand, metho
     assert found.outcome is Outcome.NO_CANDIDATES
 
 
-def test_what_is_impossible_is_said_without_a_search(scene, hand):
+def test_what_is_impossible_is_said_without_a_search(scene, hand, monkeypatch):
+    monkeypatch.delattr("graspd_core.planning.rounds.find_candidates")
     found = plan_grasps(scene, hand, count=1, restrictions=[Side(0.0), Side(0.0, told="the arm ends at 0.4 m")])
     assert (found.outcome, found.message) == (Outcome.NO_CANDIDATES, "the arm ends at 0.4 m")
-    assert found.timing.optimise < 0.5
 
 
 def test_a_malformed_restriction_is_refused(scene, hand):

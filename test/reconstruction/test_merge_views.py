@@ -36,9 +36,9 @@ def test_noise_along_the_line_of_sight_is_smoothed():
     rng = np.random.default_rng(0)
     noisy = []
     for view in VIEWS:
-        view_depth = view.points - view.viewpoint
-        view_depth /= np.linalg.norm(view_depth, axis=1, keepdims=True)
-        noisy.append(PointCloud(view.points + rng.normal(0, 0.0015, (len(view_depth), 1)) * view_depth, view.viewpoint))
+        ray = view.points - view.viewpoint
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        noisy.append(PointCloud(view.points + rng.normal(0, 0.0015, (len(ray), 1)) * ray, view.viewpoint))
     query = make_distance_query(SCENE.truth)
     before = unsigned_distance(query, np.concatenate([view.points for view in noisy])).mean()
     assert unsigned_distance(query, merge_views(noisy).points).mean() < 0.6 * before
@@ -47,9 +47,9 @@ def test_noise_along_the_line_of_sight_is_smoothed():
 def test_flying_pixels_are_dropped():
     rng = np.random.default_rng(0)
     view = VIEWS[0]
-    view_depth = view.points - view.viewpoint
-    few = rng.choice(len(view_depth), 60, replace=False)
-    flying = view.viewpoint + view_depth[few] * rng.uniform(0.7, 0.93, (60, 1))
+    ray = view.points - view.viewpoint
+    few = rng.choice(len(ray), 60, replace=False)
+    flying = view.viewpoint + ray[few] * rng.uniform(0.7, 0.93, (60, 1))
     merged = merge_views([PointCloud(np.vstack([view.points, flying]), view.viewpoint)], point_step([view]))
     assert unsigned_distance(make_distance_query(SCENE.truth), merged.points).max() < 0.008
 

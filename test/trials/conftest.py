@@ -14,6 +14,7 @@ from graspd_core.mesh.mesh_files import content_hash, mass_properties
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.types import Grasp, Posture, TriangleMesh
+from graspd_core.verify.world import World, build_world
 
 FINGER = """
   <joint name="{name}_slide" type="prismatic"><parent link="palm"/><child link="{name}"/>
@@ -47,6 +48,12 @@ def cube() -> ObjectModel:
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
     inertia = inertia * (0.1 / volume)
     return ObjectModel("cube", content_hash(mesh), mesh, volume, 0.1, center, inertia, 0.6, 1.0, radius, ())
+
+
+@pytest.fixture(scope="module")
+def world(request: pytest.FixtureRequest, gripper: HandModel, cube: ObjectModel) -> World:
+    """The gripper about the cube, with the protocol `STANDARD` of the file that asks."""
+    return build_world(gripper, cube, (cube.mesh,), request.module.STANDARD)
 
 
 @pytest.fixture(scope="session")

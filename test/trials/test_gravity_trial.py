@@ -5,14 +5,9 @@ from __future__ import annotations
 import pytest
 
 from graspd_bench.trials import LOST, gravity_trial
-from graspd_core.verify.world import PROTOCOLS, World, build_world
+from graspd_core.verify.world import PROTOCOLS
 
 STANDARD = PROTOCOLS["standard"]
-
-
-@pytest.fixture(scope="module")
-def world(gripper, cube) -> World:
-    return build_world(gripper, cube, (cube.mesh,), STANDARD)
 
 
 def test_a_firm_squeeze_gives_no_more_than_its_springs(world, closing):

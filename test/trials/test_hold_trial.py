@@ -11,16 +11,11 @@ from graspd_core.hands.model import HandModel
 from graspd_core.types import Posture, Verdict
 from graspd_core.verify import world as trial_world
 from graspd_core.verify.hold_trial import displaced, hold_trial, noisy_trial, pose_error
-from graspd_core.verify.world import PROTOCOLS, Protocol, World, build_world
+from graspd_core.verify.world import PROTOCOLS, Protocol, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
 GOOD = (0.015, 0.025, (0.04, 0.04))
-
-
-@pytest.fixture(scope="module")
-def world(gripper, cube) -> World:
-    return build_world(gripper, cube, (cube.mesh,), STANDARD)
 
 
 def test_a_firm_squeeze_holds(world, closing):

@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from graspd_core.hands.kinematics import retreat_posture
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.scene import Obstacle
 from graspd_core.types import Plane, TrialResult, TriangleMesh, Verdict
-from graspd_core.verify.lift_trial import LiftSettings, lift_trial, retreat_posture
+from graspd_core.verify.lift_trial import LiftSettings, lift_trial
 from graspd_core.verify.trial_registry import TrialContext, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, World, build_world
 

@@ -31,11 +31,6 @@ def start(world: World, height: float, joints: float) -> mujoco.MjData:
     return data
 
 
-@pytest.fixture(scope="module")
-def world(gripper, cube) -> World:
-    return build_world(gripper, cube, (cube.mesh,), STANDARD)
-
-
 @pytest.mark.parametrize("direction", range(6))
 def test_a_free_object_flies_as_newton_says(direction, world):
     data = start(world, -1.0, 0.0)

@@ -67,11 +67,11 @@ def skin_vertices(
         bone = joints[:, body] - joints[:, parent]
         places.append(places[parent] + (turns[parent] @ bone[..., None]).squeeze(-1))
         turns.append(turns[parent] @ rotations[:, body])
-    turn, place_points = torch.stack(turns, 1), torch.stack(places, 1)
-    shift = place_points - (turn @ joints[..., None]).squeeze(-1)
+    turn, place = torch.stack(turns, 1), torch.stack(places, 1)
+    shift = place - (turn @ joints[..., None]).squeeze(-1)
     mixed = torch.einsum("vj,bjrc->bvrc", skin.weights, torch.cat([turn, shift[..., None]], -1))
     vertices = (mixed[..., :3] @ posed[..., None]).squeeze(-1) + mixed[..., 3]
-    return vertices + translation[:, None], place_points + translation[:, None]
+    return vertices + translation[:, None], place + translation[:, None]
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -84,12 +84,12 @@ def as_text(root: ET.Element) -> str:
 def wrong(path: Path, element: ET.Element, message: str) -> HandError:
     """The error to raise about an element: names the file, the line, and the link or joint that it belongs to."""
     line, owner = getattr(element, "line", 0), getattr(element, "owner", "")
-    place_points = f"{path}:{line}" if line else f"{path}"
+    where = f"{path}:{line}" if line else f"{path}"
     if owner:
         message = f"{owner} {message}" if message.startswith(("is ", "has ")) else f"{owner}: {message}"
     if len(message) > _LONGEST:
         message = f"{message[: _LONGEST // 2]} ... {message[-_LONGEST // 2 :]}"
-    return HandError(f"{place_points}: {message}")
+    return HandError(f"{where}: {message}")
 
 
 def _decoded(data: bytes) -> str:

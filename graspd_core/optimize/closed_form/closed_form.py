@@ -27,11 +27,9 @@ from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.kernel.builds import call
 from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
-from graspd_core.optimize.loop import Hooks, Poses, Solution, minimise, moved_along, pack, unpack
+from graspd_core.optimize.loop import Hooks, Poses, Solution, adam_moments, minimise, moved_along, pack, unpack
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.problem import Problem, Terms, evaluate, least_distance
-
-_BETA1, _BETA2, _ADAM_EPSILON = 0.9, 0.98, 1e-8
 
 
 @dataclass(frozen=True)
@@ -73,14 +71,12 @@ def adam_step(
     problem: Problem, state: AdamState, gradient: Tensor, rate: float, count: int, config: ClosedFormConfig
 ) -> AdamState:
     """One Adam step (Kingma & Ba 2015) with per-variable rates; joints are projected onto their limits."""
-    mean = _BETA1 * state.mean + (1 - _BETA1) * gradient
-    square = _BETA2 * state.square + (1 - _BETA2) * gradient * gradient
-    direction = (mean / (1 - _BETA1**count)) / ((square / (1 - _BETA2**count)).sqrt() + _ADAM_EPSILON)
+    mean, square, top, root = adam_moments(state.mean, state.square, gradient, count)
     rates = torch.full_like(state.x[0], config.joint_rate)
     rates[:3] = config.translation_rate
     rates[3:7] = config.rotation_rate
     rates[7:] *= problem.hand.joint_scale
-    x = state.x - rate * rates * direction
+    x = state.x - rate * rates * (top / root)
     quaternion = x[:, 3:7] / x[:, 3:7].norm(dim=-1, keepdim=True)
     joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper)
     return replace(state, x=torch.cat([x[:, :3], quaternion, joints], -1), mean=mean, square=square)

@@ -16,7 +16,7 @@ Grasp'D as published (Turpin et al., ECCV 2022): desired forces that stop the ob
     min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
 
 by damped multipliers and Adamax, on contacts with the level set φ = r, r shrinking to zero (docs/method.md, §1).
-Gradients are exact, but that contacts leak (`contact.forces`), that the pose has no part in L_task, and that desired
+Gradients are exact, but that contacts leak (`penalty_forces`), that the pose has no part in L_task, and that desired
 forces are projected into their cones where they have any.
 """
 

@@ -90,8 +90,8 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
     if len(points) <= settings.neighbours:
         return nothing()
     distance, near = KDTree(points).query(points, k=settings.neighbours)
-    view_depth = points - view.viewpoint
-    view_depth /= np.linalg.norm(view_depth, axis=1, keepdims=True)
+    ray = points - view.viewpoint
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     centre, normals = points[near].mean(1), np.zeros_like(points)
     weights = np.ones(near.shape)
     # The second pass leaves out what lies across an edge from the first one's plane.
@@ -102,12 +102,12 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
         normals = least_axes(np.swapaxes(weights[..., None] * spread, 1, 2) @ spread)
         off = np.einsum("nkd,nd->nk", spread, normals)
         weights = np.exp(-np.square(off / (1.5 * step)) - np.square(distance / distance[:, -1:]))
-    normals *= -np.sign(np.einsum("nd,nd->n", normals, view_depth))[:, None]
-    slope = -np.einsum("nd,nd->n", normals, view_depth)
+    normals *= -np.sign(np.einsum("nd,nd->n", normals, ray))[:, None]
+    slope = -np.einsum("nd,nd->n", normals, ray)
     shift = np.einsum("nd,nd->n", points - centre, normals) / np.maximum(slope, 1e-3)
     crowded = distance[:, -1] < 2.5 * np.median(distance[:, -1])
     kept = (slope > MIN_VIEW_COSINE) & (np.abs(shift) < settings.stray_distance) & crowded
-    smooth = points + shift[:, None] * view_depth
+    smooth = points + shift[:, None] * ray
     return Surfels(smooth[kept], normals[kept])
 
 
@@ -127,13 +127,13 @@ def thin(surfels: Surfels, step: float) -> Surfels:
 
 def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
     """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
-    view_depth = view.points - view.viewpoint
-    distance = np.linalg.norm(view_depth, axis=1)
+    ray = view.points - view.viewpoint
+    distance = np.linalg.norm(ray, axis=1)
     width = step / float(np.median(distance))
-    axis = view_depth.mean(0) / np.linalg.norm(view_depth.mean(0))
+    axis = ray.mean(0) / np.linalg.norm(ray.mean(0))
     right = perpendicular(axis)
-    depth = np.maximum(view_depth @ axis, 1e-6)
-    image = np.column_stack([view_depth @ right, view_depth @ np.cross(axis, right)]) / depth[:, None]
+    depth = np.maximum(ray @ axis, 1e-6)
+    image = np.column_stack([ray @ right, ray @ np.cross(axis, right)]) / depth[:, None]
     _, which, count = np.unique(voxel_keys(image, width), return_inverse=True, return_counts=True)
     order = np.lexsort([distance, which])
     first = np.concatenate([[0], np.cumsum(count)[:-1]])

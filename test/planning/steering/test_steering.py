@@ -156,13 +156,15 @@ def test_no_link_enters_an_avoided_box(bottle, hand):
     assert [isinstance(answer, Refusal) for answer in kept] == in_box
 
 
-def test_from_below_the_table_is_said_to_be_impossible_and_from_above_is_not(bottle, hand):
+def test_from_below_the_table_is_said_to_be_impossible_without_a_search_and_from_above_is_not(
+    bottle, hand, monkeypatch
+):
+    monkeypatch.delattr("graspd_core.planning.rounds.find_candidates")
     low = float(bottle.object.mesh.vertices[:, 2].min())
     standing = replace(bottle, support=Plane(np.array([0.0, 0.0, 1.0]), low))
     found = plan(standing, hand, Steering(approach_direction=-DOWN))
     assert found.outcome is Outcome.NO_CANDIDATES
     assert found.message.startswith("approach_direction: nothing is left of it")
-    assert found.timing.optimise < 2.0
     for direction in (DOWN, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, -1.0])):
         assert Steering(approach_direction=direction).bind(standing, hand).impossible == ""
 

@@ -1,0 +1,278 @@
+"""What pages, docstrings and comments name in backticks exists: files, modules, functions, fields, settings."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("test", "benchmarks", "examples", "config", "docs", "msg_defs", "scripts", "docker")
+PACKAGES = tuple(path.parent.name for path in sorted(ROOT.glob("*/__init__.py")))
+# Names that are none of this tree: transforms by their frames, messages and topics of ROS and MoveIt, files of users
+# and of other projects, keys that code puts together, variables of an environment.
+FOREIGN = re.compile(
+    r"[RT](_[a-z]+)+|moveit_msgs/\w+|(object\.)?header\.frame_id|pre_grasp_approach\.direction|qos_overrides.*"
+    r"|object\.(meshes|primitives|point_cluster|surface|name)|depth/(image_rect|camera_info)"
+    r"|(DIR/)?\w+\.json|object_cloud\.xyz|my_hand\.yaml|cio\.py|setup\.bash|share/.*|results/.*|vX\.Y\.Z"
+    r"|copy_reg\._\w+|hand\.mimic|metric_\w+|squeeze_quaternion_wxyz|gripper_frame|PATH\W?.*|AWS_\w+"
+)
+SPAN = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")
+PATH = re.compile(r"[\w.{},-]+(/[\w.{},-]+)+/?|[\w{},-]+\.(py|md|hpp|cpp|yaml|toml|npz|msg|srv|action|xml|sh)")
+# On a page a word may be anybody's if it has no underscore.
+PAGE_WORD, WORD = re.compile(r"[A-Za-z]\w*_\w+"), re.compile(r"[A-Za-z]\w+")
+SETTINGS = re.compile(r"(Config|Settings)$")
+
+Members = dict[str, set[str]]
+
+
+@dataclass(frozen=True)
+class Tree:
+    """What can be named.
+
+    Attributes:
+        paths: of files and folders, from any folder on, with and without their extension.
+        scopes: modules and classes by their dotted name, from any package on: what each holds, and of which classes.
+        variables: parameters and fields by name: of which classes.
+        settings: names of fields of configurations.
+        words: that the code uses, and its whole strings.
+        libraries: what the code imports from elsewhere.
+    """
+
+    paths: frozenset[str]
+    scopes: dict[str, Members]
+    variables: Members
+    settings: frozenset[str]
+    words: frozenset[str]
+    libraries: frozenset[str]
+
+    def classes_of(self, name: str) -> set[str] | None:
+        """Return the scopes that a dotted name may be of; None if nothing is called so."""
+        own = {name} & self.scopes.keys()
+        head, _, last = name.rpartition(".")
+        if not head:
+            return own | self.variables[name] if name in self.variables else own or None
+        found = [self._member(owner, last) for owner in self.classes_of(head) or ()]
+        known = [classes for classes in found if classes is not None]
+        return own.union(*known) if own or known else None
+
+    def _member(self, owner: str, name: str) -> set[str] | None:
+        members = self.scopes.get(owner, {})
+        if name in members:
+            return members[name]
+        inherited = (self._member(base, name) for base in members.get("<bases>", ()))
+        return next((classes for classes in inherited if classes is not None), None)
+
+
+def suffixes(parts: tuple[str, ...], joint: str) -> list[str]:
+    return [joint.join(parts[start:]) for start in range(len(parts))]
+
+
+def names_in(annotation: ast.AST | None) -> set[str]:
+    return set() if annotation is None else set(re.findall(r"[A-Z]\w+", ast.unparse(annotation)))
+
+
+def section_of(configuration: str) -> str:
+    """Return the section of a file of settings that a class holds: `closed_form` of `ClosedFormConfig`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", SETTINGS.sub("", configuration)).lower()
+
+
+def members_of(body: Iterable[ast.AST]) -> Iterator[tuple[str, set[str]]]:
+    """Yield what a module or a class defines or imports, and the classes that each is of."""
+    for node in body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name, {node.name} if isinstance(node, ast.ClassDef) else names_in(node.returns)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            yield from ((alias.asname or alias.name, {alias.name}) for alias in node.names)
+        elif isinstance(node, ast.AnnAssign):
+            yield ast.unparse(node.target), names_in(node.annotation)
+        elif isinstance(node, ast.Assign):
+            yield from ((ast.unparse(target), set()) for target in node.targets)
+        elif isinstance(node, ast.If | ast.Try):
+            yield from members_of([*node.body, *node.orelse])
+
+
+def docstrings(module: ast.Module) -> list[ast.Constant]:
+    nodes = [n for n in ast.walk(module) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
+    return [node.value for node in nodes if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)]
+
+
+def words_of(module: ast.Module) -> set[str]:
+    """Return every word of the code, those in strings too, but none of a docstring."""
+    prose = set(map(id, docstrings(module)))
+    words: set[str] = set()
+    for node in ast.walk(module):
+        values = [value for value in vars(node).values() if isinstance(value, str)] if id(node) not in prose else []
+        words.update(word for value in values for word in (value, *re.findall(r"\w+", value)))
+    return words
+
+
+def read_tree(sources: dict[str, str]) -> Tree:
+    """Read the text of files by their path below the root."""
+    paths, scopes, variables = set(), defaultdict[str, Members](dict), defaultdict[str, set[str]](set)
+    settings, words, libraries = set(), set(), set(sys.stdlib_module_names)
+    for path, text in sources.items():
+        parts = Path(path).parts
+        for length in range(1, len(parts) + 1):
+            paths.update(suffixes(parts[:length], "/"))
+        paths.update(suffixes((*parts[:-1], Path(path).stem), "/"))
+        if not path.endswith(".py"):
+            words.update(re.findall(r"\w+", text) if not path.endswith(".md") else ())
+            continue
+        module = ast.parse(text)
+        words |= words_of(module)
+        dotted = Path(path).with_suffix("").parts
+        dotted = dotted[:-1] if dotted[-1] == "__init__" else dotted
+        for name in suffixes(dotted, "."):
+            scopes[name].update(members_of(module.body))
+        for node in ast.walk(module):
+            if isinstance(node, ast.ClassDef):
+                members = {**dict(members_of(node.body)), "<bases>": {ast.unparse(base) for base in node.bases}}
+                attributes = [n.attr for n in ast.walk(node) if isinstance(n, ast.Attribute)]
+                for name in suffixes((*dotted, node.name), "."):
+                    scopes[name].update({**{attribute: set() for attribute in attributes}, **members})
+                if SETTINGS.search(node.name):
+                    settings.update(members)
+                    variables[section_of(node.name)].add(node.name)
+                for name, classes in members.items():
+                    variables[name] |= classes
+            elif isinstance(node, ast.arg):
+                variables[node.arg] |= names_in(node.annotation)
+            elif isinstance(node, ast.Import):
+                libraries.update((alias.asname or alias.name).split(".")[0] for alias in node.names)
+    return Tree(frozenset(paths), scopes, variables, frozenset(settings), frozenset(words), frozenset(libraries))
+
+
+def expanded(path: str) -> list[str]:
+    """Return the paths that braces stand for."""
+    pieces = [piece.split(",") for piece in re.split(r"[{}]", path)]
+    return ["".join(chosen) for chosen in product(*pieces)]
+
+
+def exists(span: str, tree: Tree) -> bool:
+    """Return whether a path or a dotted name is one of the tree, or of Python's own library."""
+    if span in tree.words or span.split(".")[0] in tree.libraries:
+        return True
+    return all(
+        one.rstrip("/") in tree.paths or tree.classes_of(one.replace("/", ".")) is not None for one in expanded(span)
+    )
+
+
+def unknown(text: str, tree: Tree, word: re.Pattern[str] = WORD) -> list[str]:
+    """Return what a text names in backticks that does not exist."""
+    spans = [re.sub(r"\(.*\)$", "", span) for span in SPAN.findall(text)]
+    named = [span for span in spans if (PATH.fullmatch(span) or DOTTED.fullmatch(span)) and not FOREIGN.fullmatch(span)]
+    words = [span for span in spans if word.fullmatch(span) and not FOREIGN.fullmatch(span)]
+    return [span for span in named if not exists(span, tree)] + [w for w in words if w not in tree.words | tree.paths]
+
+
+def unknown_settings(page: str, tree: Tree) -> list[str]:
+    """Return what the first column of a page's tables of settings names and no configuration has."""
+    found, inside = [], False
+    for line in page.splitlines():
+        cells = line.split("|")
+        inside = line.startswith("|") and (inside or cells[1].strip() in ("setting", "parameter"))
+        names = SPAN.findall(cells[1]) if inside else []
+        found += [n for n in names if "." not in n and n not in tree.settings]
+    return found
+
+
+def prose_of(source: str) -> str:
+    """Return the docstrings and comments of a module."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    comments = [token.string for token in tokens if token.type == tokenize.COMMENT]
+    return "\n".join([str(node.value) for node in docstrings(ast.parse(source))] + comments)
+
+
+@lru_cache
+def sources() -> dict[str, str]:
+    places = [path for folder in (*PACKAGES, *FOLDERS) for path in (ROOT / folder).rglob("*")]
+    texts = {}
+    for path in [*places, *(path for path in ROOT.iterdir() if not path.name.startswith("."))]:
+        if path.is_file() and "__pycache__" not in path.parts:
+            texts[str(path.relative_to(ROOT))] = path.read_bytes().decode(errors="replace")
+    # The breaches that are planted below.
+    texts[str(Path(__file__).relative_to(ROOT))] = ""
+    return texts
+
+
+@lru_cache
+def tree() -> Tree:
+    return read_tree(sources())
+
+
+def test_what_pages_name_exists():
+    pages = {path: without_blocks(text) for path, text in sources().items() if path.endswith(".md")}
+    # What a version changed may be gone since.
+    del pages["CHANGELOG.md"]
+    assert len(pages) > 15
+    found = [f"{path}: {name}" for path, text in pages.items() for name in unknown(text, tree(), PAGE_WORD)]
+    found += [f"{path}: setting {name}" for path, text in pages.items() for name in unknown_settings(text, tree())]
+    assert not found, "\n".join(found)
+
+
+def without_blocks(page: str) -> str:
+    return re.sub(r"^```.*?^```", "", page, flags=re.MULTILINE | re.DOTALL)
+
+
+def test_what_docstrings_and_comments_name_exists():
+    modules = {path: text for path, text in sources().items() if path.endswith(".py") and path.startswith(PACKAGES)}
+    assert len(modules) > 100
+    found = [f"{path}: {name}" for path, text in modules.items() for name in unknown(prose_of(text), tree())]
+    assert not found, "\n".join(found)
+
+
+PLANTED = read_tree(
+    {
+        "core/mesh/sdf.py": "def build_sdf(mesh): ...\nclass GridSDF:\n    origin: float\n",
+        "core/plan/config.py": (
+            "class LevelSetConfig:\n    schedule: str\nclass PlanConfig:\n    level_set: LevelSetConfig\n"
+        ),
+        "core/kernel/layout.hpp": "struct grid_layout;",
+    }
+)
+
+
+@pytest.mark.parametrize(
+    "span",
+    [
+        *("core/mesh/sdf.py", "mesh/sdf", "mesh/", "sdf.py", "layout.hpp", "{mesh,core/mesh}/sdf.py"),
+        *("mesh.sdf", "sdf.build_sdf", "build_sdf(mesh)", "GridSDF.origin", "mesh/sdf.build_sdf", "ast.walk"),
+        *("level_set.schedule", "PlanConfig.level_set.schedule", "plan.level_set.schedule", "grid_layout", "T_a_b"),
+    ],
+)
+def test_the_checker_lets_good_references_pass(span: str):
+    assert unknown(f"See `{span}`.", PLANTED) == []
+
+
+@pytest.mark.parametrize(
+    "span",
+    [
+        *("core/mesh/grid.py", "mesh/grid", "grid.py", "mesh/{sdf,grid}", "mesh/sdf.make_sdf", "rows.hpp"),
+        *("mesh.grid", "sdf.make_sdf", "make_sdf(mesh)", "GridSDF.size", "level_set.radius", "PlanConfig.schedule"),
+        *("make_sdf", "starts"),
+    ],
+)
+def test_the_checker_sees_a_planted_breach(span: str):
+    assert unknown(f"See `{span}`.", PLANTED) == [re.sub(r"\(.*", "", span)]
+
+
+def test_the_checker_sees_a_setting_that_no_configuration_has():
+    page = "| setting | paper |\n|---|---|\n| `schedule` | `code` |\n| `memory`, `level_set` | 0.9 |\n\n"
+    page += "| x | `y` |\n| `z` | |\n"
+    assert unknown_settings(page, PLANTED) == ["memory"]
+
+
+def test_the_checker_reads_docstrings_and_comments_alone():
+    assert prose_of('"""A `b`."""\nx = "`c`"  # `d`\n').split() == ["A", "`b`.", "#", "`d`"]
