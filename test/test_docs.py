@@ -1,18 +1,26 @@
-"""The pages build without a warning, the reference lists every public name, and the commands of contributors agree."""
+"""What the documents show is true.
+
+Pages build, their Python runs, their commands parse, their links lead somewhere, and the examples do what they say.
+"""
 
 from __future__ import annotations
 
+import importlib
+import json
 import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
-import yaml
+import pytest
 
 import graspd_core
+from graspd_core.cli import build_parser
+from graspd_core.optimize.plan_config import load_preset
 
 ROOT = Path(__file__).parents[1]
-MAKEFILE = (ROOT / "Makefile").read_text()
 
 
 def test_the_pages_build_without_a_warning(tmp_path: Path):
@@ -31,17 +39,105 @@ def test_the_reference_lists_every_public_name_once():
     assert len(listed) == len({*listed})
 
 
-def test_a_commit_is_checked_as_make_check_does():
-    checks = re.search(r"^check: .*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
-    assert checks is not None
-    commands = [line.replace("$(RUN)/", ".venv/bin/").removesuffix(" .") for line in checks[1].split("\n\t")]
-    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
-    entries = [hook["entry"].removesuffix(" --force-exclude") for hook in hooks]
-    assert entries[: len(commands)] == [command.strip() for command in commands]
-    assert {hook["language"] for hook in hooks} == {"system"}
+README = (ROOT / "README.md").read_text()
+USAGE = (ROOT / "docs" / "usage.md").read_text()
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *sorted(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))]
 
 
-def test_every_command_of_contributors_is_there():
-    targets = set(re.findall(r"^([a-z-]+): .*##", MAKEFILE, re.MULTILINE))
-    named = re.findall(r"^ +make ([a-z -]+?)(?: +#|$)", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
-    assert {"help", "check", "test", "docs", "bench"} <= {name for line in named for name in line.split()} <= targets
+@pytest.mark.parametrize("page", [README, USAGE], ids=["README", "usage"])
+def test_the_python_runs(page: str, capsys: pytest.CaptureFixture[str]):
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "page", "exec"), {})
+    assert capsys.readouterr().out.count("verified") == 2
+
+
+@pytest.mark.parametrize(("page", "least"), [("usage", 12), ("hands", 2)])
+def test_the_commands_of_the_pages_parse(page: str, least: int):
+    text = (ROOT / "docs" / f"{page}.md").read_text()
+    lines = [line.split("#")[0].strip() for line in text.splitlines() if line.startswith("    graspd ")]
+    assert len(lines) >= least
+    for line in lines:
+        build_parser().parse_args(shlex.split(line)[1:])
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_links_lead_to_files(name: str):
+    document = ROOT / name
+    targets = re.findall(r"\]\(((?!https?:)[^)#]+)", document.read_text())
+    missing = [target for target in targets if not (document.parent / target).exists()]
+    assert not missing
+
+
+def test_presets_named_in_the_documents_exist(tmp_path: Path):
+    named = re.search(r"preset \(([a-z, ]+), or", USAGE).group(1).split(", ")  # pyright: ignore[reportOptionalMemberAccess]
+    table = README.split("<!-- bench:begin -->")[1].split("<!-- bench:end -->")[0]
+    for name in [*named, *re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)]:
+        load_preset(name)
+    (own,) = re.findall(r"```yaml\n(.*?)```", USAGE, re.DOTALL)
+    (tmp_path / "own.yaml").write_text(own)
+    assert load_preset(str(tmp_path / "own.yaml")) != load_preset("balanced")
+
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+# Runs `main` of an example with arguments, in a directory of its own.
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return lambda name, *arguments, **named: importlib.import_module(name).main(arguments, **named)
+
+
+def test_a_mesh(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    graspd_core.save_mesh(graspd_core.make_shape("box"), tmp_path / "box.obj")
+    assert run("grasp_a_mesh", "box.obj", "box.json") == 0
+    assert "links touch" in capsys.readouterr().out
+    assert graspd_core.load_grasps(tmp_path / "box.json")[0].verdict == "verified"
+
+
+def test_a_cloud(run: Run, capsys: pytest.CaptureFixture[str]):
+    assert run("grasp_a_cloud") == 0
+    assert "held ['hold', 'lift', 'hypotheses']" in capsys.readouterr().out
+
+
+def test_your_own_hand(run: Run, capsys: pytest.CaptureFixture[str]):
+    assert run("your_own_hand") == 0
+    assert "claw: 6 joints" in capsys.readouterr().out
+
+
+def test_loss_weights(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "mine.yaml").write_text("closed_form: {weights: {distance: 2.0}}\n")
+    assert run("loss_weights", "shape:box", "mine.yaml") == 0
+    out = capsys.readouterr().out
+    assert "unknown key 'speed'" in out
+    assert [line.split()[0] for line in out.splitlines()[-3:]] == ["fast", "gentle", "yours"]
+
+
+def test_your_own_metric(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # The row that the example adds is for this test only.
+    monkeypatch.setitem(graspd_core.METRICS, "contact_offset", None)
+    assert run("your_own_metric", "shape:box") == 0
+    best = json.loads((tmp_path / "grasps.json").read_text())["grasps"][0]
+    assert 0 < best["metrics"]["contact_offset_mm"] < 100
+
+
+def test_many_objects(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "meshes").mkdir()
+    graspd_core.save_mesh(graspd_core.make_shape("sphere"), tmp_path / "meshes" / "ball.stl")
+    for ending in ("succeeded", "done before"):
+        assert run("many_objects", "out", "meshes", "nothing.obj", processes=1) == 1
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[0].endswith(f"verified  meshes/ball.stl: {ending}")
+        assert lines[1].endswith("nothing.obj: no such mesh file")
+    assert (tmp_path / "out" / "objects.csv").read_text().startswith("object,verified,ending\nmeshes/ball.stl,4,")
+
+
+def test_somebody_elses_grasp(run: Run, capsys: pytest.CaptureFixture[str]):
+    assert run("try_your_grasp") == 1
+    verdicts = [line.split(": ")[1].split(";")[0] for line in capsys.readouterr().out.splitlines()]
+    assert verdicts == ["verified", "verified", "verified", "failed"]

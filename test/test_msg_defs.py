@@ -111,10 +111,3 @@ def test_a_missing_compiler_is_named(tmp_path: Path):
     expected = "graspd_msgs: no compiler 'no-such-compiler'; install one with: sudo apt-get install build-essential"
     assert result.stderr.splitlines()[-1] == expected
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("changed", ["msg_defs/msg/Grasp.msg", "msg_defs/action", "msg_defs/setup.py"])
-def test_make_setup_builds_the_interfaces_again_when_they_change(changed: str):
-    command = ["make", "-n", "-W", changed, "setup"]
-    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=30).stdout
-    assert "scripts/setup.sh " in told

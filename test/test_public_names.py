@@ -1,9 +1,12 @@
-"""What `import graspd_core` offers: documented, lazy, typed; names that moved are found with a warning."""
+"""The package: what it offers, what a fresh interpreter imports of it, where its configuration lies, and its doctor."""
 
 from __future__ import annotations
 
 import ast
+import compileall
 import inspect
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +14,8 @@ from pathlib import Path
 import pytest
 
 import graspd_core
+from graspd_core import doctor, paths
+from graspd_core.errors import ConfigError
 
 PACKAGE = Path(graspd_core.__file__).parent
 
@@ -45,3 +50,97 @@ def test_a_name_that_moved_is_found_with_a_warning(name: str):
 def test_other_names_are_missing_as_in_any_module():
     with pytest.raises(AttributeError, match="no attribute 'plan_grapes'"):
         graspd_core.plan_grapes  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+# Each takes 0.1 s or more to import, or pulls in what does.
+UNUSED = [
+    "open3d",
+    "trimesh",
+    "matplotlib",
+    "scipy.stats",
+    "scipy.optimize",
+    "fast_simplification",
+    "pybullet",
+]
+UNUSED += [
+    "rclpy",
+    "networkx",
+    "pandas",
+    "dash",
+    "sympy",
+    "torch._dynamo",
+    "graspd_core.perception.reconstruct.reconstruct",
+]
+UNUSED += ["graspd_core.perception.segment.segment", "graspd_bench.suites"]
+
+# Who gives no arm and no library loads nothing of them.
+UNUSED += ["pytorch_kinematics", "graspd_core.arms", "graspd_core.library", "sqlite3"]
+LIBRARY = """
+from graspd_core import load_hand, load_scene, plan_grasps
+result = plan_grasps(load_scene("shape:mug"), load_hand("allegro_right"), count=1, preset="fast")
+assert result.timing.verify > 0
+"""
+COMMAND = """
+from graspd_core.cli import main
+assert main(["synthesize", "shape:mug", "-n", "1", "--preset", "fast"]) in (0, 3)
+"""
+
+
+@pytest.mark.parametrize("program", [LIBRARY, COMMAND], ids=["library", "command"])
+def test_a_plan_on_a_mesh_imports_what_it_uses(program, tmp_path):
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "GRASPD_CACHE": ""}
+    ask = f"{program}\nimport sys\nprint([name for name in {UNUSED!r} if name in sys.modules])"
+    # With nothing on disk, and with all of it there.
+    for _ in range(2):
+        run = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True, check=False)
+        assert run.returncode == 0, run.stderr
+        assert run.stdout.splitlines()[-1] == "[]"
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_config_is_found_in_a_checkout():
+    assert (paths.config_dir() / "hands").is_dir()
+
+
+def test_the_environment_names_another_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("GRASPD_CONFIG", str(tmp_path))
+    assert paths.config_dir() == tmp_path
+    monkeypatch.setenv("GRASPD_CONFIG", str(tmp_path / "nowhere"))
+    with pytest.raises(ConfigError, match=r"GRASPD_CONFIG=.*nowhere"):
+        paths.config_dir()
+
+
+def test_config_is_found_beside_an_installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    package = tmp_path / "lib" / "python3.12" / "site-packages" / "graspd_core"
+    package.mkdir(parents=True)
+    shutil.copy(ROOT / "graspd_core" / "paths.py", package / "paths.py")
+    monkeypatch.setattr(paths, "__file__", str(package / "paths.py"))
+    monkeypatch.setattr(paths.sys, "prefix", str(tmp_path / "elsewhere"))
+    with pytest.raises(ConfigError, match="GRASPD_CONFIG"):
+        paths.config_dir()
+    (tmp_path / "share" / "graspd" / "config" / "hands").mkdir(parents=True)
+    assert paths.config_dir() == tmp_path / "share" / "graspd" / "config"
+
+
+def test_the_doctor_finds_this_machine_healthy(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 600.0)  # of a busy machine
+    failed = [check for check in doctor.run_checks() if not check.ok]
+    assert not failed, doctor.format_checks(failed)
+
+
+def test_the_doctor_reports_what_is_missing_and_what_dies():
+    missing = doctor.try_code("gadget", "import no_such_library", "make setup", needed=True)
+    dead = doctor.try_code("gizmo", "import os; os.abort()", "make setup", needed=False)
+    assert (missing.ok, dead.ok) == (False, False)
+    assert "No module named 'no_such_library'" in missing.detail
+    assert dead.detail
+    report = doctor.format_checks([missing, dead])
+    assert "FAIL gadget" in report
+    assert "-    gizmo" in report
+    assert report.count("-> make setup") == 2
+
+
+def test_the_launch_file_compiles():
+    assert compileall.compile_dir(ROOT / "graspd_ros" / "launch", quiet=1, force=True)

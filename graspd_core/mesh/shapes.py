@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
-from graspd_core.types import TriangleMesh
+from graspd_core.types import TriangleMesh, joined
 
 SEGMENTS = 64
 

@@ -89,29 +89,22 @@ def test_a_wrong_description_is_refused_in_one_line(tmp_path: Path, keys: dict[s
     assert "\n" not in str(caught.value)
 
 
-def test_an_arm_that_could_hit_nothing_is_refused(tmp_path: Path):
+def test_an_arm_that_could_hit_nothing_or_has_a_joint_that_follows_is_refused(tmp_path: Path):
     path = write(tmp_path)
     camera = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision>'
     (tmp_path / "cell.urdf").write_text(ROBOT.replace(camera, ""))
     with pytest.raises(ConfigError, match=r"cell.urdf: no link that moves has a <collision> or <visual> shape"):
         load_arm(path)
-
-
-def test_a_joint_that_follows_another_is_refused(tmp_path: Path):
-    path = write(tmp_path)
     (tmp_path / "cell.urdf").write_text(ROBOT.replace('<origin xyz="0.4 0 0"/>', '<mimic joint="j1"/>'))
     with pytest.raises(ConfigError, match=r"cell.yaml: joint 'j2' follows another; an arm's joints move by themselves"):
         load_arm(path)
 
 
-def test_an_unknown_arm_is_refused_with_the_known_ones():
+def test_an_unknown_arm_and_a_file_that_is_no_yaml_are_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"unknown arm 'ur99'; known: panda_like, ur5e_like, or the path of a .yaml"):
         load_arm("ur99")
     with pytest.raises(ConfigError, match=r"nowhere.yaml: No such file"):
         load_arm("nowhere.yaml")
-
-
-def test_a_file_that_is_no_yaml_is_refused(tmp_path: Path):
     path = tmp_path / "arm.yaml"
     path.write_text("urdf: [")
     with pytest.raises(ConfigError, match=r"arm.yaml: not valid YAML"):

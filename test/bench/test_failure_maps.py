@@ -1,16 +1,19 @@
-"""Failure maps: their cells, their records on disk, what is counted from them, and the pictures."""
+"""Failure maps and charts: cells, records, what is counted from them, and pictures that are the same every time."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, replace
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from graspd_bench import charts
+from graspd_bench import charts as charts_style
 from graspd_bench import failure_maps as map_runs
 from graspd_bench.failure_maps import (
     COUNT,
@@ -30,12 +33,15 @@ from graspd_bench.failure_maps import (
     run_on,
     shares,
 )
+from graspd_bench.figures import by_name, rows
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE
+from graspd_bench.studies.robust_ranking import draw_robust
 from graspd_bench.study import Request
 from graspd_core.hands.library import load_hand
-from graspd_core.mesh.shapes import BOX_HALF, make_shape
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.plan_config import METHODS as ALL_METHODS
+from graspd_core.optimize.plan_config import Method
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.planning.feasibility import kind_of
 
 TINY = MapCase("size", "random_closure", "sphere", 0.2, ("sphere",), 1, 0)
 
@@ -87,20 +93,6 @@ def test_a_refused_scene_loses_all_grasps_and_says_why():
         assert count == TINY.count
 
 
-@pytest.mark.parametrize(
-    ("said", "kind"),
-    [
-        ("the object moved 5.1 cm under a pull along +x", "the object moved under a pull"),
-        ("the object turned 16° while closing", "the object turned while closing"),
-        ("the pregrasp penetrates the object by 12.3 mm", "the pregrasp penetrates the object"),
-        ("the simulation diverged under a pull along -z", "the simulation diverged under a pull"),
-        ("cloud: 9 points (35 % do); take more", "cloud: points; take more"),
-    ],
-)
-def test_reasons_are_counted_without_their_figures(said: str, kind: str):
-    assert kind_of(said) == kind
-
-
 def test_shares_and_reasons_are_of_all_objects_together():
     records = [
         {"across": 1.0, "count": 4, "cells": [{"up": 2.0, "held": 4, "reasons": {}}]},
@@ -138,15 +130,12 @@ def test_pictures_show_what_is_recorded_and_are_the_same_every_time(tmp_path: Pa
     assert "<!-- 100 -->" in (tmp_path / "one.svg").read_text()
 
 
-def test_rows_of_which_nothing_is_known_are_left_out(tmp_path: Path):
+def test_rows_of_which_nothing_is_known_are_left_out_and_a_map_without_any_is_drawn_empty(tmp_path: Path):
     panels: dict[str, Shares] = {"some": {(x, "box"): 0.5 for x in MAPS["size"].across.places}}
     draw_map(MAPS["size"], panels, tmp_path / "part")
     said = (tmp_path / "part.svg").read_text()
     assert "<!-- box -->" in said
     assert "<!-- sphere -->" not in said
-
-
-def test_a_map_with_nothing_in_it_is_drawn_empty(tmp_path: Path):
     drawn = replace(MAPS["size"], across=MapAxis("x", (1.0,)), up=MapAxis("y", ("box",)))
     assert draw_map(drawn, {"none": {}}, tmp_path / "empty").is_file()
 
@@ -158,10 +147,6 @@ def test_the_span_of_a_gripper_is_its_opening():
     assert 0.25 < map_runs.hand_span(hand_for("allegro_right", 600)) < 0.45
 
 
-def test_the_least_width_of_the_box_is_its_shortest_side():
-    assert map_runs.least_width(make_shape("box")) == pytest.approx(2 * min(BOX_HALF))
-
-
 def test_noise_grows_from_none_over_a_camera_s_to_more():
     assert map_runs.noise_at(0.0) == NONE
     assert map_runs.noise_at(1.0) == DEFAULT
@@ -171,16 +156,90 @@ def test_noise_grows_from_none_over_a_camera_s_to_more():
     assert loud.grazing == DEFAULT.grazing
 
 
-def test_another_mass_leaves_the_shape_alone():
+def test_another_mass_or_grid_leaves_the_shape_alone():
     thing = load_scene("shape:box", resolution=8).object
     heavy = map_runs.at_mass(thing, 2.0)
     assert heavy.mass == 2.0
     np.testing.assert_allclose(heavy.inertia, 20 * thing.inertia)
     assert heavy.sha256 == thing.sha256
-
-
-def test_the_grid_is_as_coarse_as_asked_and_the_cup_stays():
     cup = map_runs.cup(0.3)
     coarse, fine = (map_runs.on_grid(cup, nodes) for nodes in (8, 32))
     assert float(coarse.sdf.spacing) > 3.9 * float(fine.sdf.spacing)
     assert coarse.object is cup.object
+
+
+ENDS = ("_short", "_planned", "_ladder")
+
+
+@pytest.fixture
+def records(record):
+    names = [
+        "fast",
+        "balanced",
+        "accurate",
+        "closed_form_hard_contact",
+        "random_closure",
+        "candidates=64",
+        "candidates=128",
+    ]
+    return [
+        record(name, thing, cpu={"scene": 1.0, "optimise": 1.0 + i, "standard": 3.0}, held=(i + j) % 4)
+        for i, name in enumerate(names)
+        for j, thing in enumerate(("box", "mug", "bowl"))
+    ]
+
+
+def test_charts_are_written_and_not_blank(tmp_path: Path, records, planned):
+    from matplotlib.image import imread
+
+    drawn = charts.draw_charts([*records, planned(), planned("fast")], tmp_path / "deep" / "chart")
+    assert {png.name for png in drawn.values()} == {f"chart{end}.png" for end in ("", *ENDS)}
+    for name in ("chart", *(f"chart{end}" for end in ENDS)):
+        picture = imread(tmp_path / "deep" / f"{name}.png")[..., :3]
+        assert picture.shape[1] > 400
+        inked = (np.abs(picture - 1.0) > 0.1).any(-1)
+        assert 0.005 < inked.mean() < 0.5, name
+        assert ElementTree.parse(tmp_path / "deep" / f"{name}.svg").getroot().tag.endswith("svg")
+
+
+def test_the_same_figures_draw_the_same_chart(tmp_path: Path, records):
+    presets = by_name(rows(records[:9]))
+    for name in ("one", "two"):
+        charts.draw_speed(presets, tmp_path / name)
+    for ending in ("png", "svg"):
+        assert (tmp_path / f"one.{ending}").read_bytes() == (tmp_path / f"two.{ending}").read_bytes()
+
+
+def test_nothing_to_draw_is_no_chart(tmp_path: Path, record):
+    assert charts.draw_charts([record(kind="pace")], tmp_path / "chart") == {}
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shapes", [["mug"], ["mug", "box", "mug"]])
+def test_the_chart_of_the_ranking_has_a_bar_for_each_shape_and_a_curve_for_each_order(tmp_path: Path, shapes):
+    costs = {"plan_cpu_s": 2.0, "ranked_plan_cpu_s": 3.0}
+    found = [{"shape": shape, "shares": [0.5, 1.0], "ranked_by": [0.25, 0.75], **costs} for shape in shapes]
+    assert draw_robust(found, tmp_path / "robust") == tmp_path / "robust.png"
+    drawing = (tmp_path / "robust.svg").read_text()
+    for text in ("ranked by score", "ranked by noisy trials", "CPU seconds for 2 verified grasps"):
+        assert f"<!-- {text} -->" in drawing
+    assert [shape for shape in ("mug", "box", "bowl") if f"<!-- {shape} -->" in drawing] == list(dict.fromkeys(shapes))
+
+
+def test_labels_keep_clear_of_each_other():
+    points = [(1.0 + 0.01 * i, 1.0 + 0.02 * (i % 3)) for i in range(8)]
+    with charts_style.figure(4.5, 4.5) as (made, axis):
+        axis.plot(*zip(*points, strict=True), "o")
+        charts_style.place_labels(axis, points, [f"a preset {i}" for i in range(8)], ["black"] * 8)
+        made.canvas.draw()
+        boxes = [text.get_window_extent() for text in axis.texts]
+    assert len(boxes) == 8
+    assert not [pair for pair in combinations(range(8), 2) if boxes[pair[0]].overlaps(boxes[pair[1]])]
+
+
+def test_a_new_method_is_drawn(tmp_path: Path, record, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(ALL_METHODS, "dummy", Method("dummy", ClosedFormConfig, "a dummy", "#123456", "*", 2))
+    drawn = charts.draw_charts([record("mine", method="dummy"), record("fast")], tmp_path / "chart")
+    text = drawn["speed"].with_suffix(".svg").read_text()
+    assert "a dummy" in text
+    assert "#123456" in text

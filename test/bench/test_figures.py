@@ -178,14 +178,6 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
         report.fill(tmp_path / "nowhere.md", {})
 
 
-def test_the_first_page_has_a_few_rows(record):
-    names = ("fast", "balanced", "accurate", "annealing", "graspd2022", "graspd2022_short", "random_closure")
-    (_, table) = tables.main_sections([record(name) for name in names], None)["bench"]
-    assert isinstance(table, str)
-    assert table.count("\n") - 1 == 5
-    assert "annealing" not in table
-
-
 def test_decades_are_shares_over_all_objects(record):
     names = [f"problem.friction={value}" for value in ("0.2", "0.4")]
     blocks = tables.decades_sections([record(name, thing) for name in names for thing in ("box", "mug")], None)[
@@ -220,12 +212,6 @@ def test_the_front_is_what_nothing_beats(points: np.ndarray):
 
     assert front.any()
     assert [not beaten(point) for point in points] == front.tolist()
-
-
-@given(POINTS, st.floats(0.5, 4.0))
-def test_the_front_does_not_depend_on_units_or_order(points: np.ndarray, factor: float):
-    order = np.random.default_rng(0).permutation(len(points))
-    assert (pareto_front(points * factor + 1.0)[order] == pareto_front(points[order])).all()
 
 
 def test_ablations_know_what_they_are_ablations_of():

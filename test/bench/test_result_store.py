@@ -16,7 +16,7 @@ from graspd_bench import result_store as store
 from graspd_bench.measurement import Cell, run_cell
 from graspd_bench.run_studies import ENVIRONMENT, Job, run_cases, run_job
 from graspd_bench.study import Case, find_objects
-from graspd_core.errors import ConfigError, GraspdError, MeshError
+from graspd_core.errors import GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, to_mapping
@@ -220,9 +220,3 @@ def test_objects_are_shapes_files_and_folders(tmp_path: Path):
     assert [Path(source).name for source in found] == ["shape:mug", "a.obj", "b.obj"]
     with pytest.raises(MeshError, match="two objects are called 'a'"):
         find_objects((str(tmp_path), str(tmp_path / "a.obj")))
-
-
-def test_an_override_names_what_it_does_not_know():
-    assert override(PlanConfig(), {"problem.candidates": 7, "resolution": 9}).problem.candidates == 7
-    with pytest.raises(ConfigError, match="unknown key 'speed'; valid keys: certainty, closed_form"):
-        override(PlanConfig(), {"speed": 1})

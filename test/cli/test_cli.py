@@ -1,7 +1,9 @@
-"""The command line: what comes out, the exit status, and one line on stderr for whatever is wrong with the input."""
+"""The command line: what comes out, the exit status, one line on stderr for what is wrong; recordings, libraries."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import signal
@@ -12,78 +14,54 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_writer import (
+    Record,
+    camera_info_message,
+    cloud_message,
+    depth_message,
+    transforms_message,
+    write_bag,
+)
 
+from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.cli import main
+from graspd_core.cli import options as clouds
 from graspd_core.cli.options import summary
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.io.grasps_json import load_document, load_grasps
-from graspd_core.mesh.mesh_files import save_mesh, surface_samples
+from graspd_core.mesh.mesh_files import load_mesh, save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import preset_names
+from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.planning import plan_grasps as pipeline
+from graspd_core.transforms import SECOND
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, TriangleMesh
 
 GRASPD = [sys.executable, "-m", "graspd_core.cli"]
-NO_FACES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-NAN_VERTEX = "v 0 0 0\nv nan 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
-
-
-def save_large(path: Path) -> None:
-    box = make_shape("box")
-    save_mesh(TriangleMesh(box.vertices / np.ptp(box.vertices, axis=0).max() * 40.0, box.faces), path)
-
 
 # name of the file: how to make it, and what the message must say
 BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing.obj": (lambda path: None, "no such"),
-    "missing.npy": (lambda path: None, "no such"),
-    "folder.stl": (lambda path: path.mkdir(), "is a directory"),
     "notes.txt": (lambda path: path.write_text("hello"), "unknown ending"),
-    "noise.stl": (lambda path: path.write_bytes(b"not a mesh at all"), "noise.stl"),
-    "empty.obj": (lambda path: path.write_text(""), "empty.obj"),
-    "points.obj": (lambda path: path.write_text(NO_FACES), "3 vertices and no face"),
-    "nan.obj": (lambda path: path.write_text(NAN_VERTEX), "NaN"),
-    "large.ply": (save_large, "40 m across"),
-    "empty.npy": (lambda path: np.save(path, np.zeros((0, 3))), "empty"),
     "nan.npy": (lambda path: np.save(path, np.full((100, 3), np.nan)), "NaN"),
-    "flat.npy": (lambda path: np.save(path, np.zeros(7)), "points × 3"),
-    "words.npz": (lambda path: path.write_bytes(b"PK nothing"), "words.npz"),
 }
 BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--hand", "claw"], "unknown hand 'claw'; known: allegro_left, allegro_right"),
-    (["--hand", "missing.yaml"], "missing.yaml: no such file"),
     (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
-    (["-n", "0"], "count: 0 grasps; valid: 1 to 1024"),
     (["-n", "many"], "invalid int value: 'many'"),
-    (["--seed", "-1"], "seed: -1; valid: 0 to"),
     (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
-    (["--mass", "nan"], "mass nan kg"),
-    (["--friction", "-1"], "friction -1.0 must be a positive number"),
-    (["--scale", "0"], "scale 0.0 must be a positive number"),
-    (["--scale", "1e6"], "m across"),
     (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
-    (["--deadline", "0"], "deadline: 0.0 s; it must be positive"),
     (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
-    (["--method", "magic"], "invalid choice: 'magic' (choose from"),
-    (["--device", "abacus"], "device: 'abacus'; valid on this machine: cpu"),
     (["--threads", "0"], "threads: 0; at least 1"),
-    (["--approach", "0", "0", "0"], "approach_direction: (0, 0, 0) is no direction"),
-    (["--approach", "0", "nan", "0"], "approach_direction: [0.0, nan, 0.0]; valid: 3 finite numbers"),
-    (["--approach", "0", "0", "-1", "--approach-angle", "200"], "approach_angle: 3.491 rad; valid: above 0"),
     (["--approach-angle", "20"], "--approach-angle: it needs --approach"),
     (["--roll-tolerance", "20"], "--roll-tolerance: it needs --roll"),
-    (["--roll", "20"], "roll: needs approach_direction"),
     (["--region", "cube", "0"], "--region: cube 0; valid: box X Y Z SX SY SZ"),
     (["--region", "box", "0", "0", "0"], "--region: box 0 0 0; valid: box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"),
     (["--region", "sphere", "0", "0", "0", "wide"], "--region: sphere 0 0 0 wide; valid: box"),
-    (["--region", "sphere", "1", "0", "0", "0.1"], "region: no part of the object lies in it; the object goes from"),
-    (["--avoid", "0", "0", "0", "1", "1", "0"], "box size: (1.0, 1.0, 0.0); valid: three lengths above 0"),
-    (["--arm", "ur99", "--arm-base", "1", "0", "0"], "unknown arm 'ur99'; known: panda_like, ur5e_like"),
     (["--arm", "ur5e_like"], "--arm: say where it stands, --arm-base X Y Z or X Y Z QW QX QY QZ"),
     (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
     (["--arm-base", "1", "0", "0"], "--arm-base: there is no arm"),
-    (["--arm", "ur5e_like", "--arm-base", "0", "0", "0", "1", "1", "0", "0"], "valid: w x y z of length 1"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
 ]
 
@@ -105,13 +83,6 @@ def test_a_bad_object_is_named_in_one_line(tmp_path: Path, capsys: pytest.Captur
     line = the_line(capsys)
     assert culprit in line
     assert name in line or name.endswith("npy"), "clouds are cleaned after they were read, under the name of cloud"
-
-
-def test_an_unknown_shape_lists_the_known(capsys: pytest.CaptureFixture[str]):
-    assert main(["synthesize", "shape:teapot"]) == EXIT_BAD_INPUT
-    line = the_line(capsys)
-    assert "teapot" in line
-    assert "cylinder" in line
 
 
 @pytest.mark.parametrize(("options", "culprit"), BAD_OPTIONS, ids=lambda value: str(value)[:40])
@@ -254,20 +225,8 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     """A mesh in millimetres on disk in; grasps.json and a page out."""
     box = make_shape("box")
     save_mesh(TriangleMesh(box.vertices * 1000, box.faces), tmp_path / "box.stl")
-    options = [
-        "-n",
-        "1",
-        "--units",
-        "mm",
-        "--preset",
-        "fast",
-        "--seed",
-        "1",
-        "--out",
-        "grasps.json",
-        "--html",
-        "view.html",
-    ]
+    out = ["--out", "grasps.json", "--html", "view.html"]
+    options = ["-n", "1", "--units", "mm", "--preset", "fast", "--seed", "1", *out]
     done = subprocess.run([*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == EXIT_OK, done.stderr
     assert "<title>box.stl, allegro_right: verified grasp</title>" in (tmp_path / "view.html").read_text()
@@ -295,3 +254,222 @@ def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path):
     assert load_document(out)["outcome"]["name"] == "CANCELLED"
     # Amid its first round: nothing was tried.
     assert "verify" not in errors
+
+
+CAMERA = PinholeCamera(160, 120, 190.0, 190.0, 79.5, 59.5, (0.05, -0.1))
+OPTICAL = "camera_optical_frame"
+START = 1_700_000_000 * SECOND
+EYES = [(0.4, 0.1, 0.25), (-0.3, -0.3, 0.25)]
+QUICK_PRESET = "closed_form: {explore_steps: 6, refine_steps: 6, polish_steps: 6}\n"
+
+
+def records() -> list[Record]:
+    """A box seen from two eyes, with an image of nothing between them."""
+    box = make_shape("box")
+    poses = [look_at(EYES[0], (0, 0, 0)), look_at(EYES[0], (0, 0, 0)), look_at(EYES[1], (0, 0, 0))]
+    images = [render_depth(box, CAMERA, poses[0]), np.zeros((120, 160)), render_depth(box, CAMERA, poses[2])]
+    found = []
+    for index, (image, pose) in enumerate(zip(images, poses, strict=True)):
+        stamp = START + index * SECOND
+        found += [
+            Record("/tf", stamp, transforms_message([("world", OPTICAL, pose)], stamp)),
+            Record("/depth/camera_info", stamp, camera_info_message(CAMERA, OPTICAL, stamp)),
+            Record("/depth/image_raw", stamp, depth_message(image, OPTICAL, stamp, encoding="32FC1")),
+        ]
+    return found
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("bags")
+    for storage in ("sqlite3", "mcap"):
+        write_bag(folder / storage, records(), storage=storage)
+    hopeless = [Record("/points", START + i, cloud_message(np.full((9, 3), np.nan), "lidar", START)) for i in range(2)]
+    write_bag(folder / "hopeless", hopeless)
+    return {path.name: path for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Options of a run that tries nothing and optimises hardly at all."""
+    path = tmp_path_factory.mktemp("presets") / "quick.yaml"
+    path.write_text(QUICK_PRESET)
+    return ["-n", "1", "--preset", str(path), "--verify", "none"]
+
+
+@pytest.fixture(scope="module")
+def replayed(bags, quick, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, list[str], Path, str]:
+    """Exit status, lines, results and stderr of the whole mcap recording in the world's frame."""
+    out, printed, said = tmp_path_factory.mktemp("replayed") / "grasps", io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
+        status = main(["replay", str(bags["mcap"]), "--frame", "world", *quick, "--out", str(out)])
+    return status, printed.getvalue().splitlines(), out, said.getvalue()
+
+
+def test_every_cloud_of_a_recording_is_planned_on_in_the_frame_asked_for(replayed):
+    status, lines, out, said = replayed
+    # One of the three shows nothing: fewer than were asked for.
+    assert status == EXIT_TOO_FEW
+    assert len(lines) == 4
+    assert lines[0].startswith("cloud 0 at 1700000000.000000000 s: ")
+    assert "1 of 1 grasps" in lines[0]
+    assert lines[1].startswith("cloud 1 at 1700000001.000000000 s: refused: depth image: none of its 160 x 120 pixels")
+    assert lines[2].startswith("cloud 2 at 1700000002.000000000 s: ")
+    assert lines[3].startswith("3 scenes: 2 with enough grasps, 0 with fewer, 1 refused; 2 grasps in ")
+    for cloud in ("cloud 0 at 1700000000.000000000 s", "cloud 2 at 1700000002.000000000 s"):
+        assert f"graspd: {cloud}: cloud: seen from one side only; the rest is guessed by " in said
+    assert sorted(path.name for path in out.iterdir()) == ["cloud_000000.json", "cloud_000002.json"]
+    for path in out.iterdir():
+        # The box is at the world's origin, half a metre from the camera's; its unseen back is a guess.
+        assert np.linalg.norm(load_document(path)["object"]["center_of_mass"]) < 0.05
+
+
+def test_the_same_recording_gives_the_same_grasps_whatever_its_storage(replayed, bags, tmp_path, quick):
+    out = tmp_path / "again.json"
+    options = ["--frame", "world", "--limit", "1", *quick, "--out", str(out)]
+    assert main(["replay", str(bags["sqlite3"]), *options]) == EXIT_OK
+    first, again = load_document(replayed[2] / "cloud_000000.json"), load_document(out)
+    assert first["grasps"] == again["grasps"]
+    assert first["object"]["sha256"] == again["object"]["sha256"]
+
+
+def test_a_cloud_that_is_not_made_whole_in_time_ends_by_the_deadline(bags, tmp_path, capsys, quick):
+    options = ["--limit", "1", *quick, "--deadline", "1e-6", "--out", str(tmp_path / "out")]
+    assert main(["replay", str(bags["mcap"]), *options]) == EXIT_TOO_FEW
+    out, err = capsys.readouterr()
+    assert "0 of 1 grasps (0 tried): the deadline passed before enough grasps were found" in out
+    assert "1 scenes: 0 with enough grasps, 1 with fewer, 0 refused" in out
+    assert err == ""
+    assert not (tmp_path / "out" / "cloud_000000.json").exists()
+
+
+def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys, quick):
+    out = tmp_path / "grasps.json"
+    fused = ["--fuse", "--frame", "world"]
+    assert main(["replay", str(bags["sqlite3"]), *fused, *quick, "--out", str(out)]) == EXIT_OK
+    printed, said = capsys.readouterr()
+    assert printed.startswith("2 clouds fused: ")
+    assert np.abs(load_document(out)["object"]["center_of_mass"]).max() < 0.01
+    # The empty image between the two is no view of anything.
+    assert "graspd: 1 of 3 clouds left out, the first cloud 1: depth image: none of its" in said
+    assert main(["replay", str(bags["hopeless"]), "--fuse", *quick]) == EXIT_BAD_INPUT
+    assert "cloud 0: the cloud has no finite point" in the_line(capsys)
+
+
+def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):
+    monkeypatch.setattr(clouds, "MOST_VIEWS", 1)
+    assert main(["replay", str(bags["mcap"]), "--fuse", "--frame", "world", *quick]) == EXIT_BAD_INPUT
+    assert "more than 1 clouds to fuse; choose some with --every or --limit" in the_line(capsys)
+
+
+def test_ctrl_c_ends_a_recording_of_which_every_cloud_is_refused(bags, capsys, monkeypatch, quick):
+    monkeypatch.setattr(Interrupt, "came", lambda self: True)
+    assert main(["replay", str(bags["hopeless"]), *quick]) == EXIT_INTERRUPTED
+    assert capsys.readouterr().out.startswith("0 scenes: ")
+
+
+def test_a_recording_without_any_usable_cloud_is_bad_input(bags, capsys, quick):
+    assert main(["replay", str(bags["hopeless"]), *quick]) == EXIT_BAD_INPUT
+    lines = capsys.readouterr().out.splitlines()
+    assert ["no finite point" in line for line in lines] == [True, True, False]
+    assert lines[-1].startswith("2 scenes: 0 with enough grasps, 0 with fewer, 2 refused; 0 grasps")
+
+
+def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys, quick):
+    far = ["--target", "0", "0", "3"]
+    assert main(["replay", str(bags["mcap"]), "--limit", "1", *far, *quick]) == EXIT_TOO_FEW
+    assert "refused: " in capsys.readouterr().out.splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--every", "0"], "every: 0 clouds; at least 1"),
+        (["--limit", "0"], "limit: 0 clouds; at least 1"),
+        (["--out", "one.json"], "one.json: one file for many clouds; give a directory, or --limit 1, or --fuse"),
+        (["--target", "0", "0", "0", "--alone"], "not allowed with argument"),
+    ],
+)
+def test_a_bad_option_of_replay_is_named_in_one_line(bags, capsys, monkeypatch, tmp_path, options, culprit):
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(bags["mcap"]), *options]) == EXIT_BAD_INPUT
+    assert culprit in the_line(capsys)
+
+
+def test_a_mesh_comes_out_of_a_recording_in_either_frame(bags, tmp_path, capsys):
+    out = tmp_path / "box.ply"
+    extent = np.ptp(make_shape("box").vertices, axis=0)
+    both = ["--every", "2", "--limit", "2", "--frame", "world"]
+    assert main(["reconstruct", str(bags["mcap"]), *both, "--out", str(out)]) == EXIT_OK
+    assert "box.ply" in capsys.readouterr().out
+    in_world = load_mesh(out).vertices
+    assert np.ptp(in_world, axis=0) == pytest.approx(extent, abs=0.02)
+    # The first cloud alone, in its camera's frame: straight ahead.
+    assert main(["reconstruct", str(bags["sqlite3"]), "--out", str(out)]) == EXIT_OK
+    in_camera = load_mesh(out).vertices
+    assert in_camera.mean(0) == pytest.approx([0, 0, np.linalg.norm(EYES[0])], abs=0.05)
+
+
+FEW = ["-n", "2", "--preset", "fast"]
+
+
+def build(out: Path, *words: str) -> int:
+    return main(["library", "build", *words, "--out", str(out), *FEW])
+
+
+def test_a_library_is_built_gone_on_with_and_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "known.grasps"
+    assert build(out, "shape:sphere") == 0
+    assert "sphere: 2 of 2 grasps" in capsys.readouterr().out
+    assert build(out, "shape:sphere", "--scales", "1", "0.9") == 0
+    told = capsys.readouterr().out
+    assert "sphere: 2 grasps are there" in told
+    assert "sphere@0.9: 2 of 2 grasps" in told
+    assert main(["library", "list", str(out)]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.split()[:4] for row in rows[:2]] == [
+        ["sphere", "allegro_right", "2", "grasps"],
+        ["sphere@0.9", "allegro_right", "2", "grasps"],
+    ]
+    assert rows[2] == f"{out}: 2 records, 4 grasps"
+    # A mesh that cannot be used keeps no other from being added.
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "bad.obj").write_text("v 0 0 0\n")
+    save_mesh(make_shape("capsule"), tmp_path / "meshes" / "capsule.obj")
+    assert build(out, str(tmp_path / "meshes")) == 3
+    told = capsys.readouterr()
+    assert "capsule: 2 of 2 grasps" in told.out
+    assert "bad.obj" in told.err
+
+
+def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Path, capsys):
+    out, mesh = tmp_path / "known.grasps", make_shape("sphere")
+    for folder, size in (("a", 1.0), ("b", 0.9)):
+        (tmp_path / folder).mkdir()
+        save_mesh(TriangleMesh(mesh.vertices * size, mesh.faces), tmp_path / folder / "ball.obj")
+    assert build(out, str(tmp_path / "a" / "ball.obj")) == 0
+    assert build(out, str(tmp_path / "b" / "ball.obj")) == 2
+    told = capsys.readouterr().err
+    assert "has another 'ball', of" in told
+    assert "give one of the files another name" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["build", "shape:sphere"], "--out"),
+        (["build", "shape:nothing", "--out", "new.grasps"], "shape"),
+        (["build", "shape:sphere", "--out", "new.grasps", "--verify", "none"], "verify: none"),
+        (["build", "shape:sphere", "--out", "other.grasps"], "other.grasps: torn or no library"),
+        (["list", "none.grasps"], "none.grasps: no such file"),
+        (["list", "other.grasps"], "other.grasps: torn or no library"),
+    ],
+)
+def test_what_cannot_be_done_is_told_in_one_line(tmp_path: Path, monkeypatch, capsys, words: list[str], told: str):
+    monkeypatch.chdir(tmp_path)
+    Path("other.grasps").write_text("some other file\n" * 100)
+    assert main(["library", *words]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not Path("new.grasps").exists()

@@ -1,16 +1,27 @@
-"""Settings: every boxed preset loads, and what is wrong in one is named with what would be right."""
+"""Settings of plans and of scenes: presets load, one file reaches every field, and what is wrong in one is named."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import yaml
 
-from graspd_core.config import SegmentationConfig, from_mapping
+from graspd_bench.rendering.depth_noise import NONE
+from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
+from graspd_core.config import SceneConfig, SegmentationConfig, from_mapping, load_scene_config
 from graspd_core.errors import ConfigError
-from graspd_core.optimize.closed_form.closed_form_config import LossWeights
-from graspd_core.optimize.plan_config import PlanConfig, load_preset, plan_config, preset_names, to_mapping
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
+from graspd_core.perception.cloud.camera import PinholeCamera
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.obstacles import make_obstacles
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.target_selection import Target
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -18,11 +29,8 @@ def test_every_boxed_preset_loads(name: str):
     assert isinstance(load_preset(name), PlanConfig)
 
 
-def test_the_balanced_preset_is_the_default():
+def test_the_balanced_preset_is_the_default_and_presets_differ_in_effort():
     assert load_preset("balanced") == PlanConfig()
-
-
-def test_presets_differ_in_effort():
     fast, balanced, accurate = (load_preset(name).settings for name in ("fast", "balanced", "accurate"))
     steps = [
         c.starts_per_grasp * (c.explore_steps + c.refine_steps + c.polish_steps) for c in (fast, balanced, accurate)
@@ -38,20 +46,11 @@ def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
     assert config.settings.weights == dataclasses.replace(PlanConfig().settings.weights, wrench_resistance=2.5)
     assert isinstance(config.settings.delta_end, float)
     assert config.grasp_stages == PlanConfig().grasp_stages
-
-
-def test_weights_that_a_preset_leaves_out_are_those_of_the_method(tmp_path: Path):
-    path = tmp_path / "mine.yaml"
     path.write_text("closed_form: {polish_weights: {penetration: 25}}\n")
     before, after = load_preset("balanced").settings, load_preset(str(path)).settings
     assert after == dataclasses.replace(
         before, polish_weights=dataclasses.replace(before.polish_weights, penetration=25.0)
     )
-
-
-def test_a_mapping_of_a_config_makes_that_config_again():
-    config = dataclasses.replace(PlanConfig(), resolution=24)
-    assert plan_config(to_mapping(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -116,7 +115,87 @@ def test_a_place_that_is_none_is_named(value: object, complaint: str):
         from_mapping(SegmentationConfig, {"roi_low": value})
 
 
-def test_every_setting_is_explained():
-    for cls in (PlanConfig, LossWeights, type(PlanConfig().settings), type(PlanConfig().grasp_stages)):
-        for setting in dataclasses.fields(cls):
-            assert f"        {setting.name}: " in (cls.__doc__ or ""), f"{cls.__name__}.{setting.name}"
+PARTS = [(part.name, getattr(SceneConfig(), part.name)) for part in dataclasses.fields(SceneConfig)]
+FIELDS = {f"{name}.{field.name}": field for name, part in PARTS for field in dataclasses.fields(part)}
+CAMERA = PinholeCamera(160, 120, 154.0, 154.0, 79.5, 59.5)
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_an_empty_file_holds_the_defaults_and_a_missing_one_is_named(tmp_path: Path):
+    assert load_scene_config(written(tmp_path, "")) == SceneConfig()
+    with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
+        load_scene_config(tmp_path / "none.yaml")
+
+
+def test_one_file_reaches_every_field(tmp_path: Path):
+    def other(name: str, value: Any) -> Any:
+        given = {"roi_low": [0.0, 0.0, 0.0], "roi_high": [1.0, 1.0, 1.0], "poisson": "open3d"}
+        return given[name] if name in given else 2 * value
+
+    values = {name: {f: other(f, v) for f, v in dataclasses.asdict(part).items()} for name, part in PARTS}
+    config = dataclasses.asdict(load_scene_config(written(tmp_path, yaml.safe_dump(values))))
+    for name, part in PARTS:
+        assert all(config[name][field] != value for field, value in dataclasses.asdict(part).items())
+
+
+@pytest.mark.parametrize(
+    ("text", "culprits"),
+    [
+        ("segmentation: {gab: 0.01}", ["scene.yaml.segmentation", "'gab'", "gap", "voxel"]),
+        ("obstacle: {padding: 0.01}", ["'obstacle'", "obstacles, reconstruction, segmentation"]),
+        ("segmentation: {gap: 0}", ["segmentation.gap", "0.0", "above zero"]),
+        ("reconstruction: {max_points: 10}", ["reconstruction.max_points", "10", "at least 1000"]),
+        ("reconstruction: {seen_distance: 0.02}", ["seen_distance", "0.02", "guessed_distance=0.02"]),
+        ("segmentation: {roi_low: [0, 0, 0], roi_high: [1, 1, 0]}", ["roi_low", "roi_high=(1.0, 1.0, 0.0)"]),
+        ("reconstruction: {poisson: pcl}", ["reconstruction.poisson", "pcl", "grid, open3d"]),
+        ("segmentation: [", ["not valid YAML"]),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path: Path, text: str, culprits: list[str]):
+    with pytest.raises(ConfigError) as caught:
+        load_scene_config(written(tmp_path, text))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(part in message for part in ["scene.yaml", *culprits]), message
+
+
+def recorded(config: Any, prefix: str, read: set[str]) -> Any:
+    """The same settings; `read` gets the names of those that are looked at."""
+
+    class Recorded(type(config)):
+        def __getattribute__(self, name: str) -> Any:
+            read.add(f"{prefix}.{name}")
+            return super().__getattribute__(name)
+
+    return Recorded(**vars(config))
+
+
+def test_every_field_is_used_on_the_way_from_views_to_a_scene():
+    read: set[str] = set()
+    settings = SceneConfig(**{name: recorded(part, name, read) for name, part in PARTS})
+    read.clear()
+    on_table = tabletop("mug", obstacles=[("cylinder", 0.0, 0.16), ("box", 0.0, -0.16)])
+    view = views_of(on_table, CAMERA, ring_poses(1, elevation=0.3, azimuth=0.4), NONE)[0]
+    corners = (np.array([-0.07, -0.07, 0.0]), np.array([0.07, 0.07, 0.2]))
+    scene_from_views([view], target=Target(box=corners), settings=settings, resolution=16)
+    # The things alone, in the air.
+    above = PointCloud(view.points[view.points[:, 2] > 0.008], view.viewpoint)
+    segment([above], target=Target(point=np.array([0.0, 0.0, 0.05])), settings=settings.segmentation)
+    ring = np.array([[0.12 * np.cos(t), 0.12 * np.sin(t), 0.01 * t] for t in np.linspace(0, 12.6, 200)])
+    make_obstacles([ring], None, on_table.truth, 1.0, settings.obstacles)
+    assert set(FIELDS) - read == set()
+
+
+def test_the_settings_change_the_mesh_and_its_confidence():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(4000, 3))
+    views = [PointCloud(0.04 * ball / np.linalg.norm(ball, axis=1, keepdims=True), np.array([0.5, 0.0, 0.3]))]
+    usual = SceneConfig().reconstruction
+    here = reconstruct(views, settings=dataclasses.replace(usual, max_faces=500, seen_distance=1e-6))
+    assert len(here.mesh.faces) <= 500
+    assert here.confidence.max() < 1.0

@@ -1,8 +1,11 @@
-"""The file format: what is written comes back, JSON is strict, and other files are refused by name."""
+"""The file format: what is written comes back, other files are refused by name; and the page of a grasp."""
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +21,7 @@ from graspd_core.errors import ConfigError, FormatError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mount
 from graspd_core.io.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import (
@@ -32,6 +37,7 @@ from graspd_core.types import (
     Verdict,
 )
 from graspd_core.verify.metrics import METRICS
+from graspd_viewer.grasp_page import placed_hand, save_view
 
 # The keys of docs/format.md, one set per object.
 TOP = {
@@ -310,8 +316,46 @@ def test_too_few_joint_values_are_refused(document):
         grasps_of(document)
 
 
-@pytest.mark.parametrize("wrong", [[], None, "allegro", {"joint_names": 3}, {"joint_names": [], "mimic": [7]}])
-def test_a_hand_of_the_wrong_kind_is_refused(document, wrong: object):
-    document["hand"] = wrong
-    with pytest.raises(FormatError, match="grasps: "):
-        grasps_of(document)
+# Half a turn about z: x and y change sign.
+HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def grasp_at(hand, verdict: Verdict) -> Grasp:
+    posture = Posture(np.array([0.1, 0.2, 0.3]), HALF_TURN, hand.open_posture)
+    trials = () if verdict is Verdict.UNVERIFIED else (TrialResult("hold", verdict is Verdict.VERIFIED, 0.0, 0.0),)
+    return Grasp(posture, posture, posture, (), 0.0, trials=trials)
+
+
+def shown(path: Path) -> dict[str, np.ndarray]:
+    """Bounds of every mesh in a page, read back from its embedded GLB."""
+    (encoded,) = re.findall(r'base64_data\s*=\s*"([A-Za-z0-9+/=]+)"', path.read_text())
+    scene = trimesh.load_scene(io.BytesIO(base64.b64decode(encoded)), file_type="glb")
+    return {name: mesh.bounds for name, mesh in scene.geometry.items()}
+
+
+def test_the_page_shows_object_and_hand_and_needs_no_network(tmp_path: Path, hand):
+    cup = make_shape("mug")
+    save_view(tmp_path / "deep" / "view.html", cup, hand, [grasp_at(hand, Verdict.VERIFIED)], name="<mug>")
+    page = (tmp_path / "deep" / "view.html").read_text()
+    assert not re.findall(
+        r"""(?:src|href)\s*=\s*["']?https?:|@import|fetch\(\s*["']http|import[^;]{0,80}["']http""", page
+    )
+    assert not re.findall(r"<(?:link|iframe|img)\b", page)
+    assert f"<title>&lt;mug&gt;, {hand.name}: verified grasp</title>" in page
+    meshes = shown(tmp_path / "deep" / "view.html")
+    assert set(meshes) == {"object", "hand"}
+    # float32 in the file
+    assert meshes["object"] == pytest.approx(np.stack([cup.vertices.min(0), cup.vertices.max(0)]), abs=1e-6)
+
+
+def test_the_hand_is_where_the_posture_puts_it(hand):
+    posture = grasp_at(hand, Verdict.VERIFIED).grasp
+    centre = placed_hand(hand, posture).vertices.mean(0)
+    at_origin = placed_hand(hand, Posture(np.zeros(3), np.array([1.0, 0, 0, 0]), hand.open_posture)).vertices.mean(0)
+    assert centre == pytest.approx(at_origin * [-1, -1, 1] + posture.position, abs=1e-9)
+
+
+def test_a_grasp_that_failed_is_not_shown(tmp_path: Path, hand):
+    save_view(tmp_path / "view.html", make_shape("box"), hand, [grasp_at(hand, Verdict.FAILED)])
+    assert set(shown(tmp_path / "view.html")) == {"object"}
+    assert f"<title>object, {hand.name}: no grasp</title>" in (tmp_path / "view.html").read_text()

@@ -50,9 +50,3 @@ def test_what_is_planted_is_found_and_kept(tmp_path: Path) -> None:
     ended = run("-c", PLANTED.format(folder=str(FUZZ.parent), out=str(tmp_path), file=str(FUZZ)))
     notes = [path.read_text() for path in (tmp_path / "findings").glob("preset-*.txt")]
     assert any("KeyError: 'planted'" in note for note in notes), ended.stderr
-
-
-def test_an_unknown_target_is_refused() -> None:
-    ended = run(str(FUZZ), "--targets", "urdg")
-    assert ended.returncode == 2
-    assert "unknown target 'urdg'; choose from urdf, mjcf" in ended.stderr

@@ -112,10 +112,3 @@ def test_a_hand_is_laid_out_once_and_let_go_again(allegro: HandModel) -> None:
         make_kinematics(copy)
     gc.collect()
     assert first() is None
-
-
-def test_float32_agrees_with_float64(allegro: HandModel) -> None:
-    q = torch.as_tensor(_random_q(allegro, 10, 4))
-    double = forward(make_kinematics(allegro, dtype=torch.float64), q).translation
-    single = forward(make_kinematics(allegro), q.float()).translation
-    torch.testing.assert_close(single.double(), double, atol=1e-6, rtol=0)

@@ -1,6 +1,8 @@
-"""Candidates and dense samples lie on the hand's outer surface and cover it."""
+"""Candidates and dense samples lie on the hand's outer surface and cover it; on disk they are that hand's alone."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,12 +10,22 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_core.hands import surface_points as sampling
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import load_hand
+from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.self_collision import collision_spheres
-from graspd_core.hands.surface_points import dense_samples, feature_points, primitive_area, surface_points
+from graspd_core.hands.self_collision import adjacent_links, collision_spheres
+from graspd_core.hands.surface_points import (
+    candidates,
+    dense_samples,
+    feature_points,
+    kept_dense_samples,
+    primitive_area,
+    surface_points,
+    with_candidates,
+)
+from graspd_core.runtime import disk_cache as cache
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [0.03, 0, 0], [0, 0.02, 0], [0, 0, 0.04]])
 SHAPES = {
@@ -91,13 +103,6 @@ def test_corners_that_face_the_grasp_are_candidates(hand: HandModel) -> None:
         assert np.linalg.norm(own - corner, axis=1).min() < 1e-9
 
 
-def test_candidate_count_is_kept_and_seeded() -> None:
-    few = load_hand("allegro_right", candidates=60)
-    again = load_hand("allegro_right", candidates=60)
-    assert len(few.candidate_points) == 60
-    np.testing.assert_array_equal(few.candidate_points, again.candidate_points)
-
-
 def test_dense_samples_carry_the_outer_area(hand: HandModel) -> None:
     points, links, areas = dense_samples(hand, count=20000, seed=3)
     assert len(points) >= 20000
@@ -165,3 +170,60 @@ def test_proxy_spheres_fill_the_links_and_bulge_little(hand: HandModel) -> None:
         surface = points[owners == link]
         reach = np.linalg.norm(surface[:, None] - centers[mine][None], axis=-1) - radii[mine]
         assert np.median(reach.min(1)) < 0.005  # half the surface is within 5 mm of a sphere
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("GRASPD_CACHE", raising=False)
+    with_candidates.cache_clear()
+    cache.forget()
+    yield tmp_path / "graspd"
+    with_candidates.cache_clear()
+    cache.forget()
+
+
+def arrays_of(hand):
+    samples = kept_dense_samples(hand, count=500, seed=3)
+    return [hand.adjacent, hand.candidate_points, hand.candidate_normals, hand.candidate_link, *samples]
+
+
+@pytest.mark.parametrize("name", hand_names())
+def test_what_is_on_disk_is_what_sampling_gives(name, own_cache, monkeypatch):
+    hand = load_hand(name, candidates=100)
+    fresh = arrays_of(hand)
+    bare = replace(hand, adjacent=np.zeros_like(hand.adjacent))
+    expected = [hand.adjacent, *candidates(hand, 100, 0), *dense_samples(hand, count=500, seed=3)]
+    cache.forget()
+    for module, function in ((sampling, "candidates"), (sampling, "dense_samples")):
+        monkeypatch.setattr(module, function, lambda *_, **__: pytest.fail("sampled again"))
+    read = arrays_of(load_hand(name, candidates=100))
+    assert adjacent_links(bare).tolist() == hand.adjacent.tolist()
+    for a, b, c in zip(fresh, read, expected, strict=True):
+        assert a.dtype == b.dtype == c.dtype
+        assert (a == b).all()
+        assert (b == c).all()
+
+
+def test_another_hand_has_its_own(own_cache):
+    hand = load_hand("parallel_gripper", candidates=50)
+    files = set(own_cache.glob("hand-*.npz"))
+    with_candidates(replace(hand, name="other", urdf="elsewhere"), 60)
+    assert len(set(own_cache.glob("hand-*.npz")) - files) == 1
+    solid = hand.primitives[0]
+    thicker = replace(hand, primitives=(replace(solid, translation=solid.translation + 1e-6), *hand.primitives[1:]))
+    for changed in (thicker, replace(hand, upper=hand.upper + 1e-6), replace(hand, palm_normal=-hand.palm_normal)):
+        files = set(own_cache.glob("hand-*.npz"))
+        with_candidates(changed, 60)
+        assert len(set(own_cache.glob("hand-*.npz")) - files) == 1
+
+
+@pytest.mark.parametrize("alien", [{"adjacent": np.zeros(3)}, {"adjacent": np.float64(1)}, {"other": np.zeros((9, 9))}])
+def test_an_alien_file_is_sampled_again(alien, own_cache):
+    hand = load_hand("parallel_gripper", candidates=50)
+    bare = replace(hand, adjacent=np.zeros_like(hand.adjacent))
+    adjacent_links(bare)
+    for file in own_cache.glob("hand-*-adjacent-*.npz"):
+        np.savez(file, **alien)
+    cache.forget()
+    assert adjacent_links(bare).tolist() == hand.adjacent.tolist()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -192,10 +190,3 @@ def test_two_objects_of_one_name_are_told(library, hand, ball, planned, tmp_path
     add_planned(library, load_scene(other), hand, load_preset("fast"), planned.grasps, "standard")
     with pytest.raises(ConfigError, match=r"ball: the library .* has several: .*ball\.obj, .*ball\.obj; name the mesh"):
         entry_by_name(library, hand, "ball", PHYSICS)
-
-
-def test_who_gives_no_library_imports_none_of_it():
-    code = "import sys, graspd_core as g; g.plan_grasps, g.load_hand, g.load_scene; "
-    code += "print([m for m in sys.modules if 'sqlite3' in m or m.startswith('graspd_core.library')])"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"

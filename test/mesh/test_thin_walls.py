@@ -1,4 +1,4 @@
-"""Walls thinner than a cell: what the grid makes of them, what the object's own points make good, and grasps."""
+"""Sharp points, and walls thinner than a cell: what the grid makes of them, and what the points make good."""
 
 from __future__ import annotations
 
@@ -12,21 +12,15 @@ from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.stress.run_stress_case import GRASP, faults, run_case
 from graspd_bench.stress.stress_cases import CASES
 from graspd_core.hands.library import load_hand
-from graspd_core.mesh.mesh_files import mass_properties, save_mesh, surface_samples
+from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
-from graspd_core.mesh.sharp_features import neighbours_together, sharp_points
+from graspd_core.mesh.shapes import BOX_HALF, make_shape
+from graspd_core.mesh.sharp_features import farthest_points, neighbours_together, sharp_points
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import TriangleMesh
 
 RADIUS, HEIGHT = 0.033, 0.08
-
-
-@pytest.mark.parametrize("wall", [5e-4, 3e-3])
-def test_the_cup_is_as_thick_as_asked_for(wall):
-    # A cylinder less a smaller one; 64 segments lose 0.16 % of the area of a circle.
-    volume = np.pi * (RADIUS**2 * HEIGHT - (RADIUS - wall) ** 2 * (HEIGHT - wall))
-    assert mass_properties(thin_cup(wall))[0] == pytest.approx(volume, rel=3e-3)
 
 
 @pytest.mark.parametrize("wall", [5e-4, 9e-4, 1.5e-3])
@@ -110,3 +104,42 @@ def test_what_a_coarse_grid_or_small_components_once_hid_is_grasped(name):
     ending = replace(run_case(CASES[name], "fast"), loading=0.0, planning=0.0, memory=0.0)
     assert ending.ending == GRASP
     assert faults(CASES[name], ending) == ()
+
+
+def test_a_sphere_has_no_sharp_points():
+    # 3 mm below a sphere of 35 mm the surface is 3 mm away; its facets change that by hundredths of a millimetre.
+    assert sharp_points(make_shape("sphere"), 50)[0].shape == (0, 3)
+
+
+@pytest.mark.parametrize("count", [8, 60])
+def test_the_sharp_points_of_a_box_lie_on_its_edges(count: int):
+    points, _ = sharp_points(make_shape("box"), count)
+    assert len(points) == count
+    inside = np.sort(np.array(BOX_HALF) - np.abs(points), axis=1)
+    # On the surface to float32 rounding; the second nearest face is within the 3 mm that the probe looks down.
+    assert np.abs(inside[:, 0]) == pytest.approx(0.0, abs=1e-6)
+    assert (np.abs(inside[:, 1]) < 0.003).all()
+
+
+def test_the_sharp_points_of_a_box_cover_all_its_edges():
+    points, _ = sharp_points(make_shape("box"), 60)
+    for axis in range(3):
+        a, b = np.delete(np.arange(3), axis)
+        for sign in [(-1, -1), (-1, 1), (1, -1), (1, 1)]:
+            edge = np.array([sign[0] * BOX_HALF[a], sign[1] * BOX_HALF[b]])
+            near = np.linalg.norm(points[:, [a, b]] - edge, axis=1) < 0.005
+            assert near.sum() >= 2
+    box = make_shape("box")
+    assert np.array_equal(sharp_points(box, 20, seed=1)[0], sharp_points(box, 20, seed=1)[0])
+
+
+@pytest.mark.parametrize(("name", "thin"), [("mug", True), ("bowl", True), ("box", False), ("sphere", False)])
+def test_only_walls_are_thin(name: str, thin: bool):
+    assert (sharp_points(make_shape(name), 8)[1] > 0.6) == thin
+
+
+def test_farthest_points_of_a_line():
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [10, 0, 0]])
+    assert farthest_points(line, 3).tolist() == [0, 4, 3]
+    assert sorted(farthest_points(line, 99)) == [0, 1, 2, 3, 4]
+    assert len(farthest_points(np.zeros((0, 3)), 3)) == 0

@@ -1,4 +1,4 @@
-"""The winding number's inside, and exact distances, for surfaces of every kind."""
+"""The winding number's inside, closest points and exact distances, for surfaces of every kind; rows as numbers."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 
 from graspd_core.hands.link_distance import box_sdf
 from graspd_core.mesh.shapes import BOX_HALF, MUG_HALF, make_shape
 from graspd_core.mesh.surface_queries import (
+    closest_points,
     inside,
     is_inside,
     make_distance_query,
+    make_surface,
     make_winding_tree,
     signed_distance,
+    surface_distance,
     unsigned_distance,
     winding_inside,
 )
+from graspd_core.mesh.topology import packed_rows
 from graspd_core.types import TriangleMesh
 
 
@@ -51,14 +56,6 @@ def test_an_open_cup_is_empty_and_its_holes_leak_only_near_the_rim():
     holed = TriangleMesh(sphere.vertices, sphere.faces[sphere.vertices[sphere.faces].mean(1)[:, 2] < 0.03])
     # A cap of height h is a share h/2R of the solid angle: 1 − 5/70 is still well inside.
     assert winding_inside(holed, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.03]])).all()
-
-
-def test_inverted_and_doubled_surfaces_have_the_same_inside():
-    mesh = make_shape("bottle")
-    points = about(mesh, 400, seed=2)
-    plain = winding_inside(mesh, points)
-    assert np.array_equal(winding_inside(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1]), points), plain)
-    assert np.array_equal(winding_inside(TriangleMesh(mesh.vertices, np.vstack([mesh.faces] * 2)), points), plain)
 
 
 def test_winding_ignores_long_faces_and_distance_from_the_origin():
@@ -116,3 +113,56 @@ def test_many_points_are_asked_in_pieces_between_which_other_threads_run():
     assert np.array_equal(is_inside(dataclasses.replace(tree, tree=counting), points), is_inside(tree, points))
     assert sum(counting.asked) > 2000
     assert max(counting.asked) <= 500
+
+
+@pytest.mark.parametrize("shift", [0.0, 100.0])
+def test_a_boxs_distance_is_exact_far_from_the_origin_too(shift):
+    box, half = make_shape("box"), np.array(BOX_HALF)
+    points = np.random.default_rng(0).uniform(-3, 3, (1000, 3)) * half
+    points = points[(np.abs(points) > half).any(1)]
+    surface = make_surface(TriangleMesh(box.vertices + shift, box.faces))
+    closest, normals = closest_points(surface, points + shift)
+    exact = np.clip(points, -half, half)
+    # Ten roundings of a float64 of the coordinates' size.
+    assert np.abs(closest - shift - exact).max() < 1e-15 * (1 + 10 * shift)
+    assert np.abs(surface_distance(surface, points + shift) - np.linalg.norm(points - exact, axis=1)).max() < 2e-12
+    over_a_face = (np.abs(points) > half).sum(1) == 1
+    assert np.abs(normals - np.sign(points - exact))[over_a_face].max() < 1e-12
+
+
+def test_points_that_are_not_finite_have_no_closest_one():
+    surface = make_surface(make_shape("torus"))
+    points = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, 1e200], [0.035, 0, 0.1]])
+    closest, normals = closest_points(surface, points)
+    assert np.isnan(np.concatenate([closest[:3], normals[:3]])).all()
+    assert surface_distance(surface, points)[:3].tolist() == [np.inf] * 3
+    assert np.allclose(normals[3], [0, 0, 1], atol=0.1)
+
+
+def test_no_points_have_no_closest_ones_and_faces_without_an_area_are_borne():
+    surface = make_surface(make_shape("box"))
+    assert surface_distance(surface, np.zeros((0, 3))).shape == (0,)
+    assert [part.shape for part in closest_points(surface, np.zeros((0, 3)))] == [(0, 3), (0, 3)]
+    triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    surface = make_surface(TriangleMesh(triangle, np.array([[0, 1, 2], [0, 0, 0], [1, 1, 2]])))
+    assert surface_distance(surface, np.array([[0.2, 0.2, 0.5], [2.0, 0, 0]])).tolist() == [0.5, 1.0]
+
+
+_SHAPES = array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12).map(lambda shape: (shape[0], 1 + shape[1] % 3))
+
+# Few values, so that rows repeat; or up to where three of them have no room in one number.
+_VALUES = st.integers(-3, 3) | st.integers(-(2**40), 2**40)
+
+
+@given(arrays(np.int64, _SHAPES, elements=_VALUES))
+def test_rows_and_their_numbers_sort_and_group_alike(rows: np.ndarray):
+    by_rows = np.unique(rows, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    by_numbers = np.unique(packed_rows(rows), return_index=True, return_inverse=True, return_counts=True)
+    for expected, found in zip(by_rows[1:], by_numbers[1:], strict=True):
+        np.testing.assert_array_equal(expected.reshape(-1), found)
+    np.testing.assert_array_equal(by_rows[0], rows[by_numbers[1]])
+
+
+@pytest.mark.parametrize("columns", [1, 3])
+def test_no_rows_give_no_numbers(columns: int):
+    assert packed_rows(np.zeros((0, columns), dtype=np.int64)).shape == (0,)

@@ -14,7 +14,6 @@ from torch import Tensor
 from graspd_core.optimize import losses
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Poses, pack
-from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.problem import Terms, evaluate
 
 ROOT = Path(__file__).parents[2]
@@ -131,29 +130,6 @@ def test_single_and_double_precision_agree(hand, scenes, problem_of, name, fine)
     # distances of self-collision cancel once more.
     for term, a, b in zip(TERMS, single[:-1], double[:-1], strict=True):
         assert a.double().numpy() == pytest.approx(b.numpy(), rel=1e-3, abs=1e-4), term
-
-
-def plain(function: Callable) -> Callable:
-    """The function without the run-time shape checks that tests switch on."""
-    return getattr(function, "__wrapped__", function)
-
-
-@pytest.mark.parametrize(
-    ("function", "arguments"),
-    [
-        (losses.wrench_resistance, (draw(4, 12), 0.5)),
-        (losses.touch, (draw(4, 6), draw(6))),
-        (losses.penetration, (draw(4, 9), draw(4))),
-        (losses.self_collision, (draw(4, 6, 3, high=0.03), *spheres())),
-        (losses.posture, (draw(4, 5), *limits())),
-        (losses.soft_contact, (draw(4, 9), draw(4), 0.01)),
-        (wrench_support, (draw(4, 7, 3), draw(4, 7, 3), draw(4, 7), disturbance_directions(12, 0), 0.5)),
-    ],
-    ids=["task", "touch", "penetration", "self_collision", "posture", "soft_contact", "wrench_support"],
-)
-def test_kernels_trace_in_one_graph(function, arguments):
-    traced = torch.compile(plain(function), backend="eager", fullgraph=True)
-    assert torch.equal(traced(*arguments), function(*arguments))
 
 
 EVALUATION = """

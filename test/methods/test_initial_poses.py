@@ -124,16 +124,6 @@ def test_a_share_of_the_starts_is_put_there_with_the_fingertips(hand, scenes):
     assert 0.1 < near(0.25) - near(0.0) < 0.6
 
 
-def test_starts_are_seeded(hand, scenes):
-    def draw(seed: int) -> Tensor:
-        starts = draw_starts(scenes["box"], hand, 5, seed, "cpu", torch.float32)
-        return torch.cat([starts.translation, starts.quaternion, starts.joints], -1)
-
-    assert torch.equal(draw(3), draw(3))
-    assert not torch.equal(draw(3), draw(4))
-    assert draw(3).dtype == torch.float32
-
-
 def box(*size: float) -> TriangleMesh:
     unit = convex_hull(TriangleMesh(np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T, np.zeros((1, 3), int)))
     return TriangleMesh(unit.vertices * np.array(size), unit.faces)

@@ -1,4 +1,4 @@
-"""Support and neighbours in the optimiser: exact on half-spaces, nothing reaches through, free scenes pay nothing."""
+"""Support and neighbours in the optimiser, patches of the hand that are drawn to the surface, a hand that gives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, place_points
+from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, in_base, link_poses, place_points
+from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import find_candidates
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
@@ -26,7 +27,7 @@ from graspd_core.optimize.obstacle_distance import (
     obstacle_gaps,
 )
 from graspd_core.optimize.plan_config import PlanConfig
-from graspd_core.optimize.problem import Problem, build_problem, evaluate
+from graspd_core.optimize.problem import Problem, build_problem, evaluate, make_hand_tensors, make_object_tensors
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
@@ -200,3 +201,41 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
         ]
         quaternion = torch.as_tensor(grasp.grasp.quaternion_wxyz)[None]
         assert -float(gap_on_the_way(obstacles, kinematics, quaternion, ends[0], ends[1])) < 0.0016
+
+
+SETTINGS = ProblemConfig(candidates=200, features=24)
+
+
+@pytest.mark.parametrize("name", hand_names())
+def test_a_patch_is_part_of_one_rigid_group_and_all_have_a_coarse_candidate(name: str):
+    hand = load_hand(name, candidates=400)
+    tensors = make_hand_tensors(hand, 200, 4, "cpu", torch.float64)
+    of_link = hand.link_group[hand.candidate_link]
+    members = [np.unique(row) for row in tensors.fine.groups.numpy()]
+    assert sorted(np.concatenate(members)) == sorted(np.flatnonzero(np.isin(of_link, of_link[:200])))
+    assert all(len(set(of_link[some])) == 1 for some in members)
+    coarse = [np.unique(row) for row in tensors.coarse.groups.numpy()]
+    assert [set(some) for some in coarse] == [set(some[some < 200]) for some in members]
+    assert 200 / 4 * 0.8 <= len(members) <= 200 / 4 * 1.2
+
+
+def test_candidates_of_a_patch_lie_together():
+    hand = load_hand("allegro_right", candidates=200)
+    patches, links = (make_hand_tensors(hand, 200, size, "cpu", torch.float64) for size in (4, 0))
+
+    def width(tensors) -> float:
+        posture = link_poses(hand, (hand.lower + hand.upper) / 2)
+        points = torch.as_tensor(in_base(posture, hand.candidate_points, hand.candidate_link))
+        return float(torch.stack([points[row].std(0).norm() for row in tensors.coarse.groups]).mean())
+
+    assert width(patches) < 0.7 * width(links)
+    assert len(links.reach) == len(np.unique(hand.link_group[hand.candidate_link]))
+
+
+def test_a_hand_that_gives_sees_a_thinner_object(scenes):
+    firm, soft = (
+        make_object_tensors(scenes["box"], replace(SETTINGS, softness=s), "cpu", torch.float64) for s in (0.0, 0.002)
+    )
+    assert torch.allclose(soft.sdf.field[0], firm.sdf.field[0] + 0.002)
+    assert torch.equal(soft.sdf.field[1:], firm.sdf.field[1:])
+    assert len(firm.features) > len(soft.features) == 0

@@ -182,7 +182,7 @@ def test_no_shape_is_begun_where_none_is_needed():
         assert not hypotheses._begun(doubted)
 
 
-def test_nothing_is_tried_after_a_failure():
+def test_nothing_is_tried_after_a_failure_and_what_was_stopped_is_not_verified():
     def never(grasp, stop):
         raise AssertionError("tried")
 
@@ -190,6 +190,7 @@ def test_nothing_is_tried_after_a_failure():
     failing = under((True, False), (True,))
     asked = replace(failing, stages=((*failing.stages[0], late), (late,)))
     assert not try_hypotheses(asked, GRASP, lambda: False)[0].passed
+    assert not try_hypotheses(under((True, True, True)), GRASP, lambda: True)[0].passed
 
 
 @pytest.mark.parametrize(("missing", "expected"), [(0, [""]), (1, ["", "mirror"]), (3, ["", "mirror", "extrusion"])])
@@ -221,10 +222,6 @@ def test_no_more_is_in_doubt_than_the_probability_asks_for(probability, stages):
         assert asked.probability >= probability
 
 
-def test_a_grasp_that_was_stopped_is_not_verified():
-    assert not try_hypotheses(under((True, True, True)), GRASP, lambda: True)[0].passed
-
-
 def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
     result = plan(seen_from(), SURE)
     verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
@@ -242,13 +239,10 @@ def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
     assert order == sorted(order, key=[Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED].index)
 
 
-def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape():
+def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape_and_a_mesh_is_not_doubted():
     result = plan(seen_from(), 0.0)
     assert all(grasp.probability is None for grasp in result.grasps)
     assert all(trial.name != HYPOTHESES for grasp in result.grasps for trial in grasp.trials)
-
-
-def test_a_mesh_is_not_doubted():
     result = plan(load_scene("shape:cylinder"), SURE)
     assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.grasps)
 

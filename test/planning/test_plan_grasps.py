@@ -219,7 +219,7 @@ def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkey
     monkeypatch.setattr(verification, "_worlds", lambda *_: release.wait())
     short = replace(load_preset("fast").settings, explore_steps=3, refine_steps=3, polish_steps=3)
     try:
-        late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=2.0)
+        late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=0.5)
     finally:
         release.set()
     assert late.outcome is Outcome.DEADLINE

@@ -83,13 +83,7 @@ def test_starts_are_drawn_until_enough_are_allowed_the_same_for_a_seed(scene, ha
     assert torch.equal(found.translation, starts(scene, hand, bound).translation)
     assert not torch.equal(found.translation, starts(scene, hand, bound, seed=4).translation)
     assert (starts(scene, hand).translation[:, 0] < 0.05).any()
-
-
-def test_a_restriction_that_allows_all_changes_no_start(scene, hand):
     assert torch.equal(starts(scene, hand, BoundRestrictions((Side(-9.0),))).joints, starts(scene, hand).joints)
-
-
-def test_where_nothing_is_allowed_there_are_no_starts(scene, hand):
     assert len(starts(scene, hand, BoundRestrictions((Side(9.0),))).joints) == 0
 
 

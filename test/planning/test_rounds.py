@@ -1,24 +1,32 @@
-"""Adaptive fidelity: a cheap first round where a trial tells, more effort in each further one."""
+"""Rounds of growing effort, ranking by robustness, runs that are watched, and grasps from elsewhere that are tried."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
-from graspd_core.config import RoundsConfig
+from graspd_bench.studies.robust_ranking import correlation, orders
+from graspd_core import verify_grasps
+from graspd_core.config import RobustConfig, RoundsConfig
+from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
+from graspd_core.io.grasps_json import result_document
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.candidates import Candidates
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.perception.scene import Obstacle, Scene, object_parts
 from graspd_core.planning import rounds as planning_rounds
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.rounds import rounds_of
-from graspd_core.types import Plane
+from graspd_core.types import Grasp, GraspMetrics, Outcome, Plane, Posture, Progress, Snapshot, Stage, Verdict
+from graspd_core.verify.hold_trial import noisy_share, pose_errors
+from graspd_core.verify.verification import most_robust_first
+from graspd_core.verify.world import PROTOCOLS, build_world
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +73,146 @@ def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, 
     asked.clear()
     plan_grasps(scene, load_hand("parallel_gripper"), count=20)
     assert asked == [2, 20, 20, 20]
+
+
+POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
+
+
+def order(shares: dict[float, float | None]) -> list[float]:
+    """Scores of grasps in the order that the given shares bring about."""
+    measured = [GraspMetrics({"robustness": share}) for share in shares.values()]
+    grasps = [Grasp(POSTURE, POSTURE, POSTURE, (), s, m) for s, m in zip(shares, measured, strict=True)]
+    return [grasp.score for grasp in most_robust_first(grasps)]
+
+
+def test_the_most_robust_come_first_and_level_ones_keep_their_order():
+    assert order({5.0: 0.5, 4.0: 1.0, 3.0: 0.125, 2.0: 1.0}) == [4.0, 2.0, 5.0, 3.0]
+    assert order({5.0: 0.25, 4.0: None, 3.0: 0.75}) == [3.0, 4.0, 5.0]
+    assert order({5.0: None, 4.0: None}) == [5.0, 4.0]
+
+
+def test_a_plan_is_put_in_order_and_says_by_what():
+    hand, scene = load_hand("allegro_right"), load_scene("shape:box")
+    config = replace(load_preset("fast"), robust=RobustConfig(rank=True, trials=2, hold_time=0.1))
+    told: list[Progress] = []
+    result = plan_grasps(scene, hand, count=2, preset=config, progress=told.append)
+    assert result.outcome is Outcome.SUCCEEDED
+    verified = [g.metrics for g in result.grasps if g.metrics and g.verdict is Verdict.VERIFIED]
+    shares = [share for metrics in verified if (share := metrics["robustness"]) is not None]
+    assert len(shares) == 2
+    assert shares == sorted(shares, reverse=True)
+    assert set(shares) <= {0.0, 0.5, 1.0}
+    assert [p.stage for p in told[-3:]] == [Stage.VERIFY, Stage.VERIFY, Stage.DONE]
+    document = result_document(result, scene.object, hand, config)
+    assert [g["metrics"]["robustness"] for g in document["grasps"]][:2] == shares
+    assert document["config"]["robust"] == {"rank": True, "trials": 2, "hold_time": 0.1}
+    # A trial that is cut short says nothing.
+    world = build_world(hand, scene.object, object_parts(scene.object), PROTOCOLS["standard"])
+    errors = pose_errors(0, 2)
+    assert noisy_share(world, result.grasps[0], PROTOCOLS["standard"], errors, stop=lambda: True) is None
+    # Nor do none at all.
+    assert noisy_share(world, result.grasps[0], PROTOCOLS["standard"], []) is None
+
+
+def test_the_preset_and_only_it_ranks():
+    assert load_preset("robust") == replace(load_preset("balanced"), robust=RobustConfig(rank=True))
+    assert not load_preset("balanced").robust.rank
+
+
+def test_figures_of_the_benchmark():
+    rows = [
+        {"shares": [0.5, 1.0, 0.0], "ranked_by": [0.5, 1.0, 0.25], "score": [3.0, 2.0, 1.0]},
+        {"shares": [1.0, 0.0], "ranked_by": [0.0, 1.0], "score": [2.0, 1.0]},
+    ]
+    by_score, by_noise, best = orders(rows)
+    assert by_score.tolist() == [0.75, 0.5]
+    assert by_noise.tolist() == [0.5, 0.75]
+    assert best.tolist() == [1.0, 0.25]
+    # Ranks (2, 3, 1) against (3, 2, 1): one half; and of two, the same way or the other.
+    assert correlation(rows, "score") == pytest.approx((0.5 + 1.0) / 2)
+    assert correlation(rows, "ranked_by") == pytest.approx((1.0 - 1.0) / 2)
+
+
+@pytest.fixture
+def _one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("_one_thread")
+@pytest.mark.parametrize("preset", ["fast", "random_closure"])
+def test_a_watched_run_ends_as_one_that_nobody_watches(preset: str):
+    scene, hand, seen = load_scene("shape:box"), load_hand("parallel_gripper"), list[Snapshot]()
+    watched = plan_grasps(scene, hand, count=3, preset=preset, measure=False, watch=seen.append)
+    alone = plan_grasps(scene, hand, count=3, preset=preset, measure=False)
+    assert [g.grasp.position.tolist() for g in watched.grasps] == [g.grasp.position.tolist() for g in alone.grasps]
+    starts = [s for s in seen if not s.verdicts]
+    # The last of each round: the next has other candidates.
+    tried = [s for s, after in pairwise([*seen, starts[0]]) if s.verdicts and not after.verdicts]
+    assert starts
+    assert all(np.isfinite(s.positions).all() and s.joint_positions.shape[1] == hand.num_joints for s in starts)
+    told = [verdict for s in tried for verdict in s.verdicts if verdict is not Verdict.UNVERIFIED]
+    assert sorted(told) == sorted(g.verdict for g in watched.grasps)
+
+
+def test_hands_are_seen_where_the_object_is_though_it_is_planned_on_about_its_own_centre():
+    from graspd_core.mesh.shapes import make_shape
+    from graspd_core.types import TriangleMesh
+
+    shape, far = make_shape("box"), np.array([40.0, 0.0, 0.0])
+    scene, seen = load_scene(TriangleMesh(shape.vertices + far, shape.faces)), list[Snapshot]()
+    plan_grasps(scene, load_hand("parallel_gripper"), count=1, preset="fast", measure=False, watch=seen.append)
+    assert {bool(s.verdicts) for s in seen} == {True, False}
+    assert all(np.abs(s.positions - far).max() < 1.0 for s in seen)
+
+
+HAND = load_hand("parallel_gripper")
+
+# Half of what the jaws leave between them [m]: the box is 60 mm wide.
+CLEAR, TOUCH, PRESS = 0.05, 0.03, 0.02
+
+
+def gripper_at(height: float) -> Grasp:
+    """The jaws about a box at the origin, from above."""
+    down = np.array([0.0, 1.0, 0.0, 0.0])
+    clear, touch, press = (
+        Posture(np.array([0.0, 0.0, height]), down, np.array([jaw])) for jaw in (CLEAR, TOUCH, PRESS)
+    )
+    return Grasp(clear, touch, press)
+
+
+def test_a_grasp_that_holds_and_one_that_misses_come_back_in_their_order():
+    scene = load_scene("shape:box")
+    missed, held = verify_grasps(scene, HAND, [gripper_at(0.4), gripper_at(0.15)])
+    assert (missed.verdict, held.verdict) == (Verdict.FAILED, Verdict.VERIFIED)
+    assert missed.reason
+    assert missed.metrics is not None
+    assert missed.metrics["contact_area"] == 0
+    assert held.metrics is not None
+    # Both pads, each 24 mm wide and 69 mm along the box.
+    assert held.metrics["contact_area"] == pytest.approx(2 * 0.024 * 0.069, rel=0.35)
+
+
+def test_what_is_not_asked_for_is_not_done_and_an_unknown_trial_is_refused():
+    tried = replace(gripper_at(0.15), score=3.0)
+    (grasp,) = verify_grasps(load_scene("shape:box"), HAND, [tried], verify="none", measure=False)
+    assert (grasp.verdict, grasp.metrics, grasp.score) == (Verdict.UNVERIFIED, None, 3.0)
+    with pytest.raises(ConfigError, match="verify: 'soft'; valid: standard"):
+        verify_grasps(load_scene("shape:box"), HAND, [], verify="soft")
+
+
+@pytest.mark.parametrize(
+    ("change", "culprit"),
+    [
+        ({"joint_positions": np.zeros(16)}, r"grasp 1: squeeze.joint_positions .*; valid: 1 finite"),
+        ({"position": np.array([0.0, np.nan, 0.0])}, "grasp 1: squeeze.position .*; valid: 3 finite"),
+        ({"quaternion_wxyz": np.array([0.0, 2.0, 0.0, 0.0])}, "grasp 1: squeeze.quaternion_wxyz has length 2"),
+    ],
+)
+def test_a_posture_that_fits_no_hand_is_refused(change: dict, culprit: str):
+    good = gripper_at(0.15)
+    bad = replace(good, squeeze=replace(good.squeeze, **change))
+    with pytest.raises(ConfigError, match=culprit):
+        verify_grasps(load_scene("shape:box"), HAND, [good, bad])

@@ -259,7 +259,6 @@ def test_confidence_goes_along_to_another_grid():
     [
         ("resolution", 7, "resolution: 7 nodes; valid: 8 to 256"),
         ("resolution", 257, "resolution: 257 nodes"),
-        ("problem.fine_candidates", 0, "candidates=0: at least 1"),
     ],
 )
 def test_a_setting_out_of_range_is_named(name: str, value: int, complaint: str):

@@ -1,4 +1,4 @@
-"""Whether clouds tell that their camera stood elsewhere: authored scenes with the faults of a real camera."""
+"""Whether clouds tell that their camera stood elsewhere, and whether an object reaches the border of a picture."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, reaches_image_border
 from graspd_core.perception.cloud.viewpoint_check import check_viewpoint
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
+
 # Where robots have their base: on the table, above it, on the floor; and right under the object.
 BASES = {"on the table": (-0.5, 0.0, 0.0), "above": (-0.5, 0.1, 0.4), "floor": (-0.5, 0.2, -0.7), "under": (0, 0, -0.5)}
 
@@ -31,8 +33,7 @@ def seen(shape: str, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return grid, flat[np.unique(np.floor(flat / 0.004), axis=0, return_index=True)[1]], T[:3, 3]
 
 
-@pytest.mark.parametrize("elevation", [0.35, 0.8, 1.2])
-@pytest.mark.parametrize("shape", ["mug", "box"])
+@pytest.mark.parametrize(("shape", "elevation"), [("mug", 0.35), ("mug", 0.8), ("mug", 1.2), ("box", 0.8)])
 def test_the_true_place_is_taken_and_the_places_of_robots_are_refused(shape, elevation):
     grid, points, place = seen(shape, elevation)
     check_viewpoint(points, place, grid=grid)
@@ -61,3 +62,48 @@ def test_clouds_too_small_or_too_flat_to_tell_are_taken():
     flat = np.c_[rng.uniform(-0.3, 0.3, (5000, 2)), np.full(5000, 0.6)]
     check_viewpoint(flat, np.zeros(3))
     check_viewpoint(np.zeros((500, 3)), np.zeros(3))
+
+
+EYE = np.array([0.0, 0.0, 1.0])
+WIDTH = SegmentationConfig().border_width
+
+
+def picture(rows: int = 120) -> np.ndarray:
+    """A plane seen by a camera above, half a metre wide."""
+    row, column = np.mgrid[-0.25 : 0.25 : rows * 1j, -0.25 : 0.25 : rows * 1j]
+    return np.column_stack([row.ravel(), column.ravel(), np.zeros(row.size)])
+
+
+@pytest.mark.parametrize(("middle", "reaches"), [((0.0, 0.0), False), ((0.24, 0.0), True), ((0.1, -0.24), True)])
+def test_what_lies_on_the_border_reaches_it(middle: tuple[float, float], reaches: bool):
+    points = picture()
+    mine = np.hypot(points[:, 0] - middle[0], points[:, 1] - middle[1]) < 0.05
+    assert reaches_image_border(points, EYE, mine, WIDTH) is reaches
+
+
+@pytest.mark.parametrize("away", [0.5, 0.8, 1.3, 2.0])
+def test_what_is_almost_on_the_border_is_told_from_what_is(away: float):
+    """The hull of a few points, which is asked first, is smaller than that of all."""
+    points = picture(rows=300)
+    mine = (points[:, 0] < 0.25 - away * WIDTH) & (points[:, 0] > 0.15) & (np.abs(points[:, 1]) < 0.05)
+    assert reaches_image_border(points, EYE, mine, WIDTH) is (away < 1)
+
+
+def test_what_makes_the_outline_alone_does_not():
+    points = picture()
+    out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
+    both = np.concatenate([points, out])
+    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
+
+
+def test_what_stands_out_over_the_end_of_the_table_does_not():
+    """The sides of the outline go from its top to the corners of the table, and there is nothing along them."""
+    points = picture(rows=300)
+    out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
+    both = np.concatenate([points, out])
+    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
+
+
+def test_nothing_reaches_nothing():
+    assert not reaches_image_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool), WIDTH)
+    assert not reaches_image_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool), WIDTH)

@@ -200,11 +200,6 @@ def test_what_is_seen_all_round_is_not_doubted(name):
     assert found.warnings == ()
 
 
-@pytest.mark.parametrize(("name", "count"), [("sphere", 1), ("capsule", 1), ("hammer", 1), ("mug", 2), ("bowl", 2)])
-def test_what_has_an_unseen_side_is_doubted(name, count):
-    assert made(name, count).evidence is not None
-
-
 def test_more_views_are_nearer_the_truth():
     off = [distances(make.mesh, seen("hammer")[0].truth).mean() for make in (made("hammer"), made("hammer", 3))]
     assert off[1] < off[0]
@@ -242,7 +237,7 @@ def test_without_a_support_a_single_view_is_completed_too():
     assert distances(whole.mesh, scene.truth).mean() < 0.004
 
 
-@pytest.mark.parametrize("name", ["sphere", "bottle"])
+@pytest.mark.parametrize("name", ["bottle", "box", "torus"])
 def test_an_all_round_cloud_needs_no_camera(name):
     points, _ = surface_samples(make_shape(name), 6000, 0)
     whole = reconstruct([PointCloud(points, np.array([0.5, 0.1, 0.3]))])

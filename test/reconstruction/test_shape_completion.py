@@ -1,4 +1,6 @@
-"""Guesses about unseen sides: symmetries of known bodies, and what the cameras say of guessed points."""
+"""Guesses about unseen sides: symmetries, axes, what cameras say of guessed points; other shapes, and the next view."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
@@ -8,13 +10,18 @@ from hypothesis import strategies as st
 from graspd_core.config import ReconstructionConfig
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import BOX_HALF, CYLINDER_HALF, CYLINDER_RADIUS, SPHERE_RADIUS, make_shape
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
+from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths, weigh
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.reconstruct.extrusion import extrude, stand
+from graspd_core.perception.reconstruct.hidden_side import next_view, other_rules, other_shape
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, merge_views, point_step
-from graspd_core.perception.reconstruct.revolution import find_revolution, fit_axis
+from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
+from graspd_core.perception.reconstruct.revolution import find_revolution, fit_axis, half_plane, settle_axis
 from graspd_core.perception.reconstruct.shape_completion import complete_shape, openness, plausible
 from graspd_core.perception.reconstruct.symmetry import find_centre, find_mirrors, image
+from graspd_core.types import Plane, TriangleMesh
 
 EYE = np.array([0.3, 0.15, 0.35])
 
@@ -150,3 +157,119 @@ def test_guesses_in_empty_space_or_on_what_is_seen_are_dropped():
     whole = whole + np.array([0.0, 0.0, BOX_HALF[2]])
     hidden = (normals @ np.array([-1.0, 0.0, 0.0])) > 0.9
     assert len(plausible(Surfels(whole[hidden], normals[hidden]), seen, free_space, step).points) > 100
+
+
+def half_cone(seed: int, noise: float) -> tuple[Surfels, np.ndarray]:
+    """The half of a cup's wall, 30 mm wide below and 42 above, that one camera sees, and its axis."""
+    rng = np.random.default_rng(seed)
+    turn, height = rng.uniform(-1.3, 1.3, 3000), rng.uniform(0, 0.09, 3000)
+    outward = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(3000)])
+    up = np.array([0.0, 0.0, 1.0])
+    points = (0.03 + 0.012 * height / 0.09)[:, None] * outward + height[:, None] * up
+    points += noise * rng.standard_normal((3000, 1)) * np.array([1.0, 0.0, 0.0])
+    normals = outward - 0.012 / 0.09 * up
+    turned = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    return Surfels(points @ turned.T, normals / np.linalg.norm(normals, axis=1)[:, None] @ turned.T), turned @ up
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("tilt", [0.04, 0.12])
+def test_the_points_settle_a_tilted_axis(seed: int, tilt: float):
+    surfels, true = half_cone(seed, 1e-3)
+    side = np.cross(true, np.eye(3)[int(np.argmin(np.abs(true)))])
+    start = fit_axis(surfels, (true + tilt * side / np.linalg.norm(side)) / np.hypot(1, tilt))
+    settled = settle_axis(surfels, start, 1.5e-3)
+    assert np.linalg.norm(np.cross(settled.direction, true)) < 0.01
+    assert np.linalg.norm(settled.direction) == pytest.approx(1.0)
+
+
+def test_the_half_plane_keeps_heights_and_distances():
+    surfels, true = half_cone(3, 0.0)
+    outward, rows = half_plane(surfels, fit_axis(surfels, true))
+    assert np.allclose(np.linalg.norm(outward, axis=1), 1.0)
+    assert np.allclose(outward @ true, 0.0, atol=1e-9)
+    assert np.ptp(rows[:, 0]) == pytest.approx(0.09, abs=1e-3)
+    assert 0.029 < rows[:, 1].min() < rows[:, 1].max() < 0.043
+
+
+def test_half_a_ball_seen_from_any_side_has_its_back():
+    """All its axes are as good; the one that shows the back is taken."""
+    rng = np.random.default_rng(0)
+    normals = rng.standard_normal((6000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    normals = normals[normals[:, 2] > 0.15]
+    found = find_revolution(Surfels(0.03 * normals, normals), FreeSpace((), standing=False), 1.2e-3)
+    assert found is not None
+    assert found.surfels.points[:, 2].min() < -0.025
+
+
+TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def standing_box() -> tuple[TriangleMesh, PointCloud]:
+    """A box on the table, and the part of it that a camera sees."""
+    box = make_shape("box")
+    box = TriangleMesh(box.vertices + np.array([0.0, 0.0, BOX_HALF[2]]), box.faces)
+    points, normals = surface_samples(box, 24_000, 0)
+    return box, PointCloud(points[((EYE - points) * normals).sum(1) > 0], EYE)
+
+
+@pytest.fixture(scope="module")
+def half_seen() -> Reconstruction:
+    return reconstruct([standing_box()[1]], support=TABLE)
+
+
+def test_other_rules_give_other_closed_shapes_through_what_was_seen(half_seen):
+    evidence, view = half_seen.evidence, standing_box()[1]
+    rules = other_rules(evidence)
+    assert evidence.chosen not in rules
+    shapes = [mesh for rule in rules if (mesh := other_shape(evidence, rule, half_seen.mesh)) is not None]
+    assert len(shapes) >= 2
+    for mesh in shapes:
+        assert is_closed(mesh)
+        surface = make_surface(mesh)
+        seen = surface_distance(surface, view.points)
+        assert (seen < ReconstructionConfig.fit_distance).mean() > 0.85
+        assert surface_distance(surface, surface_samples(half_seen.mesh, 2000, 0)[0]).mean() > 2e-4
+
+
+def test_the_shape_that_was_chosen_is_no_other(half_seen):
+    assert half_seen.evidence.hidden
+    assert other_shape(half_seen.evidence, half_seen.evidence.chosen, half_seen.mesh) is None
+
+
+def test_nothing_else_may_be_true_of_what_was_seen_all_round():
+    box, _ = standing_box()
+    points, normals = surface_samples(box, 24_000, 0)
+    eyes = 0.5 * np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, 1]]) + np.array([0.0, 0.0, 0.05])
+    views = [PointCloud(points[((eye - points) * normals).sum(1) > 0], eye) for eye in eyes]
+    whole = reconstruct(views, support=TABLE)
+    assert not whole.evidence.hidden
+    assert other_rules(whole.evidence) == ()
+
+
+def test_the_next_view_looks_at_the_far_side_from_above_the_table(half_seen):
+    assert half_seen.evidence.hidden
+    pose = next_view(half_seen.evidence, half_seen.mesh, np.zeros(3))
+    assert pose is not None
+    eye, forward = pose[:3, 3], pose[:3, 2]
+    centre = np.array([0.0, 0.0, BOX_HALF[2]])
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert np.linalg.norm(eye - centre) == pytest.approx(np.linalg.norm(EYE - centre), rel=0.05)
+    assert forward @ (centre - eye) > 0.99 * np.linalg.norm(centre - eye)
+    assert eye[2] > 0
+    assert eye[:2] @ EYE[:2] < 0
+    points, normals = surface_samples(standing_box()[0], 24_000, 0)
+    sides = points[:, 2] > 1e-4  # not the one that it stands on
+    hidden = sides & (((EYE - points) * normals).sum(1) <= 0)
+    shown = hidden & (((eye - points) * normals).sum(1) > 0)
+    assert shown.sum() > 0.95 * hidden.sum()
+
+
+def test_the_next_view_goes_where_the_object_goes(half_seen):
+    shift = np.array([1.0, -2.0, 3.0])
+    assert half_seen.evidence.hidden
+    here, there = (next_view(half_seen.evidence, half_seen.mesh, s) for s in (np.zeros(3), shift))
+    assert here is not None
+    assert there is not None
+    assert there[:3, 3] - here[:3, 3] == pytest.approx(shift)

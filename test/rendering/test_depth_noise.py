@@ -26,8 +26,9 @@ def block() -> np.ndarray:
     return depth
 
 
-def test_no_noise_changes_nothing():
+def test_no_noise_changes_nothing_and_seeds_differ():
     assert np.array_equal(add_noise(block(), CAMERA, NONE, 0), block())
+    assert not np.array_equal(add_noise(block(), CAMERA, DEFAULT, 0), add_noise(block(), CAMERA, DEFAULT, 1))
 
 
 @pytest.mark.parametrize("z", [0.3, 0.6, 1.2])
@@ -121,10 +122,6 @@ def test_the_same_seed_gives_the_same_finite_image(seed, level):
     assert np.array_equal(first, add_noise(holed, CAMERA, LEVELS[level], seed))
     assert np.isfinite(first).all()
     assert first.min() >= 0
-
-
-def test_seeds_differ():
-    assert not np.array_equal(add_noise(block(), CAMERA, DEFAULT, 0), add_noise(block(), CAMERA, DEFAULT, 1))
 
 
 def test_levels_are_in_order():

@@ -1,7 +1,8 @@
-"""A function in a process of its own."""
+"""A function in a process of its own; and freed memory, where the C library has no call to give it back."""
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import pickle
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core.runtime.worker_process import WorkerProcess
+from graspd_core.runtime.worker_process import WorkerProcess, limit_malloc_arenas, trim_heap
 
 
 @pytest.fixture
@@ -162,3 +163,14 @@ def _alive(process: int) -> bool:
             return file.read().split()[2] != "Z"
     except FileNotFoundError:
         return False
+
+
+def no_library(name: None) -> object:
+    raise OSError("no such library")
+
+
+@pytest.mark.parametrize("library", [lambda name: object(), no_library])
+def test_where_the_c_library_has_no_such_thing_nothing_is_raised(monkeypatch: pytest.MonkeyPatch, library):
+    monkeypatch.setattr(ctypes, "CDLL", library)
+    trim_heap()
+    limit_malloc_arenas()

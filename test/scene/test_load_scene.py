@@ -1,4 +1,6 @@
-"""Scenes from every kind of source."""
+"""Scenes from every kind of source, from what a camera saw of a crowded table, and of an object far from the origin."""
+
+from __future__ import annotations
 
 import dataclasses
 
@@ -6,11 +8,26 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.errors import CloudError, MeshError
+from graspd_core.hands.library import load_hand
+from graspd_core.io.grasps_json import grasps_of, load_document, save_result
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape, shape_volume
+from graspd_core.mesh.topology import far_centre
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.scene import build_scene, object_parts
+from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.target_selection import Target
+from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
+from graspd_core.types import Outcome, Plane, TriangleMesh, Verdict
+from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.world import PROTOCOLS, build_world
 
 
 def test_file_scale_and_value_agree(tmp_path):
@@ -70,3 +87,112 @@ def test_unknown_endings_list_meshes_and_clouds(tmp_path):
     (tmp_path / "a.docx").write_text("x")
     with pytest.raises(MeshError, match=r"docx'; valid endings: dae, .*npy.*stl"):
         load_scene(tmp_path / "a.docx")
+
+
+MAP = np.array([512_345.25, 5_401_234.5, 370.0])
+
+
+def at(place, shape: str = "box") -> TriangleMesh:
+    mesh = make_shape(shape)
+    return TriangleMesh(mesh.vertices + np.asarray(place, dtype=float), mesh.faces)
+
+
+def test_far_is_a_hundred_times_the_size():
+    size = 0.09
+    assert not far_centre(at((99 * size, 0, 0)).vertices).any()
+    assert far_centre(at((0, 101 * size, 0)).vertices) == pytest.approx([0, 101 * size, 0])
+
+
+def test_near_the_origin_nothing_is_moved():
+    scene = load_scene("shape:box", resolution=16)
+    planned, far = planning_scene(scene, 16)
+    assert planned is scene
+    assert not far.any()
+
+
+def test_a_far_object_is_measured_like_a_near_one():
+    far = build_scene(at(MAP), resolution=16).object
+    near = build_scene(at((0, 0, 0)), resolution=16).object
+    # A coordinate of five million metres is known to a nanometre.
+    assert far.volume == pytest.approx(shape_volume("box"), rel=1e-6)
+    assert far.center_of_mass - MAP == pytest.approx(near.center_of_mass, abs=1e-8)
+    assert far.inertia == pytest.approx(near.inertia, rel=1e-5)
+    ours, theirs = object_parts(far), object_parts(near)
+    assert sum(len(p.vertices) for p in ours) == sum(len(p.vertices) for p in theirs)
+    assert np.concatenate([p.vertices for p in ours]).min(0) - MAP == pytest.approx(near.mesh.vertices.min(0), abs=1e-3)
+
+
+def test_a_far_scene_is_planned_about_its_object():
+    table = Plane(np.array([0.0, 0.0, 1.0]), MAP[2] - 0.045)
+    scene = build_scene(at(MAP), support=table, resolution=16)
+    planned, far = planning_scene(scene, 16)
+    assert far == pytest.approx(MAP)
+    assert planned.support is not None
+    assert planned.support.offset == pytest.approx(-0.045, abs=1e-9)
+    assert np.abs(planned.object.mesh.vertices).max() < 0.1
+    corner = planned.sdf.origin.new_tensor(planned.object.mesh.vertices)
+    assert sample_sdf(planned.sdf, corner)[0].abs().max() < 0.005
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("allegro_right")
+
+
+def test_grasps_of_a_far_object_hold_there(hand, tmp_path):
+    scene = build_scene(at(MAP))
+    result = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
+    assert result.outcome is Outcome.SUCCEEDED
+    save_result(tmp_path / "grasps.json", result, scene.object, hand, load_preset("fast"))
+    kept = [g for g in grasps_of(load_document(tmp_path / "grasps.json")) if g.verdict is Verdict.VERIFIED]
+    assert len(kept) == 2
+    protocol = PROTOCOLS["standard"]
+    world = build_world(hand, scene.object, object_parts(scene.object), protocol)
+    for grasp in kept:
+        for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze):
+            assert np.linalg.norm(posture.position - MAP) < 0.4
+        gaps = [np.abs(np.array(contact.position) - MAP) for contact in grasp.contacts]
+        # Contacts lie on the box, to the planner's grid.
+        assert np.array(gaps) == pytest.approx(np.clip(gaps, 0, [0.03, 0.03, 0.045]), abs=0.003)
+        assert hold_trial(world, grasp, protocol).passed
+
+
+# A box that hides the lower part of a ball from the camera.
+CROWDED = tabletop("sphere", obstacles=(("box", 0.115, 0.02),))
+VIEWS = views_of(CROWDED, CAMERA, ring_poses(1, elevation=np.deg2rad(40.0), azimuth=np.deg2rad(10.0)))
+TARGET = Target(point=np.array([0.0, 0.0, 0.035]))
+
+
+def test_what_something_hides_may_be_there():
+    seen = segment(VIEWS, target=TARGET)
+    whole = reconstruct(seen.views, seen.support, whole=VIEWS)
+    truth = CROWDED.truth.vertices
+    assert seen.views[0].points[:, 2].min() > 0.015
+    assert whole.mesh.vertices.min(0) == pytest.approx(truth.min(0), abs=0.006)
+    assert whole.mesh.vertices.max(0) == pytest.approx(truth.max(0), abs=0.006)
+    points, _ = surface_samples(CROWDED.truth, 4000, 0)
+    knowing, blind = (FreeSpace(make_view_depths(seen.views, around), True) for around in (VIEWS, ()))
+    assert (empty_depth(knowing, points) > 0.005).mean() < 0.01
+    assert (empty_depth(blind, points) > 0.005).mean() > 0.1, "what is hidden counted as empty"
+
+
+def test_a_scene_knows_what_its_views_hide():
+    scene = scene_from_views(VIEWS, target=TARGET)
+    assert scene.object.mesh.vertices[:, 2].min() == pytest.approx(0.0, abs=0.006)
+    assert len(scene.obstacles) == 1
+
+
+def test_before_an_occluder_it_is_empty_and_behind_it_nobody_knows():
+    """A wall a metre away, and a strip that hides its right half, half a metre away."""
+    ticks = np.linspace(-0.1, 0.1, 80)
+    x, y = (axis.ravel() for axis in np.meshgrid(ticks, ticks))
+    wall = np.column_stack([x, y, np.ones_like(x)])[x < 0]
+    strip = np.column_stack([0.5 * x, 0.5 * y, np.full_like(x, 0.5)])[x > 0]
+    eye = np.zeros(3)
+    alone, whole = PointCloud(wall, eye), PointCloud(np.concatenate([wall, strip]), eye)
+    (depth,) = make_view_depths([alone], [whole])
+    hidden, before = np.array([[0.05, 0.0, 1.0], [0.05, 0.0, 0.8]]), np.array([[0.02, 0.0, 0.4]])
+    known = FreeSpace((depth,), standing=False)
+    assert empty_depth(known, hidden) == pytest.approx(0.0)
+    assert empty_depth(known, before)[0] == pytest.approx(0.1, abs=0.01)
+    assert (empty_depth(FreeSpace(make_view_depths([alone]), standing=False), hidden) > 0.03).all()

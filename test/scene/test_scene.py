@@ -108,13 +108,10 @@ def test_the_disk_does_not_fill_up(own_cache, monkeypatch):
     assert left == {"thing-5", "last"}
 
 
-def test_the_disk_can_be_left_alone(own_cache, monkeypatch):
+def test_the_disk_can_be_left_alone_and_an_unwritable_one_is_done_without(own_cache, monkeypatch, tmp_path):
     monkeypatch.setenv("GRASPD_CACHE", "off")
     load_scene("shape:torus", resolution=16)
     assert not own_cache.exists()
-
-
-def test_an_unwritable_disk_is_done_without(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert sample_sdf(load_scene("shape:torus", resolution=16).sdf, torch.zeros(1, 3))[0] > 0

@@ -45,6 +45,7 @@ def side_by_side(one: str, other: str) -> TabletopScene:
     return tabletop(one, obstacles=[(other, float(widths[0].max() - widths[1].min()), 0.0)])
 
 
+@pytest.mark.slow
 def test_most_that_touch_are_told_where_both_were_taken():
     told: dict[tuple[str, str], list[bool]] = {}
     for pair in combinations_with_replacement(("sphere", "cylinder", "bottle", "box"), 2):

@@ -1,4 +1,4 @@
-"""The hold trial on grasps made by hand: good ones pass, bad ones fail for the right reason."""
+"""The hold trial and the drop trial on grasps made by hand: good ones pass, bad ones fail for the right reason."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graspd_bench.trials import LOST, gravity_trial
 from graspd_core.hands.model import HandModel
 from graspd_core.types import Posture, Verdict
 from graspd_core.verify import world as trial_world
 from graspd_core.verify.hold_trial import displaced, hold_trial, noisy_trial, pose_error
-from graspd_core.verify.world import PROTOCOLS, Protocol, build_world
+from graspd_core.verify.world import PROTOCOLS, Protocol, World, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
@@ -27,15 +28,6 @@ def test_a_firm_squeeze_holds(world, closing):
     assert hold.displacement < 0.003
     assert hold.rotation < np.deg2rad(1)
     assert replace(grasp, trials=(hold,)).verdict is Verdict.VERIFIED
-
-
-def test_the_same_trial_gives_the_same_figures(world, gripper, cube, closing):
-    # A weak hold, whose slipping amplifies any difference.
-    grasp = closing(0.015, 0.025, (0.0262, 0.0262))
-    again = build_world(gripper, cube, (cube.mesh,), STANDARD)
-    first = hold_trial(world, grasp, STANDARD)
-    assert first.displacement > 0
-    assert first == hold_trial(world, grasp, STANDARD) == hold_trial(again, grasp, STANDARD)
 
 
 def test_a_hand_ten_centimetres_away_holds_nothing(world, closing):
@@ -142,3 +134,47 @@ def test_pose_errors_stay_within_their_bounds_and_move_all_postures_alike(closin
 
 def postures(grasp) -> tuple[Posture, Posture, Posture]:
     return grasp.pregrasp, grasp.grasp, grasp.squeeze
+
+
+USUAL = PROTOCOLS["standard"]
+
+
+@pytest.fixture(scope="module")
+def usual_world(gripper, cube) -> World:
+    return build_world(gripper, cube, (cube.mesh,), USUAL)
+
+
+def test_a_firm_squeeze_gives_no_more_than_its_springs(usual_world, closing):
+    # Both fingers yield to 0.98 N along y by 0.98 N over both springs, and friction holds the rest.
+    springs = 0.98 / (2 * USUAL.slide_stiffness)
+    assert gravity_trial(usual_world, closing(0.015, 0.0249, (0.033, 0.033)), USUAL) < springs + 0.001
+
+
+def test_an_object_out_of_reach_is_lost(usual_world, closing):
+    assert gravity_trial(usual_world, closing(0.015, 0.025, (0.03, 0.03), height=-0.3), USUAL) == pytest.approx(LOST)
+
+
+def test_a_start_that_the_hold_trial_refuses_is_lost(usual_world, closing):
+    assert gravity_trial(usual_world, closing(0.04, 0.04, (0.04, 0.04)), USUAL) == LOST
+
+
+def test_an_open_hand_stops_the_object_in_the_directions_where_it_stands(usual_world, closing):
+    # Fingers 5 mm off either side along y; the palm 10 mm below. Nothing along ±x and +z.
+    moved = gravity_trial(usual_world, closing(0.02, 0.02, (0.02, 0.02), height=-0.03), USUAL)
+    assert moved == pytest.approx((3 * LOST + 2 * 0.005 + 0.01) / 6, abs=0.002)
+
+
+def test_the_same_trial_gives_the_same_figure_whatever_was_tried_between(usual_world, closing):
+    grasp = closing(0.015, 0.025, (0.026, 0.026))
+    first = gravity_trial(usual_world, grasp, USUAL)
+    assert 0 < first < LOST
+    assert gravity_trial(usual_world, closing(0.015, 0.025, (0.03, 0.03), height=-0.3), USUAL) > first
+    assert gravity_trial(usual_world, grasp, USUAL) == first
+
+
+def test_a_direction_that_is_cut_short_counts_with_what_it_came_to(usual_world, closing):
+    far = closing(0.015, 0.025, (0.03, 0.03), height=-0.3)
+    assert gravity_trial(usual_world, far, USUAL, stop=lambda: True) == 0.0
+    # After 0.2 s, two looks, the object has fallen 20 cm and is lost; the other directions are not begun.
+    looks = iter([False, False])
+    assert gravity_trial(usual_world, far, USUAL, stop=lambda: next(looks, True)) == pytest.approx(LOST / 6)

@@ -1,31 +1,37 @@
-"""The lift trial on grasps made by hand: a cube on a table, a gripper that comes straight down on it."""
+"""The lift trial, its recordings, and free things that a lift takes out of others: a gripper comes down on a cube."""
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
+from graspd_bench.trials import Lifted, lift_out, placed, settle
+from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import retreat_posture
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.scene import Obstacle
-from graspd_core.types import Plane, TrialResult, TriangleMesh, Verdict
+from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings, lift_trial
 from graspd_core.verify.trial_registry import TrialContext, grasp_trials
-from graspd_core.verify.world import PROTOCOLS, World, build_world
+from graspd_core.verify.world import PROTOCOLS, FreeBody, World, build_world
+from graspd_viewer.trial_controls import record_trial
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
 STANDARD = replace(PROTOCOLS["standard"], slide_stiffness=500.0, slide_damping=10.0)
+
 # The fixtures' gripper reaches along +z; a table whose free side is −z makes that "down". The cube ends at z = 20 mm.
 TABLE = Plane(np.array([0.0, 0.0, -1.0]), -0.02)
 GOOD = (0.015, 0.025, (0.04, 0.04))
+
 # The fingers end 70 mm from the base: 2 mm above the table.
 CLEAR = -0.052
 
@@ -54,16 +60,13 @@ def test_the_retreat_lies_straight_back(hand, closing):
     assert retreat_posture(hand, pregrasp, 0.02).position == pytest.approx([0, 0, -0.065])
 
 
-def test_a_firm_squeeze_lifts(table, hand, closing):
+def test_a_firm_squeeze_lifts_and_the_same_lift_gives_the_same_figures(table, hand, closing):
     lift = lift_trial(table, hand, closing(*GOOD, height=CLEAR), STANDARD)
     assert lift.passed, lift
     assert lift.reason == ""
     # 1 N of weight on the springs of 500 N/m, as in the hold trial; the cube rose with the hand.
     assert lift.displacement < 0.003
     assert lift.rotation < np.deg2rad(1)
-
-
-def test_the_same_lift_gives_the_same_figures(table, hand, closing):
     grasp = closing(0.015, 0.025, (0.0262, 0.0262), height=CLEAR)
     assert lift_trial(table, hand, grasp, STANDARD) == lift_trial(table, hand, grasp, STANDARD)
 
@@ -162,3 +165,147 @@ def test_a_verdict_needs_every_trial(table, hand, cube, closing):
     assert [trial.name for trial in grasp_trials(replace(context, around=None), grasp)] == ["hold"]
     (lost,) = grasp_trials(context, closing(*GOOD, height=-0.145))
     assert (lost.name, lost.passed) == ("hold", False)
+
+
+@pytest.fixture(scope="module")
+def context(gripper, cube) -> TrialContext:
+    hand = replace(gripper, approach=np.array([0.0, 0.0, 1.0]))
+    alone = build_world(hand, cube, (cube.mesh,), STANDARD)
+    return TrialContext(hand, STANDARD, alone, build_world(hand, cube, (cube.mesh,), STANDARD, TABLE))
+
+
+@pytest.mark.parametrize("squeeze", [(0.04, 0.04), (0.0262, 0.0262), (0.02, 0.02)])
+def test_a_recorded_trial_ends_as_any_other(context, closing, squeeze):
+    grasp = closing(0.015, 0.025, squeeze, height=CLEAR)
+    results = grasp_trials(context, grasp)
+    assert [record_trial(context, grasp, result.name).result for result in results] == list(results)
+
+
+def test_its_frames_show_a_cube_that_is_held(context, closing):
+    recording = record_trial(context, closing(*GOOD), "hold")
+    assert recording.seconds == pytest.approx(0.02)
+    stages = list(dict.fromkeys(frame.stage for frame in recording.frames))
+    pulls = [f"a pull along {sign}{axis}" for sign in "+-" for axis in "xyz"]
+    assert stages == ["closing", "squeezing", *pulls]
+    squeezed = [frame for frame in recording.frames if frame.stage == "squeezing"][-1]
+    # 15 mm of squeeze on 500 N/m from either side, which the cube bears: forces into it, and none is left over.
+    left = squeezed.forces[squeezed.contacts[:, 1] > 0].sum(0)
+    assert left == pytest.approx([0.0, -7.5, 0.0], abs=0.2)
+    assert squeezed.forces.sum(0) == pytest.approx(np.zeros(3), abs=0.05)
+    # Link 0 is the palm, the cube comes last.
+    assert squeezed.positions[0] == pytest.approx([0.0, 0.0, -0.045])
+    assert squeezed.positions[-1] == pytest.approx(np.zeros(3), abs=1e-3)
+
+
+def test_its_last_frame_is_the_moment_of_the_failure(context, closing):
+    recording = record_trial(context, closing(*GOOD, height=-0.145), "hold")
+    assert recording.result.reason.endswith(recording.frames[-1].stage)
+    assert np.linalg.norm(recording.frames[-1].positions[-1]) > STANDARD.max_displacement - 1e-3
+
+
+def test_a_lift_goes_up(context, closing):
+    frames = record_trial(context, closing(*GOOD, height=CLEAR), "lift").frames
+    assert list(dict.fromkeys(frame.stage for frame in frames)) == [
+        "coming", "closing", "squeezing", "lifting", "holding up",
+    ]  # fmt: skip
+    # Up is −z here; 20 cm, for the hand and for the cube in it.
+    assert frames[-1].positions[0] == pytest.approx([0, 0, CLEAR - 0.2], abs=1e-6)
+    assert frames[-1].positions[-1] == pytest.approx([0, 0, -0.2], abs=3e-3)
+
+
+def test_a_trial_that_does_not_apply_is_refused(context, closing):
+    with pytest.raises(ConfigError, match="'lift': valid for this scene: hold"):
+        record_trial(replace(context, around=None), closing(*GOOD), "lift")
+
+
+LIFT = LiftSettings(lift_height=0.25, hold_time=0.5)
+HALF = 0.02
+
+
+@pytest.fixture(scope="module")
+def block(cube):
+    """The cube somewhere, turned about an axis (a scaled axis, [rad])."""
+    from scipy.spatial.transform import Rotation
+
+    def build(x: float, y: float, z: float, turn: Sequence[float] = (0.0, 0.0, 0.0)) -> FreeBody:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), (x, y, z)
+        return FreeBody(cube, (cube.mesh,), pose)
+
+    return build
+
+
+def from_above(closing, z: float = 0.0, turned: bool = False) -> Grasp:
+    """The gripper straight down about a cube that stands at height z; turned, it points up, away from the cube."""
+    good = closing(0.015, 0.025, (0.04, 0.04))
+    # The fingers reach 70 mm along +z of the base; half a turn about y lets them come from above, 2 mm off the table.
+    quaternion = np.array([1.0, 0.0, 0.0, 0.0]) if turned else np.array([0.0, 0.0, 1.0, 0.0])
+
+    def there(posture: Posture) -> Posture:
+        place = np.array([0.0, 0.0, z + (0.13 if turned else 0.072)])
+        return replace(posture, position=place, quaternion_wxyz=quaternion)
+
+    return replace(good, pregrasp=there(good.pregrasp), grasp=there(good.grasp), squeeze=there(good.squeeze))
+
+
+def lifted(hand: HandModel, bodies: Sequence[FreeBody], index: int, grasp: Grasp) -> Lifted:
+    return lift_out(hand, bodies, index, grasp, STANDARD, LIFT)
+
+
+def test_a_pile_settles_on_the_table_the_same_way_every_time(block):
+    pile = [block(0.0, 0.005, 0.06, (0.4, 0.2, 0.0)), block(0.01, 0.0, 0.14, (0.1, 0.7, 0.3)), block(0, 0.012, 0.22)]
+    poses = settle(pile, wall=0.06)
+    assert np.array_equal(poses, settle(pile, wall=0.06))
+    rest = settle([replace(body, pose=pose) for body, pose in zip(pile, poses, strict=True)])
+    for body, pose in zip(pile, rest, strict=True):
+        lowest = placed(replace(body, pose=pose))[0].mesh.vertices[:, 2].min()
+        # On the table, on one other or on two.
+        assert -0.002 < lowest < 4 * HALF + 0.002
+    # What rests goes on resting.
+    again = settle([replace(body, pose=pose) for body, pose in zip(pile, rest, strict=True)])
+    assert np.allclose(again, rest, atol=1e-3)
+
+
+def test_nothing_settles_to_nothing():
+    assert settle([]) == ()
+
+
+def test_the_thing_that_is_held_comes_up_and_the_others_stay(hand, block, closing):
+    bodies = [block(0.15, 0.1, HALF), block(0.0, 0.0, HALF), block(-0.12, 0.0, HALF)]
+    came = lifted(hand, bodies, 1, from_above(closing))
+    assert came.result.passed, came.result
+    assert came.poses[1][:3, 3] == pytest.approx([0, 0, HALF + LIFT.lift_height], abs=0.01)
+    for k in (0, 2):
+        assert came.poses[k] == pytest.approx(bodies[k].pose, abs=2e-3)
+    assert came.hand is not None
+    assert came.hand.position[2] == pytest.approx(0.072 + LIFT.lift_height, abs=1e-6)
+
+
+def test_a_thing_that_lies_on_another_is_lifted_off_it(hand, block, closing):
+    grasp = from_above(closing, z=2 * HALF)
+    came = lifted(hand, [block(0, 0, HALF), block(0, 0, 3 * HALF)], 1, grasp)
+    assert came.result.passed, came.result
+    assert came.poses[0][2, 3] == pytest.approx(HALF, abs=2e-3)
+
+
+def test_a_grasp_turned_away_fails_and_says_so(hand, block, closing):
+    came = lifted(hand, [block(0.0, 0.0, HALF)], 0, from_above(closing, turned=True))
+    assert not came.result.passed
+    assert came.result.reason.endswith("while lifting")
+    assert came.poses[0][2, 3] == pytest.approx(HALF, abs=2e-3)
+
+
+def test_a_hand_that_would_reach_into_the_table_never_moves(hand, block, closing):
+    grasp = from_above(closing)
+    low = replace(grasp.grasp, position=grasp.grasp.position - [0, 0, 0.01])
+    came = lifted(hand, [block(0.0, 0.0, HALF)], 0, replace(grasp, grasp=low))
+    assert "into the support" in came.result.reason
+    assert came.hand is None
+    assert np.array_equal(came.poses[0], np.array(block(0.0, 0.0, HALF).pose))
+
+
+def test_a_neighbour_in_the_way_is_pushed(hand, block, closing):
+    """The open fingers end at y = ±40 mm: what lies there is hit as they come down, and is moved."""
+    bodies = [block(0.0, 0.0, HALF), block(0.0, 0.055, HALF)]
+    came = lifted(hand, bodies, 0, from_above(closing))
+    assert np.linalg.norm(came.poses[1][:3, 3] - bodies[1].pose[:3, 3]) > 0.005

@@ -1,4 +1,4 @@
-"""Meshes that hands name: found where ROS keeps them, read as hulls, refused by name."""
+"""Meshes that hands name: found where ROS keeps them, read as hulls, refused by name, and drawn whole but bounded."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from graspd_core.errors import HandError
-from graspd_core.hands.library import read_hand_file
+from graspd_core.hands.library import hand_names, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.readers.visual_solids import visual_solids
+from graspd_core.mesh.mesh_files import save_mesh
+from graspd_core.mesh.shapes import make_shape
+from graspd_core.types import TriangleMesh
 
 WEDGE = "v 0 0 0\nv 0.02 0 0\nv 0 0.02 0\nv 0 0 0.03\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 URDF = (
@@ -102,3 +106,67 @@ def test_a_flat_mesh_becomes_a_thin_plate(workspace: Path) -> None:
     flat = workspace / "src" / "hand_description" / "meshes" / "flat.obj"
     flat.write_text("v 0 0 0\nv 0.02 0 0\nv 0 0.02 0\nf 1 2 3\n")
     assert np.ptp(_read(workspace, "meshes/flat.obj").primitives[0].vertices, axis=0).min() == pytest.approx(0.001)
+
+
+FINGER = """<joint name="j{0}" type="revolute"><parent link="palm"/><child link="f{0}"/><origin xyz="0 {1} 0"/>
+  <axis xyz="0 1 0"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+  <link name="f{0}">{2}<collision><geometry><box size="0.02 0.02 0.08"/></geometry></collision></link>"""
+SHOWN = '<visual><origin xyz="0 0 0.03"/><geometry><mesh filename="shown.ply" scale="{}"/></geometry></visual>'
+
+
+def hand_of(folder: Path, mesh: TriangleMesh, scale: str, prefix: str = ""):
+    """Two fingers on a palm; the first shows a mesh, the second nothing of its own."""
+    save_mesh(mesh, folder / "shown.ply")
+    palm = '<link name="palm"><collision><geometry><box size="0.08 0.1 0.02"/></geometry></collision></link>'
+    fingers = FINGER.format(1, 0.03, SHOWN.format(scale)), FINGER.format(2, -0.03, "")
+    (folder / "hand.urdf").write_text(f'<robot name="two">{palm}{"".join(fingers)}</robot>')
+    return load_hand(folder / "hand.urdf", candidates=50, prefix=prefix)
+
+
+def fine_ring() -> TriangleMesh:
+    import trimesh
+
+    ring = trimesh.creation.torus(0.04, 0.01, major_sections=100, minor_sections=60)
+    return TriangleMesh(np.array(ring.vertices), np.array(ring.faces, dtype=np.int64))
+
+
+@pytest.mark.parametrize("prefix", ["", "left_"])
+def test_a_mesh_is_drawn_whole_and_bounded_and_other_links_as_they_collide(tmp_path: Path, prefix: str):
+    ring = fine_ring()
+    assert len(ring.faces) > 8000
+    hand = hand_of(tmp_path, ring, "0.5 0.5 -0.5", prefix)
+    drawn = visual_solids(hand, prefix)
+    (shown,) = (shape for shape in drawn if hand.link_names[shape.link] == f"{prefix}f1")
+    assert 3000 < len(shown.faces) <= 4000
+    np.testing.assert_allclose(shown.translation, [0, 0, 0.03])
+    np.testing.assert_allclose(np.ptp(shown.vertices, axis=0), 0.5 * np.ptp(ring.vertices, axis=0), rtol=0.02)
+    # Mirrored, its faces still look outwards; the ring's hole stays open.
+    a, b, c = shown.vertices[shown.faces].transpose(1, 0, 2)
+    volume = float((np.cross(a, b) * c).sum()) / 6
+    assert 0 < volume < 0.5 * float(np.prod(np.ptp(shown.vertices, axis=0)))
+    others = [shape for shape in drawn if shape is not shown]
+    assert others == [shape for shape in hand.primitives if shape.link != shown.link]
+
+
+@pytest.mark.parametrize("name", hand_names())
+def test_the_shipped_hands_are_drawn_link_by_link(name: str):
+    hand = load_hand(name, candidates=50)
+    drawn = visual_solids(hand)
+    assert {shape.link for shape in drawn} >= {shape.link for shape in hand.primitives}
+    assert sum(len(shape.faces) for shape in drawn) <= 4000 + 60 * len(drawn)
+
+
+def test_a_visual_mesh_that_is_gone_is_named(tmp_path: Path):
+    hand = hand_of(tmp_path, make_shape("mug"), "1 1 1")
+    (tmp_path / "shown.ply").unlink()
+    with pytest.raises(HandError, match=r"hand.urdf:\d+: link 'f1': mesh 'shown.ply' was not found"):
+        visual_solids(hand)
+
+
+def test_a_surface_that_cannot_be_simplified_is_drawn_as_its_hull(tmp_path: Path):
+    """Triangles that share no corner: none can be taken away without a gap."""
+    corners = np.random.default_rng(0).normal(size=(3 * 9000, 3)) * 0.02
+    hand = hand_of(tmp_path, TriangleMesh(corners, np.arange(3 * 9000).reshape(-1, 3)), "1 1 1")
+    (drawn,) = (shape for shape in visual_solids(hand) if hand.link_names[shape.link] == "f1")
+    assert len(drawn.faces) <= 4000
+    assert np.ptp(drawn.vertices) > 0.8 * np.ptp(corners)

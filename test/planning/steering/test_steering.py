@@ -1,4 +1,4 @@
-"""Grasps come from where they are asked to, touch what they are asked to, and enter no avoided box."""
+"""Grasps come from where they are asked to, touch regions that they are asked to, and enter no avoided box."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from graspd_core import Verdict, load_hand, load_scene, plan_grasps
 from graspd_core.errors import ConfigError
+from graspd_core.hands.kinematics import link_poses
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.topology import moved_mesh
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.restrictions import BoundRestrictions, Refusal, Roll
-from graspd_core.planning.regions import Box, NearPoints, Sphere, entered
+from graspd_core.planning.regions import Box, NearPoints, Sphere, boxes_in_reach, entered
 from graspd_core.planning.steering import (
     CONTACT_TOLERANCE,
     Steering,
@@ -25,7 +28,7 @@ from graspd_core.planning.steering import (
     untouched_part,
 )
 from graspd_core.se3 import axis_rotation
-from graspd_core.types import Outcome, Plane
+from graspd_core.types import Outcome, Plane, Posture
 
 HANDS = ("allegro_right", "allegro_left", "leap_right", "barrett_like", "parallel_gripper")
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -123,25 +126,6 @@ def test_the_untouched_part_is_the_object_outside_the_region(bottle):
     assert (gap[above < -0.005] > 0.0).all()
 
 
-def test_the_search_is_pulled_into_the_region_by_a_true_gradient(bottle):
-    """Value and gradient of the distance that the loss takes, by central differences where it has no kink."""
-    region = Sphere(bottle.object.mesh.vertices.mean(0) - 0.05 * DOWN, 0.06)
-    sdf = untouched_part(bottle, region).sdf.to("cpu", torch.float64)
-    generator = torch.Generator().manual_seed(1)
-    low, high = sdf.origin, sdf.origin + 2 * sdf.half
-    points = low + (high - low) * torch.rand(300, 3, generator=generator, dtype=torch.float64)
-    points.requires_grad_(True)
-    value = sample_sdf(sdf, points)[0]
-    (gradient,) = torch.autograd.grad(value.sum(), points)
-    step = 1e-6
-    for axis in range(3):
-        ahead, behind = (sample_sdf(sdf, points.detach() + s * torch.eye(3)[axis])[0] for s in (step, -step))
-        numeric = (ahead - behind) / (2 * step)
-        close = (gradient[:, axis] - numeric).abs() < 1e-4
-        # A point in three hundred may lie within a step of the border of a cell.
-        assert close.double().mean() > 0.98
-
-
 def test_no_link_enters_an_avoided_box(bottle, hand):
     steering = Steering(avoid=[Box((0.0, 0.0, -0.5), (2.0, 2.0, 1.0))])
     free = plan_grasps(bottle, hand, count=6, preset="fast", measure=False)
@@ -217,3 +201,101 @@ def test_steering_is_in_the_frame_of_the_scene_far_from_the_origin_too(hand):
     assert found.grasps[0].verdict is Verdict.VERIFIED
     assert max(outside_region(top, grasp) for grasp in found.grasps) <= CONTACT_TOLERANCE
     assert np.linalg.norm(found.grasps[0].grasp.position - away) < 0.5
+
+
+QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+
+
+def test_a_turned_box_has_signed_distances():
+    box = Box((0.1, 0.0, 0.0), (0.2, 0.04, 0.06), QUARTER)
+    at = np.array([[0.1, 0.0, 0.0], [0.1, 0.1, 0.0], [0.1, 0.13, 0.0], [0.15, 0.14, 0.0], [0.1, 0.0, 0.03]])
+    assert np.allclose(box.distance(at), [-0.02, 0.0, 0.03, np.hypot(0.03, 0.04), 0.0])
+
+
+def test_a_ball_and_what_is_near_have_signed_distances():
+    at = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    assert np.allclose(Sphere((0.0, 0.0, 0.1), 0.2).distance(at), [-0.1, np.hypot(0.3, 0.1) - 0.2])
+    near = NearPoints(np.array([[0.0, 0.0, 0.0], [0.31, 0.0, 0.0], [np.nan, 0.0, 0.0]]), radius=0.02)
+    assert np.allclose(near.distance(at), [-0.02, -0.01])
+
+
+@given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
+def test_distances_never_change_faster_than_the_point(values: list[float]):
+    a, b = np.array(values[:3]), np.array(values[3:])
+    for region in (Box((0.01, 0.02, 0.0), (0.1, 0.05, 0.2), (0.5, 0.1, 0.3, 0.7)), Sphere((0, 0, 0), 0.05)):
+        change = abs(float(np.diff(region.distance(np.stack([a, b])))[0]))
+        assert change <= np.linalg.norm(a - b) + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Box((0, 0), (1, 1, 1)), "box center: .*3 finite numbers"),
+        (lambda: Box((0, 0, np.nan), (1, 1, 1)), "box center"),
+        (lambda: Box((0, 0, 0), (1, 0, 1)), "box size: .*above 0"),
+        (lambda: Box((0, 0, 0), (1, 1, 1), (0, 0, 0, 0)), "quaternion_wxyz: all 0"),
+        (lambda: Sphere((0, 0, 0), 0.0), "sphere radius: 0.0 m"),
+        (lambda: Sphere((0, 0, 0), float("nan")), "sphere radius"),
+        (lambda: NearPoints(np.full((2, 3), np.nan)), "none is finite"),
+        (lambda: NearPoints(np.zeros((0, 3))), "none is finite"),
+        (lambda: NearPoints(np.zeros((1, 3)), radius=-1.0), "region radius"),
+    ],
+)
+def test_what_is_no_region_is_refused(make, said):
+    with pytest.raises(ConfigError, match=said):
+        make()
+
+
+def posture(hand, position=(0.0, 0.0, 0.0), quaternion=(1.0, 0.0, 0.0, 0.0)) -> Posture:
+    return Posture(np.array(position), np.array(quaternion), hand.open_posture)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_box_with_a_point_of_the_hand_in_it_is_entered_and_one_beside_all_solids_is_not(name):
+    hand = load_hand(name)
+    rotations, translations = link_poses(hand, hand.open_posture)
+    links = hand.candidate_link
+    points = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
+    for point in points[::37]:
+        assert entered(hand, [posture(hand)], [Box(point, (0.002, 0.003, 0.004), (0.9, 0.1, 0.3, 0.2))]).all()
+    beside = points.max(0) + 0.05
+    assert not entered(hand, [posture(hand)], [Box(beside, (0.02, 0.02, 0.02))]).any()
+
+
+def test_an_edge_between_corners_is_seen_and_a_narrow_gap_is_a_gap():
+    hand = load_hand("parallel_gripper")
+    solid = max(hand.primitives, key=lambda p: p.size[0] * p.size[1] * p.size[2])
+    link = link_poses(hand, hand.open_posture)
+    rotation, at = link[0][solid.link] @ solid.rotation, link[0][solid.link] @ solid.translation + link[1][solid.link]
+    alone = replace(hand, primitives=(solid,))
+    half = np.array(solid.size)
+    # A stick through the middle of the largest box: no corner of either is in the other.
+    assert entered(alone, [posture(hand)], [Box(at, 6 * half.max() * np.array([1, 1e-3, 1e-3]))]).all()
+    for gap, inside in ((1e-3, False), (-1e-3, True)):
+        middle = at + rotation @ np.array([half[0] + 0.01 + gap, 0.0, 0.0])
+        turn = _quaternion(rotation)
+        assert entered(alone, [posture(hand)], [Box(middle, (0.02, 0.02, 0.02), turn)]).all() == inside
+
+
+def _quaternion(rotation):
+    from graspd_core.se3 import quaternion_from_rotation
+
+    return tuple(quaternion_from_rotation(torch.as_tensor(rotation)).tolist())
+
+
+def test_hands_are_placed_by_their_posture():
+    hand = load_hand("allegro_right")
+    box = Box((1.0, 2.0, 3.0), (0.3, 0.3, 0.3))
+    found = entered(hand, [posture(hand), posture(hand, (1.0, 2.0, 3.0)), posture(hand, (1.0, 2.0, 3.8))], [box])
+    assert found.tolist() == [False, True, False]
+    assert entered(hand, [posture(hand)], []).tolist() == [False]
+    assert entered(hand, [], [box]).tolist() == []
+
+
+def test_of_a_wide_box_the_search_sees_what_is_in_reach():
+    scene, hand = load_scene("shape:box"), load_hand("allegro_right")
+    plate, far = Box((0.0, 0.0, -0.1), (100.0, 100.0, 0.02)), Box((5.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    (found,) = boxes_in_reach(scene, hand, [plate, far])
+    assert 0.3 < np.ptp(found.mesh.vertices[:, 0]) < 1.5
+    heights = torch.tensor([[0.0, 0.0, -0.1], [0.0, 0.0, 0.0]])
+    assert np.allclose(sample_sdf(found.sdf, heights)[0], [-0.01, 0.09], atol=0.02)
