@@ -1,6 +1,6 @@
-"""How charts look: light, printable, told apart by shape as well as by colour; and labels that keep apart.
+"""The charts: speed against accuracy, planned grasps, and the settings sweeps.
 
-The charts: speed against accuracy, planned grasps, and the settings sweeps.
+They are light, printable, and told apart by shape as well as by colour.
 """
 
 from __future__ import annotations
@@ -111,7 +111,6 @@ def place_labels(
 
 
 def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -> np.ndarray:
-    """Centre of a label whose nearest edge is that far from its point."""
     way = np.array([np.cos(angle), np.sin(angle)])
     return point + way * distance + np.sign(np.round(way, 6)) * half * np.abs(way) ** 0.5
 
@@ -312,7 +311,6 @@ def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
 
 
 def _draw_line(axis, sweep_values: dict[float, list[Row]], name: str, factor: float, colour: str, line: str) -> None:
-    """Mean over objects, with quartiles as a band."""
     over = {sweep_value: found for sweep_value, group in sweep_values.items() if (found := spread(group, name))}
     axis.plot(list(over), [s.mean * factor for s in over.values()], line, color=colour, ms=4.5, lw=1.4)
     low, high = ([getattr(s, end) * factor for s in over.values()] for end in ("low", "high"))

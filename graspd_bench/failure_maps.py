@@ -1,10 +1,7 @@
-"""One case of a map: a planning, the cells that its grasps are tried in, and what came of it in each.
+"""Failure maps: where methods stop working. `MAPS` is the registry.
 
-What each map does for a case: friction and mass, the object's size, a single depth view, the wall of a cup.
-
-All maps: their axes, their objects, and the cases that they are made of. `MAPS` is the registry.
-
-Failure maps as heat maps: the share held in every cell, methods side by side, and where half of it is lost.
+A case is a planning and the cells that its grasps are tried in: friction and mass, the object's size, a single depth
+view, or the wall of a cup. The heat maps show the share held in every cell, and where half of it is lost.
 """
 
 from __future__ import annotations

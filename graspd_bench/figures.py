@@ -1,9 +1,4 @@
-"""Names of presets: which is an ablation of which, and how each method is told from the others.
-
-Records to figures: for every name (a preset, a sweep value) and object, then for every name over its objects.
-
-What moved since an earlier run.
-"""
+"""Records to figures: by name (a preset, a sweep value) and object, then over objects, then against an earlier run."""
 
 from __future__ import annotations
 
@@ -164,7 +159,6 @@ def by_name(rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 
 def _grasp_figures(grasp: dict[str, Any]) -> dict[str, float | None]:
-    """Figures of one grasp's record by name, each in the unit of its name; None where there is none."""
     measured = grasp.get("metrics") or {}
     moved = {name: _inner(grasp, trial, "displacement_cm") for name, trial in _DISPLACEMENTS.items()}
     metrics = {row.key: (measured.get(name), row.scale) for name, row in METRICS.items()}

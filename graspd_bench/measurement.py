@@ -1,8 +1,6 @@
-"""The trials that a raw grasp goes through, by the name that `--trials` knows them by; docs/metrics.md defines them.
+"""One cell: a kind of run, settings, an object, a hand and a seed; and what is run for it.
 
-Lengths are written in the unit of their name, [cm] and [deg].
-
-One cell: a kind of run, settings, an object, a hand and a seed; and what is run for it.
+Its trials go by the names of `--trials` (docs/metrics.md). Lengths are in the unit of their name, [cm] and [deg].
 """
 
 from __future__ import annotations
@@ -83,7 +81,6 @@ def _second(tried: Tried) -> Trial:
 
 
 def _nothing(grasp: Grasp) -> dict[str, Any]:
-    """Without PyBullet there is no figure."""
     return {}
 
 

@@ -1,6 +1,6 @@
-"""Cases on worker processes: each does one after the other, alone in its process, and a death costs one case.
+"""Studies end to end: what is asked, what has finished before, the rest run, and what came of it onto pages.
 
-Studies end to end: what is asked, what has finished before, the rest run, and what came of it onto pages.
+Each worker process does one case after the other, so that a death costs one case.
 """
 
 from __future__ import annotations

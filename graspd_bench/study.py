@@ -1,7 +1,4 @@
-"""What a benchmark is: cases, what is run for one of them, and what is made of the records.
-
-The case of most studies: grasps of an object, and what is loaded for them.
-"""
+"""What a benchmark is: cases, what is run for one of them, and what is made of the records."""
 
 from __future__ import annotations
 

@@ -174,7 +174,6 @@ def _cells(
     *,
     hand: str = "",
 ) -> list[Cell]:
-    """Cells of a request's hand and seeds."""
     label = Path(name).stem if Path(name).suffix in (".yaml", ".yml") else name
     hand = hand or request.hand or "allegro_right"
     return [Cell(kind, label, config, thing, hand, seed, count, trials) for seed in request.seeds or (0,)]

@@ -1,7 +1,4 @@
-"""Texts into the marked sections of documents; tables in Markdown; where figures come from.
-
-Records of cells as Markdown tables, and the sections of pages that they fill.
-"""
+"""Records as Markdown tables, and texts into the marked sections of pages."""
 
 from __future__ import annotations
 

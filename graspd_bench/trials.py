@@ -265,7 +265,6 @@ def settle(
 
 
 def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
-    """Let everything be slowed as in a liquid, whatever its mass and size."""
     for name in names:
         body = int(model.body(name).id)
         first = int(model.joint(name).dofadr[0])

@@ -1,7 +1,4 @@
-"""A block in this process: the object made ready once, its grasps planned, and the rows of their file.
-
-What a data set would take, from one block of each hand that is made and thrown away.
-"""
+"""A block in this process: the object made ready once, its grasps planned, and the rows of their file."""
 
 from __future__ import annotations
 

@@ -187,7 +187,6 @@ def by_object(blocks: Sequence[Block]) -> list[tuple[DatasetObject, list[Block]]
 
 
 def _split(total: int, most: int) -> list[int]:
-    """`total` in parts of `most`; the last one is smaller."""
     return [min(most, total - begun) for begun in range(0, total, most)]
 
 
@@ -203,7 +202,6 @@ def _objects(request: DatasetRequest) -> list[DatasetObject]:
 
 
 def _drawn_scales(content: str, request: DatasetRequest) -> list[float]:
-    """Random scales of an object, the same for the same content and seed; rounded, so that they can be typed."""
     number, low, high = request.random_scales
     draw = np.random.default_rng([int(content[:8], 16), request.seed]).uniform(np.log(low), np.log(high), number)
     return [round(float(scale), 4) for scale in np.exp(draw)]

@@ -1,6 +1,4 @@
-"""Tables to Parquet and back: the same rows give the same bytes, and a byte that changed is found when it is read.
-
-Where a data set lies: a directory, or an address that pyarrow knows (s3://bucket/path, gs://, hdfs://).
+"""Where a data set lies: a directory, or an address that pyarrow knows (s3://bucket/path, gs://, hdfs://).
 
     grasps/hand=HAND/object=CONTENT/KEY.parquet    a block each
     objects/SHA256.parquet                         a mesh each
@@ -8,7 +6,7 @@ Where a data set lies: a directory, or an address that pyarrow knows (s3://bucke
     runs/KEY.json                                  what a command asked for and what it took
     README.md                                      the data card
 
-A file appears whole or not at all.
+A file appears whole or not at all. The same rows give the same bytes, and a byte that changed is found when it is read.
 """
 
 from __future__ import annotations

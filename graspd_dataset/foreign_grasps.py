@@ -216,7 +216,6 @@ def _plain(values: dict[Any, Any], key: str, path: Path) -> Any:
 
 
 def _pose(values: Any, joints: int, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position, quaternion wxyz and joints of a qpos."""
     size = np.shape(values)
     if joints and len(size) == 1 and size[0] != 7 + joints:
         raise FormatError(f"{where}: {size[0] - 7} joints; the joint order has {joints}")
@@ -377,5 +376,4 @@ def foreign_files(place: Path) -> tuple[Path, ...]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """By which 2.npy comes before 10.npy."""
     return [(int(part), "") if odd % 2 else (0, part) for odd, part in enumerate(re.split(r"([0-9]+)", str(path)))]

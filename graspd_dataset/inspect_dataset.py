@@ -1,7 +1,4 @@
-"""What a data set holds: numbers by hand, and why grasps failed.
-
-A data set looked through: every file whole, where its content says, and no grasp in it twice.
-"""
+"""A data set looked through: what it holds, why grasps failed, whether files are whole and no grasp is in it twice."""
 
 from __future__ import annotations
 

@@ -85,12 +85,10 @@ def _refuse_silent(address: str | None) -> None:
 
 @lru_cache
 def _token() -> str:
-    """Who knows it may give commands to the Ray of this process, which reads it once: a second Ray has the same."""
     return secrets.token_hex(32)
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove what drivers left that were killed: folders that name a process which is no more."""
     for path in folder.glob(f"{_FOLDER}*-*"):
         process = path.name.removeprefix(_FOLDER).partition("-")[0]
         if process.isdigit() and not Path(f"/proc/{process}").exists() and Path("/proc/self").exists():

@@ -1,6 +1,6 @@
-"""What a command asked for and what it took, beside the data; and the data card that is made of it.
+"""The blocks that are missing, a bounded number at a time: objects made ready ahead, nothing done twice.
 
-The blocks that are missing, a bounded number at a time: objects made ready ahead, nothing done twice.
+Beside the data: what a command asked for and what it took, and the data card that is made of it.
 """
 
 from __future__ import annotations
@@ -152,7 +152,6 @@ _LICENCE = {
 
 
 def _objects(command: str) -> list[Any]:
-    """Those that a command names."""
     words = shlex.split(command)[2:]
     return words[: next(i for i, word in enumerate(words) if word.startswith("--"))]
 

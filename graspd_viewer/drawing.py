@@ -1,8 +1,6 @@
 """What is drawn, as plain meshes: the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`) show the same.
 
-What a grasp does to its object: the forces of its squeeze, and the push that it resists least.
-
-Where the hand is on its way: from the retreat over the pregrasp and the grasp to the squeeze.
+Also the forces of a grasp's squeeze, the push that it resists least, and where the hand is on its way.
 """
 
 from __future__ import annotations

@@ -111,7 +111,6 @@ class GraspTab:
         self._nodes.pose_object(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
     def _follow(self) -> None:
-        """Move the hand to where the scrubber was dragged, in two steps."""
         self.draw_pose(0.5 * (self._at + float(self._stage.value)))
         self._jobs.submit("pose", self.draw_pose, after=_HALF_PERIOD)
 
@@ -175,5 +174,4 @@ class GraspTab:
 
 
 def _plain(text: str) -> str:
-    """A text that Markdown takes for nothing but text."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]()#+!|<>~&" else c for c in " ".join(text.split())[:300])

@@ -57,7 +57,6 @@ class LiveView:
             self._jobs.submit("live", lambda: self._draw(hand, seen), self._wait())
 
     def _wait(self) -> float:
-        """How long until the next picture may be drawn [s]."""
         return max(0.0, self._drawn + INTERVAL - time.monotonic())
 
     def _draw(self, hand: HandModel, seen: Snapshot) -> None:

@@ -1,6 +1,6 @@
-"""What a visitor asks to be planned: checked here, because a forged message may hold anything in any field.
+"""The tab where visitors plan: an object, a hand, a preset; Plan, Stop and Save. One run at a time, seen by all.
 
-The tab where visitors plan: an object, a hand, a preset; Plan, Stop and Save. One run at a time, seen by all.
+A visitor's wish is checked here, because a forged message may hold anything in any field.
 """
 
 from __future__ import annotations

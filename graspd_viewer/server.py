@@ -1,9 +1,8 @@
-"""One thread that draws: of each kind of work it does the newest, so that no flood of sliders piles up.
-
-A viser server that may be left running: who may connect, and how much may be sent to it.
+"""A viser server that may be left running, and the one thread that draws.
 
 viser serves anybody on every interface, lets any page that is open in the same browser connect, takes files of any
 size, and opens a public tunnel when a visitor asks for one. This one does none of it.
+The thread draws the newest of each kind, so that no flood of sliders piles up.
 """
 
 from __future__ import annotations

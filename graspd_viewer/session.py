@@ -130,7 +130,6 @@ def _object_of(
 
 
 def _beside(source: str, path: Path) -> str:
-    """A source as named, or the file of that name beside the grasps, where only that is there."""
     beside = path.parent / Path(source).name
     if source.startswith(SHAPE_PREFIX) or Path(source).exists() or not beside.is_file():
         return source

@@ -1,8 +1,7 @@
-"""A trial watched: where hand and object were at every moment as MuJoCo ran it, and what pressed on the object.
+"""A grasp's trial, run again and watched: forwards, step by step, up to the moment and the reason of its failure.
 
-Nothing here is run by planning; a trial that is recorded takes the same steps and ends with the same result.
-
-A grasp's trial, run again and watched: forwards, step by step, up to the moment and the reason of its failure.
+A recording holds where hand and object were as MuJoCo ran it, and what pressed on the object. A trial that is recorded
+takes the same steps and ends with the same result.
 """
 
 from __future__ import annotations
@@ -138,7 +137,6 @@ def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], 
 
 
 def _hold_stage(world: World, data: Any, protocol: Protocol) -> str:
-    """What a hold trial does, told by its clock, which every pull sets back, and by what pulls."""
     pull = data.xfrc_applied[world.object_body, :3]
     if pull.any():
         return f"a pull along {axis_name(pull / np.linalg.norm(pull))}"

@@ -1,7 +1,4 @@
-"""The help inside the page.
-
-The page: its tabs, and the thread that draws. Runs until it is closed; visitors come and go.
-"""
+"""The page: its tabs, its help, and the thread that draws. Runs until it is closed; visitors come and go."""
 
 from __future__ import annotations
 
@@ -150,5 +147,4 @@ class Viewer:
 
 
 def _report(error: Exception) -> None:
-    """A fault of the drawing: the page goes on."""
     traceback.print_exception(error, file=sys.stderr)

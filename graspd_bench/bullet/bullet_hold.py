@@ -127,7 +127,6 @@ def _put_base(run: _Run, position: Float[np.ndarray, "3"], quaternion_wxyz: Floa
 
 
 def _start_penetration(run: _Run) -> float:
-    """Deepest overlap of hand and object in the current state [m]."""
     import pybullet
 
     pybullet.performCollisionDetection(physicsClientId=run.client)
@@ -165,7 +164,6 @@ def _pull(run: _Run, posture: Posture, direction: Float[np.ndarray, "3"]) -> str
 
 
 def _step(run: _Run, step: int) -> str:
-    """One step of the simulation; every so often, why the trial is over, empty if it is not."""
     import pybullet
 
     pybullet.stepSimulation(physicsClientId=run.client)

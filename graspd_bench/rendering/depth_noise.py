@@ -124,7 +124,6 @@ def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int)
 
 
 def _around(depth: Depth) -> tuple[Depth, Depth, Bool[np.ndarray, "height width"]]:
-    """Least and greatest depth of each pixel and its neighbours, those without any left out; whether it is an edge."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     far = maximum_filter(depth, 3)

@@ -149,7 +149,6 @@ def hand_picture(hand: HandModel) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def _up(hand: HandModel, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The direction from the palm to the middle of the hand, square to the palm's normal, unit."""
     along = middle - hand.palm_center
     along = along - (along @ hand.palm_normal) * hand.palm_normal
     length = float(np.linalg.norm(along))

@@ -161,7 +161,6 @@ def _at_rest(shape: str | TriangleMesh, yaw: float) -> tuple[TriangleMesh, Float
 
 
 def _set_down(mesh: TriangleMesh, pose: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]):
-    """The same attitude, its lowest point at z = 0 and `centre` above the origin."""
     turned = mesh.vertices @ pose[:3, :3].T
     x, y, _ = pose[:3, :3] @ centre
     return _translation(-x, -y, -turned[:, 2].min()) @ pose

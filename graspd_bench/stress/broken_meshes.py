@@ -143,13 +143,11 @@ def box(size: Sequence[float] | np.ndarray, middle: Sequence[float] | np.ndarray
 
 
 def _edited(shape: str, change: Callable[[np.ndarray], np.ndarray]) -> TriangleMesh:
-    """A shape with other vertices."""
     mesh = make_shape(shape)
     return replace(mesh, vertices=change(mesh.vertices))
 
 
 def _kept(shape: str, which: Callable[[np.ndarray], np.ndarray]) -> TriangleMesh:
-    """A shape with those of its faces only that are chosen by their corners."""
     mesh = make_shape(shape)
     return replace(mesh, faces=mesh.faces[which(mesh.vertices[mesh.faces])])
 
@@ -159,7 +157,6 @@ def _scaled(shape: str, factor: float) -> TriangleMesh:
 
 
 def _share(faces: np.ndarray) -> np.ndarray:
-    """A number from 0 to 1 for every face."""
     return np.random.default_rng(_SEED).random(len(faces))
 
 
@@ -224,7 +221,6 @@ def thin_cup(wall: float) -> TriangleMesh:
 
 
 def _sieve() -> TriangleMesh:
-    """A plate of 6 x 4 holes, of bars that cross."""
     bars = [box((0.004, 0.084, 0.02), ((i - 3) * 0.02, 0.0, 0.0)) for i in range(7)]
     return joined(*bars, *(box((0.124, 0.004, 0.02), (0.0, (j - 2) * 0.02, 0.0)) for j in range(5)))
 

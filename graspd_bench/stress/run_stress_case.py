@@ -149,7 +149,6 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
 
 
 def _told(result: GraspResult, folder: str) -> str:
-    """What the user reads of a result; files by their names alone."""
     told = (result.outcome.value, result.message, *result.warnings)
     return "; ".join(filter(None, told)).replace(f"{folder}/", "")
 
@@ -169,7 +168,6 @@ def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder
 
 
 def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: TriangleMesh) -> int:
-    """How many verified grasps hold on the true object, of the mass and friction that were planned with."""
     from graspd_core.perception.scene import build_scene
 
     true = build_scene(truth, source="truth", mass=scene.object.mass, friction=scene.object.friction)

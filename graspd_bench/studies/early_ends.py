@@ -131,7 +131,6 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:
-    """One trial: what it said, and its CPU time [ms]."""
     began = time.thread_time()
     result = trial(grasp, full, error)
     said = {"figure": result} if isinstance(result, float) else {"passed": result.passed, "reason": result.reason}

@@ -126,6 +126,5 @@ def _line(r: Record) -> list[str]:
 
 
 def _content(folder: Path) -> str:
-    """Hash of the frame's files."""
     files = [path for path in sorted(folder.iterdir()) if path.is_file()]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

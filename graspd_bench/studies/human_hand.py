@@ -1,16 +1,11 @@
-"""Contact area and intersection volume of a hand that is given as one closed surface: a skinned human hand.
-
-The same definitions as for hands of solids (docs/metrics.md), on the skin itself instead of the hulls that stand for it
-while planning.
-
-Human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
+"""Human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
 
     graspd bench mano --hand MANO_RIGHT.pkl
 
 The model is the user's (https://mano.is.tue.mpg.de; never shipped). All grasps go through the hold trial, and the two
 best ranked of every object are measured, as the paper does, once with rigid flesh and once with flesh that gives by a
-millimetre. Area and volume are those of the skinned mesh; the trials use the convex hulls that stand for it.
-The paper's row is of 57 ShapeNet objects: these are other objects.
+millimetre. Area and volume are those of the skinned mesh, by the definitions of docs/metrics.md; the trials use the
+convex hulls that stand for it.
 """
 
 from __future__ import annotations

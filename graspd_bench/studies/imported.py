@@ -158,7 +158,6 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
 
 
 def _name(source: str) -> str:
-    """What an object goes by, in short; DexGraspBench calls every mesh "simplified", in a folder named after it."""
     path = Path(source)
     return (path.parents[1].name if path.stem == "simplified" else thing_name(source))[:16]
 

@@ -1,10 +1,6 @@
-"""A case of study `piles`: so many things, how they are dropped, and what the camera sees of them.
-
-Clear a pile: look, choose a thing, plan among the others, lift it on the truth, until nothing can be grasped.
+"""Clear a pile: look, choose a thing, plan among the others, lift it on the truth, until nothing can be grasped.
 
 What the robot knows is what the camera saw; what came of it is measured on the truth.
-
-What came of piles: a row for each number of things, why attempts failed, and a film strip of one scene.
 """
 
 from __future__ import annotations
@@ -206,7 +202,6 @@ def run_pile(case: PileCase) -> Record:
 
 
 def _seen(views: Sequence[PointCloud]) -> list[Float[np.ndarray, "_ 3"]]:
-    """The things that are seen; none where there is nothing, or nothing that is one."""
     try:
         return list(find_things(views))
     except GraspdError:
@@ -242,7 +237,6 @@ def _take_one(
 def _truth_of(
     points: Float[np.ndarray, "_ 3"], cloud: KDTree, truth: Int[np.ndarray, "points"], run: _Run
 ) -> dict[str, Any]:
-    """Which thing a segment truly shows, by most of its points, and what share of them is of a second one."""
     labels = truth[cloud.query(points)[1]]
     of_things = np.bincount(labels[(labels >= 0) & (labels < len(run.present))], minlength=len(run.present))
     order = np.argsort(-of_things, kind="stable")
@@ -280,7 +274,6 @@ def _planned(
 
 
 def _why_none(result: GraspResult) -> str:
-    """What most candidates failed of, numbers left out."""
     reasons = Counter(re.sub(r"-?\d+(\.\d+)?", "…", grasp.reason.split(" (")[0]) for grasp in result.grasps)
     told = "; ".join(f"{reason}: {count}" for reason, count in reasons.most_common(3))
     return told or result.message or str(result.outcome.value)
@@ -312,7 +305,6 @@ def _execute(hand: HandModel, run: _Run, grasp: Grasp, attempt: Record) -> None:
 
 
 def _risen(lifted: Lifted, before: Sequence[Float[np.ndarray, "4 4"]], index: int) -> list[int]:
-    """What the hand took out: the thing that was meant, and what came up with it."""
     if not lifted.result.passed:
         return []
     rise = 0.5 * _LIFT.lift_height
@@ -320,7 +312,6 @@ def _risen(lifted: Lifted, before: Sequence[Float[np.ndarray, "4 4"]], index: in
 
 
 def _frame(run: _Run, hand: Posture | None = None) -> Record:
-    """What lies where, as a picture needs it."""
     poses = {str(k): np.round(body.pose[:3], 5).tolist() for k, body in zip(run.present, run.bodies, strict=True)}
     posture = None
     if hand is not None:
@@ -382,7 +373,6 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
 
 
 def _by_segment(records: Sequence[Record]) -> str:
-    """How many verified grasps held where a segment was of one thing, and where it was of two."""
     lifts = [a for r in records for a in r["attempts"] if "lift" in a]
     held = {merged: [a["ended"] == CLEARED for a in lifts if a["merged"] == merged] for merged in (False, True)}
     one, two = (f"{sum(own)} of {len(own)}" for own in held.values())
@@ -403,7 +393,6 @@ def _causes(records: Sequence[Record]) -> list[str]:
 
 
 def _plain(reason: str) -> str:
-    """A reason without its figures, and of several only the first."""
     return re.sub(r"-?\d+(\.\d+)?", "…", re.sub(r": \d+$", "", reason.split(";")[0])).replace("|", "/")
 
 

@@ -125,7 +125,6 @@ def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
 
 @lru_cache(maxsize=1)
 def _load_libraries() -> None:
-    """Load what makes scenes of views, by a view of a ball."""
     scene_from_views(views_of(tabletop("sphere"), CAMERA, ring_poses(1, elevation=0.8)))
 
 
