@@ -24,7 +24,8 @@ def run_node(file: Path, arguments: list[str]) -> int:
     """graspd_node, with a timer that notes how late it comes and a note of each cloud's age on arrival."""
     from graspd_ros import grasp_node as service
     from graspd_ros import node
-    from graspd_ros.inputs.sensor_frames import SensorFrame, nanoseconds
+    from graspd_ros.convert import nanoseconds
+    from graspd_ros.inputs.sensor_frames import SensorFrame
 
     class TimedNode(service.GraspNode):
         def __init__(self, *args, **kwargs) -> None:

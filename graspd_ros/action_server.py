@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
-from graspd_ros.inputs.requests import Listener
+from graspd_ros.request import Listener
 
 GOAL_DEPTH = 500  # a reader keeps only its newest messages: of a burst of goals most would vanish
 RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result; rclpy's 900 keep a lot in memory

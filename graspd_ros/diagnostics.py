@@ -1,14 +1,33 @@
-"""The node's health on /diagnostics."""
+"""The node's health on /diagnostics: what it counts since its start, and how that is told."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from graspd_msgs.msg import Grasp, GraspArray
 from std_msgs.msg import Header
+
+from graspd_core.types import GraspResult
+
+_ENDS = {
+    GraspArray.SUCCEEDED: "requests succeeded",
+    GraspArray.PARTIAL: "requests partial",
+    GraspArray.FAILED: "requests failed",
+    GraspArray.CANCELLED: "requests cancelled",
+    GraspArray.SUPERSEDED: "requests superseded",
+    GraspArray.REFUSED: "requests refused",
+}
+# What is counted since the start, by the key that tells it.
+ACCEPTED, RECEIVED, SUPERSEDED = "requests accepted", "clouds received", "clouds superseded"
+VERIFIED, FAILED, AUDITED, DISAGREED = "grasps verified", "grasps failed", "grasps audited", "audits that disagreed"
 
 
 @dataclass(frozen=True)
@@ -21,20 +40,13 @@ class Health:
         ready: whether the hand is loaded and everything is warm.
         worker_alive: whether the worker's thread serves.
         running: id of the request that is worked on, empty when idle.
-        waiting: requests that wait.
-        queue_size: most requests that may wait.
-        accepted, succeeded, partial, failed, cancelled, superseded, refused: requests since the start, by their end.
-        verified: grasps since the start that held in the trial.
-        rejected: grasps since the start that did not.
-        audited: verified grasps since the start that were tried once more with a pull at full length.
-        audits_disagreed: those of them that failed there.
+        waiting: requests that wait, of at most `queue_size`.
+        transforms: whether /tf is heard.
+        counts: since the start, by the key that tells them.
         failed_in_a_row: requests that failed since the last that did not.
         last_latency: seconds from the last answered request to its answer, None before the first.
         last_first_verified: seconds from that request to its first verified grasp, None where there was none.
         last_error: the last failure in one line, empty without one.
-        clouds_received: clouds and depth images that came.
-        clouds_superseded: those that gave way to newer ones.
-        transforms: whether /tf is heard.
     """
 
     name: str
@@ -44,33 +56,62 @@ class Health:
     running: str = ""
     waiting: int = 0
     queue_size: int = 0
-    accepted: int = 0
-    succeeded: int = 0
-    partial: int = 0
-    failed: int = 0
-    cancelled: int = 0
-    superseded: int = 0
-    refused: int = 0
-    verified: int = 0
-    rejected: int = 0
-    audited: int = 0
-    audits_disagreed: int = 0
+    transforms: bool = False
+    counts: Mapping[str, int] = field(default_factory=dict)
     failed_in_a_row: int = 0
     last_latency: float | None = None
     last_first_verified: float | None = None
     last_error: str = ""
-    clouds_received: int = 0
-    clouds_superseded: int = 0
-    transforms: bool = False
+
+
+class Counters:
+    """Counts by name, and the last figures. Safe from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._last: dict[str, Any] = {}
+
+    def count(self, key: str) -> None:
+        """Count one more of a key."""
+        with self._lock:
+            self._counts[key] += 1
+
+    def answered(self, message: GraspArray) -> None:
+        """Count a request that got its answer, and its grasps."""
+        with self._lock:
+            self._counts[_ENDS[message.status]] += 1
+            self._counts[VERIFIED] += sum(grasp.verdict == Grasp.VERIFIED for grasp in message.grasps)
+            self._counts[FAILED] += sum(grasp.verdict == Grasp.FAILED for grasp in message.grasps)
+            if message.status == GraspArray.FAILED:
+                self._last["failed_in_a_row"] = self._last.get("failed_in_a_row", 0) + 1
+                self._last["last_error"] = message.message
+            elif message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+                self._last["failed_in_a_row"] = 0
+
+    def planned(self, result: GraspResult, latency: float) -> None:
+        """Count a run that ended `latency` seconds after its request came."""
+        with self._lock:
+            self._counts[AUDITED] += result.audits.audited
+            self._counts[DISAGREED] += result.audits.disagreed
+            self._last |= {"last_latency": latency, "last_first_verified": result.timing.first_verified}
+
+    def clear(self) -> None:
+        """Begin anew."""
+        with self._lock:
+            self._counts.clear()
+            self._last.clear()
+
+    def health(self, **state: Any) -> Health:
+        """Return the counts, and what else the node knows about itself."""
+        with self._lock:
+            return Health(**state, counts=dict(self._counts), **self._last)
 
 
 def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
-    """One status; its level is for alarms, its message for people, its values for graphs.
+    """Return one status; its level is for alarms, its message for people, its values for graphs.
 
-    Args:
-        health: what the node knows.
-        stamp: now.
-        memory: resident memory of the process and its children [bytes].
+    `memory` is the resident memory of the process and its children [bytes].
     """
     level, message = _verdict(health)
     status = DiagnosticStatus(
@@ -84,7 +125,7 @@ def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
 
 
 def resident_memory(pid: int | None = None) -> int:
-    """Memory of a process (this one) and its children that is in RAM [bytes]; 0 where the system does not tell.
+    """Return what of a process (this one) and its children is in RAM [bytes]; 0 where the system does not tell.
 
     What they share counts for each.
     """
@@ -121,6 +162,10 @@ def _verdict(health: Health) -> tuple[bytes, str]:
 
 def _values(health: Health, memory: int) -> dict[str, str]:
     state = "ended" if not health.worker_alive else "warming up" if not health.ready else "idle"
+
+    def counted(*keys: str) -> dict[str, str]:
+        return {key: str(health.counts.get(key, 0)) for key in keys}
+
     return {
         "worker": "busy" if state == "idle" and health.running else state,
         "current request": health.running,
@@ -128,20 +173,9 @@ def _values(health: Health, memory: int) -> dict[str, str]:
         "queue size": str(health.queue_size),
         "last latency [s]": _seconds(health.last_latency),
         "last first verified [s]": _seconds(health.last_first_verified),
-        "requests accepted": str(health.accepted),
-        "requests succeeded": str(health.succeeded),
-        "requests partial": str(health.partial),
-        "requests failed": str(health.failed),
-        "requests cancelled": str(health.cancelled),
-        "requests superseded": str(health.superseded),
-        "requests refused": str(health.refused),
-        "grasps verified": str(health.verified),
-        "grasps failed": str(health.rejected),
-        "grasps audited": str(health.audited),
-        "audits that disagreed": str(health.audits_disagreed),
+        **counted(ACCEPTED, *_ENDS.values(), VERIFIED, FAILED, AUDITED, DISAGREED),
         "last error": health.last_error,
-        "clouds received": str(health.clouds_received),
-        "clouds superseded": str(health.clouds_superseded),
+        **counted(RECEIVED, SUPERSEDED),
         "transforms heard": "yes" if health.transforms else "no: tf2_msgs is not installed",
         "memory [MB]": f"{memory / 1e6:.0f}" if memory else "",
     }

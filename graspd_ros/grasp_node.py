@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
@@ -36,21 +35,19 @@ from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.action_server import GoalServer, SynthesizeMessages
-from graspd_ros.diagnostics import health_message, resident_memory
-from graspd_ros.inputs.arm_place import heard_robot
-from graspd_ros.inputs.depth_stream import ImagePairs
-from graspd_ros.inputs.frames import TransformListener, wait_for_transform
+from graspd_ros.convert import nanoseconds
+from graspd_ros.diagnostics import RECEIVED, health_message, resident_memory
+from graspd_ros.error_codes import RequestError, sentence_of
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.requests import Listener, Request
-from graspd_ros.inputs.sensor_frames import SensorFrame, cloud_frame, depth_sensor_frame, nanoseconds
+from graspd_ros.inputs.sensor_frames import ImagePairs, SensorFrame, cloud_frame, depth_sensor_frame
 from graspd_ros.inputs.source_registry import SOURCES
-from graspd_ros.outputs.error_codes import RequestError, sentence_of
+from graspd_ros.inputs.tf_listener import TransformListener
 from graspd_ros.outputs.responses import Responses
-from graspd_ros.parameters import Settings, declare_settings, doubts, read_settings
+from graspd_ros.parameters import LiveSettings, Settings, doubts
+from graspd_ros.request import Listener, Request
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
-TRANSFORM_PATIENCE = 1.0  # seconds that the worker waits for a transform
 GOAL_PATIENCE = 0.3  # seconds that the executor has at the end to tell clients how their goals ended
 RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
 OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline passed while they waited
@@ -68,7 +65,8 @@ class GraspNode(Node):
 
     def __init__(self, on_failure: Callable[[], None]) -> None:
         super().__init__("graspd")
-        settings = declare_settings(self)
+        self._settings = LiveSettings(self)
+        settings = self._settings.now
         for doubt in doubts(self, settings):
             self.get_logger().warning(doubt)
         # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
@@ -77,18 +75,17 @@ class GraspNode(Node):
         self._on_failure = on_failure
         self._ready = False
         self._announcing = threading.Lock()
-        self._transforms = TransformBuffer()
-        self._listener = TransformListener(self, self._transforms)
+        self._listener = TransformListener(self, TransformBuffer())
         self._pairs = ImagePairs()
         self._things: Mapping[str, Any] = {}
         self._request_builder = RequestBuilder(
             self._hand.name,
             self._now,
-            self._transform,
-            lambda target, source, stamp: self._transform_in_time(target, source, stamp, self._stopping),
+            self._listener.lookup,
+            lambda target, source, at: self._listener.lookup_in_time(target, source, at, self._worker.stopping),
         )
         self._responses = Responses(self, self._hand)
-        self._planner = Planner(self._hand, self._transform_in_time, heard_robot(self, settings.arm))
+        self._planner = Planner(self._hand, self._listener.lookup_in_time, self._heard_robot(settings.arm))
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )
@@ -100,6 +97,13 @@ class GraspNode(Node):
         self.create_timer(OVERDUE_PERIOD, self._end_overdue, clock=steady)
         self._worker.start()
 
+    def _heard_robot(self, arm: str) -> str:
+        if not arm:
+            return ""
+        from graspd_ros.inputs.arm_place import heard_robot
+
+        return heard_robot(self, arm)
+
     def _create_inlets(self, collision_objects: str) -> None:
         def listen(kind: type, topic: str, callback: Callable, qos: QoSProfile | int) -> None:
             options = QoSOverridingOptions.with_default_policies()
@@ -109,8 +113,8 @@ class GraspNode(Node):
         listen(String, "~/mesh", self._on_mesh, 10)
         listen(String, "~/cancel", self._on_cancel, REQUEST_DEPTH)
         listen(PointCloud2, "points", self._on_points, qos_profile_sensor_data)
-        listen(Image, "depth/image_rect", self._on_image, qos_profile_sensor_data)
-        listen(CameraInfo, "depth/camera_info", self._on_camera_info, qos_profile_sensor_data)
+        listen(Image, "depth/image_rect", self._on_depth, qos_profile_sensor_data)
+        listen(CameraInfo, "depth/camera_info", self._on_depth, qos_profile_sensor_data)
         if collision_objects:
             listen(_collision_object(), collision_objects, self._on_collision_object, THINGS_DEPTH)
         self.create_service(ListHands, "~/list_hands", self._on_list_hands)
@@ -149,11 +153,8 @@ class GraspNode(Node):
     # Callbacks: short, in the executor's thread.
 
     def _on_mesh(self, message: String) -> None:
-        self._take(
-            "mesh",
-            self._request_builder.new_id("mesh"),
-            lambda name, given: self._request_builder.from_mesh(name, given, message.data),
-        )
+        name, builder = self._request_builder.new_id("mesh"), self._request_builder
+        self._take("mesh", name, lambda settings: builder.from_mesh(name, settings, message.data))
 
     def _on_request(self, message: GraspRequest) -> None:
         self._take_request(message, "request", None)
@@ -164,14 +165,10 @@ class GraspNode(Node):
     def _on_planning_goal(self, goal: Any, listener: Listener) -> str:
         from graspd_ros.grasp_planning import request_from_goal
 
-        request_id, builder = self._request_builder.new_id("planning"), self._request_builder
-        self._take(
-            "grasp_planning",
-            request_id,
-            lambda name, given: request_from_goal(builder, self._hand.name, name, given, goal, listener),
-            listener,
-        )
-        return request_id
+        name, builder = self._request_builder.new_id("planning"), self._request_builder
+        make = lambda settings: request_from_goal(builder, self._hand.name, name, settings, goal, listener)  # noqa: E731
+        self._take("grasp_planning", name, make, listener)
+        return name
 
     def _on_points(self, message: PointCloud2) -> None:
         try:
@@ -179,12 +176,8 @@ class GraspNode(Node):
         except RequestError as error:  # too large to keep
             self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
 
-    def _on_image(self, message: Image) -> None:
-        if pair := self._pairs.add_image(message):
-            self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
-
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        if pair := self._pairs.add_info(message):
+    def _on_depth(self, message: Image | CameraInfo) -> None:
+        if pair := self._pairs.add(message):
             self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
 
     def _on_collision_object(self, message: Any) -> None:
@@ -213,7 +206,7 @@ class GraspNode(Node):
 
     def _on_add_view(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            self._request_builder.add_view(read_settings(self))
+            self._request_builder.add_view(self._settings.now)
             views = self._request_builder.views
             response.success, response.message = True, f"{len(views.clouds)} views in {views.frame!r}"
         except Exception as error:  # whatever the cloud holds, the executor goes on
@@ -245,28 +238,24 @@ class GraspNode(Node):
     # From messages to the worker.
 
     def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None) -> str:
-        request_id = message.id or self._request_builder.new_id(kind)
-        self._take(
-            SOURCES[message.source].name if message.source in SOURCES else "request",
-            request_id,
-            lambda name, settings: self._request_builder.from_message(name, settings, message, listener),
-            listener,
-        )
-        return request_id
+        name, builder = message.id or self._request_builder.new_id(kind), self._request_builder
+        source = SOURCES[message.source].name if message.source in SOURCES else "request"
+        self._take(source, name, lambda settings: builder.from_message(name, settings, message, listener), listener)
+        return name
 
     def _take(
-        self, source: str, request_id: str, make: Callable[[str, Settings], Request], listener: Listener | None = None
+        self, source: str, request_id: str, make: Callable[[Settings], Request], listener: Listener | None = None
     ) -> None:
         try:
-            request = make(request_id, read_settings(self))
+            request = make(self._settings.now)
         except Exception as error:  # whatever a message holds, the executor goes on
             self._responses.not_made(request_id, source, error, listener)
         else:
             self._submit(request)
 
     def _see(self, sensor_frame: SensorFrame) -> None:
-        self._responses.counters.count("clouds_received")
-        self._request_builder.newest, settings = sensor_frame, read_settings(self)
+        self._responses.counters.count(RECEIVED)
+        self._request_builder.newest, settings = sensor_frame, self._settings.now
         if settings.cloud_policy == "off":
             return
         request_id = self._request_builder.new_id("cloud")
@@ -287,28 +276,19 @@ class GraspNode(Node):
     def _now(self) -> Time:
         return self.get_clock().now().to_msg()
 
-    def _transform(self, target: str, source: str, stamp: Time) -> np.ndarray:
-        return self._transforms.lookup(target, source, nanoseconds(stamp) or None)
-
     # The worker's side.
 
-    def _stopping(self) -> bool:
-        return self._worker.stopping()
-
-    def _transform_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> np.ndarray:
-        at = nanoseconds(stamp) or None
-        return wait_for_transform(self._transforms, target, source, at, TRANSFORM_PATIENCE, stop)
-
     def _prepare(self) -> None:
-        torch.set_num_threads(read_settings(self).torch_threads)
+        torch.set_num_threads(self._settings.now.torch_threads)
         try:
             warm_up(self._hand, stop=self._worker.stopping)
-            if read_settings(self).publish_markers:
-                self._responses.drawn(read_settings(self))
-            if read_settings(self).grasp_library:
+            settings = self._settings.now
+            if settings.publish_markers:
+                self._responses.drawn(settings)
+            if settings.grasp_library:
                 from graspd_ros.known_objects import warm_up_library
 
-                warm_up_library(read_settings(self), self._hand)
+                warm_up_library(settings, self._hand)
         except BaseException as error:  # without this the node would stand there deaf
             self._responses.tell_error("", "node", error)
             self._on_failure()

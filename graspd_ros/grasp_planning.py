@@ -6,24 +6,22 @@ that it stands on, towards which no hand may go.
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from graspd_msgs.msg import Grasp, GraspArray, GraspProgress
 from grasping_msgs.action import GraspPlanning
 from grasping_msgs.msg import Object
 
-from graspd_core import HandModel, Scene, TriangleMesh, load_scene, save_mesh
+from graspd_core import HandModel, Scene, TriangleMesh, load_scene
 from graspd_core.runtime.worker_process import run_isolated
+from graspd_ros.convert import array_of
+from graspd_ros.error_codes import ErrorCode, RequestError
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.requests import Listener, Request
-from graspd_ros.inputs.solids import bad_message, joined, mesh_shapes, primitive_shapes
-from graspd_ros.inputs.support_surface import plane_of, with_support
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_ros.inputs.solids import bad_message, joined, mesh_shapes, plane_of, primitive_shapes, with_support
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Listener, Request
 
 RETREAT = 0.1  # metres
 
@@ -50,10 +48,8 @@ class PlanningMessages:
 
     def _grasp(self, message: Grasp) -> Any:
         """Back along the way that it came: nobody says here where up is."""
-        start, end = message.pregrasp_pose.position, message.grasp_pose.position
-        back = (start.x - end.x, start.y - end.y, start.z - end.z)
-        if not any(back):
-            back = (0.0, 0.0, 1.0)
+        x, y, z = (array_of(message.pregrasp_pose.position) - array_of(message.grasp_pose.position)).tolist()
+        back = (x, y, z) if any((x, y, z)) else (0.0, 0.0, 1.0)
         return moveit_grasp(
             message,
             retreat=back,
@@ -97,10 +93,7 @@ def request_from_goal(
 
 
 def _load(mesh: TriangleMesh, settings: Settings) -> Scene:
-    with tempfile.TemporaryDirectory(prefix="graspd-") as directory:
-        path = Path(directory) / "object.ply"
-        save_mesh(mesh, path)
-        return run_isolated(load_scene, str(path), mass=settings.mass, friction=settings.friction)
+    return run_isolated(load_scene, mesh, mass=settings.mass, friction=settings.friction)
 
 
 def _solid(target: Object) -> TriangleMesh:

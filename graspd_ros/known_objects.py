@@ -7,23 +7,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from graspd_core import HandModel, Reach, Scene, Steering, load_scene
 from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, hand_hash
 from graspd_core.library.known_grasps import Physics, entry_by_file, entry_by_name, known_or_planned, library_result
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import GraspResult
-from graspd_ros.inputs.requests import KnownObject, Request
+from graspd_ros.convert import Matrix
 from graspd_ros.parameters import Settings
-from graspd_ros.recovery import unlike
+from graspd_ros.request import KnownObject, Request
+from graspd_ros.request_planner import unlike
 
 
 def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -> LibraryEntry | None:
-    """What the library has for a request and a hand, any where that is None; None where it need not know the object.
+    """Return what the library has for a request and a hand (None: any); None where it need not know the object.
 
-    Raises:
-        GraspdError: the library must know the object and does not, or cannot be read.
+    Raises GraspdError: the library must know the object and does not, or cannot be read.
     """
     library = GraspLibrary(Path(settings.grasp_library))
     physics = Physics(settings.mass, settings.friction, settings.verify)
@@ -55,13 +53,11 @@ def answer_known(
     request: Request,
     known: KnownObject,
     hand: HandModel,
-    excluded: Sequence[np.ndarray],
+    excluded: Sequence[Matrix],
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None]:
-    """Grasps of the library, and planned ones where they are too few; and the scene if it was read.
-
-    None is like those excluded.
+    """Return grasps unlike those excluded, of the library and planned where it has too few; and the scene, if read.
 
     Raises GraspdError: see `find_entry`, and what loading and planning raise.
     """

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from graspd_core.errors import ConfigError
-from graspd_ros.probe import foreign_rclpy
-from graspd_ros.ros_command import Parser
+from graspd_ros.ros_command import Parser, foreign_rclpy
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor

@@ -15,8 +15,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from graspd_core import load_arm, load_preset
-from graspd_core.arms.arm import from_robot_description, read_arm_file
+from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, FormatError
 from graspd_ros.outputs.markers import GEOMETRIES, PARTS, USUAL_PARTS
@@ -68,8 +67,12 @@ def _check_scene_config(path: str) -> None:
 
 
 def _check_arm(name: str) -> None:
-    if name and not from_robot_description(read_arm_file(name)[1]):
-        load_arm(name)
+    if name:
+        from graspd_core import load_arm
+        from graspd_core.arms.arm import from_robot_description, read_arm_file
+
+        if not from_robot_description(read_arm_file(name)[1]):
+            load_arm(name)
 
 
 def _check_library(path: str) -> None:
@@ -199,31 +202,37 @@ class Settings:
     output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
 
 
-def declare_settings(node: Node) -> Settings:
-    """Declare every parameter on the node and read them.
+class LiveSettings:
+    """A node's parameters as settings, read anew when one of them changes.
+
+    Attributes:
+        now: the settings as they are.
 
     Raises:
         ConfigError: a value given at the start is not a valid choice.
         rclpy.exceptions.ParameterException: a value of the wrong type or out of range.
     """
-    for setting in dataclasses.fields(Settings):
-        default = Settings.__dataclass_fields__[setting.name].default
-        if setting.default_factory is not dataclasses.MISSING:
-            default = setting.default_factory()
-        node.declare_parameter(setting.name, default, _descriptor(setting))
-    settings = read_settings(node)
-    for name in (setting.name for setting in dataclasses.fields(Settings)):
-        _check_value(name, node.get_parameter(name).value)
-    node.add_on_set_parameters_callback(check_parameters)
-    return settings
 
+    def __init__(self, node: Node) -> None:
+        fields = dataclasses.fields(Settings)
+        for setting in fields:
+            default = setting.default
+            if setting.default_factory is not dataclasses.MISSING:
+                default = setting.default_factory()
+            node.declare_parameter(setting.name, default, _descriptor(setting))
+        for setting in fields:
+            _check_value(setting.name, node.get_parameter(setting.name).value)
+        self._node = node
+        self._read([])
+        node.add_on_set_parameters_callback(check_parameters)
+        node.add_post_set_parameters_callback(self._read)
 
-def read_settings(node: Node) -> Settings:
-    """The parameters as they are now."""
-    values: dict[str, Any] = {s.name: _word(s, node.get_parameter(s.name).value) for s in dataclasses.fields(Settings)}
-    for name in ("mesh_roots", "marker_parts"):
-        values[name] = list(values[name] or [])
-    return Settings(**values)
+    def _read(self, _: list[Parameter]) -> None:
+        fields = dataclasses.fields(Settings)
+        values: dict[str, Any] = {s.name: _word(s, self._node.get_parameter(s.name).value) for s in fields}
+        for name in ("mesh_roots", "marker_parts"):
+            values[name] = list(values[name] or [])
+        self.now = Settings(**values)
 
 
 def doubts(node: Node, settings: Settings) -> list[str]:

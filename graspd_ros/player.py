@@ -10,6 +10,7 @@ import importlib
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +33,7 @@ def _play(options: argparse.Namespace, stop: threading.Event) -> None:
     import rclpy
 
     node = rclpy.create_node("graspd_play")
-    play(
-        node,
-        options.bag,
-        topics=tuple(options.topics),
-        rate=options.rate,
-        loop=options.loop,
-        now=options.now,
-        wait=options.wait,
-        stop=stop,
-    )
+    play(node, **vars(options), stop=stop)
     node.destroy_node()
 
 
@@ -49,24 +41,16 @@ def play(
     node: Any,
     bag: Path,
     *,
-    topics: tuple[str, ...] = (),
+    topics: Sequence[str] = (),
     rate: float = 1.0,
     loop: bool = False,
     now: bool = False,
     wait: float = 0.0,
     stop: threading.Event | None = None,
 ) -> int:
-    """Publish a recording's messages at the times they were recorded at; returns how many were published.
+    """Publish a recording's messages at the times they were recorded at, until `stop` is set; return how many.
 
-    Args:
-        node: whose publishers send them.
-        bag: a rosbag2 directory or storage file.
-        topics: only these; all of the bag unless some are named.
-        rate: how many times as fast as recorded.
-        loop: begin again at the end, until stopped.
-        now: shift the stamps in the messages, so that the recording seems to happen now.
-        wait: wait for a subscriber of any of the topics before the first message, at most so long [s].
-        stop: ends it when set.
+    `_parse` tells what the options mean.
 
     Raises:
         BagError: the bag cannot be read, lacks a topic, or holds none of a type known here.
@@ -105,7 +89,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     return options
 
 
-def _publishers(node: Any, bag: Path, wanted: tuple[str, ...]) -> dict[str, tuple[Any, type]]:
+def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[Any, type]]:
     """A publisher and the message type for each topic whose type is known here; warns of the others."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -166,12 +150,13 @@ def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> An
     """
     from rclpy.serialization import deserialize_message
 
+    from graspd_ros.convert import nanoseconds, set_nanoseconds
+
     message = deserialize_message(data, kind)
     for stamped in (message, *getattr(message, "transforms", ())):
         if hasattr(stamped, "header"):
             stamp = stamped.header.stamp
-            moved = max(0, began + round((stamp.sec * SECOND + stamp.nanosec - start) / rate))
-            stamp.sec, stamp.nanosec = moved // SECOND, moved % SECOND
+            set_nanoseconds(stamp, max(0, began + round((nanoseconds(stamp) - start) / rate)))
     return message
 
 

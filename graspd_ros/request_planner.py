@@ -1,33 +1,40 @@
-"""The worker's work on one request: read the object, plan, move the result to the frame asked for."""
+"""The worker's work on one request: read the object, plan, move the result to the frame asked for.
+
+Grasps that were tried and lost are left out: the answer is the next best of the same run, or a new run without them.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
 from graspd_core import HandModel, Reach, load_preset, plan_grasps, save_result
-from graspd_core.types import GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing
-from graspd_ros.inputs.arm_place import reach_of
-from graspd_ros.inputs.frames import moved_grasp, moved_result
-from graspd_ros.inputs.requests import Request
-from graspd_ros.recovery import RecentRuns, without
+from graspd_core.types import Grasp, GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing, Verdict
+from graspd_core.verify.robustness import begin_in_thread
+from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
+from graspd_ros.error_codes import bad_request
+from graspd_ros.request import FrameLookup, Request
 from graspd_ros.worker import Report, WorkerEnding
 
 PATIENCE = 0.15  # seconds that work gets to end by itself when its request is over
 _POLL = 0.02  # seconds between two looks at stop and deadline
+MOST_RUNS = 16
+# A grasp is like one that was lost where its base is this near to it and turned by less [m], [rad].
+LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 
-T = TypeVar("T")
 # `T_target_source` of two frames at a time (0: the newest there is); waits a little, unless the hook says stop; may
 # raise a TransformError.
-Lookup = Callable[[str, str, Time, StopHook], np.ndarray]
+Lookup = Callable[[str, str, Time, StopHook], Matrix]
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,85 @@ class Planned:
     result: GraspResult
     file: str = ""
     worked_on: bool = True
+
+
+@dataclass(frozen=True)
+class _Run:
+    object_key: str
+    frame: str
+    T_frame_object: Matrix | None
+    grasps: tuple[Grasp, ...]
+
+
+class RecentRuns:
+    """The grasps of the last runs, by the id of their request. Used by one thread at a time."""
+
+    def __init__(self) -> None:
+        self._runs: OrderedDict[str, _Run] = OrderedDict()
+
+    def keep(self, request: Request, result: GraspResult) -> None:
+        """Remember a result, in the frame that it was planned in."""
+        self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, result.grasps)
+        while len(self._runs) > MOST_RUNS:
+            self._runs.popitem(last=False)
+
+    def excluded(self, request: Request, lookup: FrameLookup) -> list[Matrix]:
+        """Return poses of the base link that the request excludes by id or pose, in the frame that it is planned in.
+
+        Raises RequestError: an id that no grasp of the last runs has; TransformError: as `lookup`.
+        """
+        poses = []
+        for name in request.exclude:
+            run, grasp = self._grasp(name)
+            pose = matrix_of_posture(grasp.grasp)
+            if run.object_key != request.object_key or not request.object_key:
+                placed = pose if run.T_frame_object is None else run.T_frame_object @ pose
+                pose = request.to_object(run.frame, placed, lookup)
+            poses.append(pose)
+        return poses + [request.to_object(frame, pose, lookup) for frame, pose in request.exclude_poses]
+
+    def _grasp(self, name: str) -> tuple[_Run, Grasp]:
+        run_id, _, rank = name.rpartition("/")
+        run = self._runs.get(run_id)
+        if run is None or not rank.isdecimal() or int(rank) >= len(run.grasps):
+            kept = ", ".join(self._runs) or "none"
+            raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; kept: {kept}")
+        return run, run.grasps[int(rank)]
+
+    def next_best(self, request: Request, excluded: Sequence[Matrix]) -> GraspResult | None:
+        """What is left of the runs on the very same object; None where nothing good is."""
+        runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
+        known = {id(grasp): grasp for run in runs for grasp in run.grasps}
+        wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
+        left = [grasp for grasp in unlike(known.values(), excluded) if grasp.verdict is wanted]
+        count = request.settings.num_grasps
+        if not left:
+            return None
+        outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
+        told = f"{min(count, len(left))} grasps of an earlier run, none like the {len(excluded)} excluded"
+        return GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", told)
+
+
+def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
+    """Those of the grasps that are not like any of the poses."""
+    return [grasp for grasp in grasps if not any(_alike(matrix_of_posture(grasp.grasp), pose) for pose in excluded)]
+
+
+def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
+    """A run's result without grasps like those excluded, at most `count` of the good ones."""
+    left = unlike(result.grasps, excluded)
+    good = [grasp for grasp in left if grasp.verdict is not Verdict.FAILED]
+    failed = [grasp for grasp in left if grasp.verdict is Verdict.FAILED]
+    outcome = result.outcome
+    if outcome in (Outcome.SUCCEEDED, Outcome.TOO_FEW):
+        outcome = Outcome.SUCCEEDED if len(good) >= count else Outcome.TOO_FEW
+    return replace(result, outcome=outcome, grasps=(*good[:count], *failed))
+
+
+def _alike(a: Matrix, b: Matrix) -> bool:
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
+    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < LIKE_DISTANCE
+    return bool(near and np.arccos(np.clip(cosine, -1.0, 1.0)) < LIKE_TURN)
 
 
 class Planner:
@@ -51,7 +137,7 @@ class Planner:
         self._hand = hand
         self._robot_description = robot_description
         self._lookup = lookup
-        self._behind: Aside[Planned] | None = None
+        self._behind: Future[Planned] | None = None
         self._runs = RecentRuns()
 
     def plan(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
@@ -67,14 +153,16 @@ class Planner:
                     tell(progress)
 
         tell(Progress(Stage.LOAD, 0, 1, 0.0, 0, 0.0))
-        if self._behind and not self._behind.wait(over):
+        if self._behind and not _ended(self._behind, over):
             return _empty(request, stop)
-        threads = request.settings.torch_threads
-        work = self._behind = Aside(
-            lambda: _with_threads(threads, lambda: self._run(request, lambda: left.is_set() or stop(), tell_if_wanted))
-        )
+
+        def run() -> Planned:
+            torch.set_num_threads(request.settings.torch_threads)  # holds for the calling thread only
+            return self._run(request, lambda: left.is_set() or stop(), tell_if_wanted)
+
+        work = self._behind = begin_in_thread("graspd_planner", run)
         end = None
-        while not work.wait(over):
+        while not _ended(work, over):
             end = end or time.monotonic() + PATIENCE
             if time.monotonic() > end:
                 with telling:
@@ -86,39 +174,43 @@ class Planner:
     def rest(self, timeout: float) -> bool:
         """Wait for work that was left behind; True when it ended within `timeout` seconds."""
         end = time.monotonic() + timeout
-        return self._behind is None or self._behind.wait(lambda: time.monotonic() > end)
+        return self._behind is None or _ended(self._behind, lambda: time.monotonic() > end)
 
     def _run(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
         # Looked up before the work, which would be lost where there is no transform.
-        run_isolated = request.frame_out != request.frame
-        stamp = Time() if request.timeless else request.stamp
-        T_out_frame = self._lookup(request.frame_out, request.frame, stamp, stop) if run_isolated else None
-        placed = lambda target, source: self._lookup(target, source, stamp, stop)  # noqa: E731
-        reach = reach_of(request, placed, self._robot_description)
+        seen = self._lookup_at(Time() if request.timeless else request.stamp, stop)
+        T_out_object = request.T_frame_object
+        if request.frame_out != request.frame:
+            T_out_frame = seen(request.frame_out, request.frame)
+            T_out_object = T_out_frame if T_out_object is None else T_out_frame @ T_out_object
+        reach: tuple[Reach, ...] = ()
+        if request.settings.arm:
+            from graspd_ros.inputs.arm_place import reach_of
+
+            reach = (reach_of(request, seen, self._robot_description),)
         if request.things:
             from graspd_ros.inputs.collision_objects import among_things
 
-            request = among_things(request, request.things, placed)
-        newest = Time()
-        excluded = self._runs.excluded(request, lambda target, source: self._lookup(target, source, newest, stop))
+            request = among_things(request, seen)
+        excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
         # What an earlier run found was not asked for these wishes, and an arm or other things may have stood elsewhere.
         # A library has what that run found, and more.
         free = request.steering is None and not reach and not request.things
         known = excluded and free and request.known is None
         result, file = self._runs.next_best(request, excluded) if known else None, ""
         if result is None:
-            poses = [pose for pose in (request.T_frame_object, T_out_frame) if pose is not None]
-            moved = lambda progress: tell(_placed(progress, poses))  # noqa: E731
+            moved = lambda progress: tell(_placed(progress, T_out_object))  # noqa: E731
             result, file = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, result)
-        for pose in (request.T_frame_object, T_out_frame):
-            result = result if pose is None else moved_result(result, pose)
-        return Planned(result, file)
+        return Planned(result if T_out_object is None else moved_result(result, T_out_object), file)
+
+    def _lookup_at(self, stamp: Time, stop: StopHook) -> FrameLookup:
+        return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _search(
         self,
         request: Request,
-        excluded: list[np.ndarray],
+        excluded: list[Matrix],
         reach: tuple[Reach, ...],
         stop: StopHook,
         tell: ProgressHook,
@@ -153,55 +245,24 @@ class Planner:
         path = Path(settings.output_dir) / f"{request.id}.json"
         # As planned: a mesh's grasps in the mesh's own frame, wherever it stands.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
-        seconds = request.stamp.sec + 1e-9 * request.stamp.nanosec
-        scene = scene or request.load()
+        seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
         save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
         return result, str(path)
 
 
-class Aside(Generic[T]):
-    """Work in a daemon thread: nobody has to wait for its end, not even the interpreter."""
-
-    def __init__(self, work: Callable[[], T]) -> None:
-        self._value: T
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, args=(work,), name="graspd_planner", daemon=True)
-        self._thread.start()
-
-    def wait(self, over: StopHook) -> bool:
-        """Wait for the end; False when `over` said so before, and a look later it had not ended."""
-        while self._thread.is_alive():
-            self._thread.join(_POLL)
-            if over():
-                return not self._thread.is_alive()
-        return True
-
-    def result(self) -> T:
-        """What the work gave; raises what it raised."""
-        if self._error is not None:
-            raise self._error
-        return self._value
-
-    def _run(self, work: Callable[[], T]) -> None:
-        try:
-            self._value = work()
-        except BaseException as error:
-            self._error = error
+def _ended(work: Future[Any], over: StopHook) -> bool:
+    """Wait for the end of work. False if `over` says so before."""
+    while not wait([work], timeout=_POLL).done:
+        if over():
+            return work.done()
+    return True
 
 
-def _placed(progress: Progress, poses: list[np.ndarray]) -> Progress:
+def _placed(progress: Progress, T_out_object: Matrix | None) -> Progress:
     """A report whose grasp is in the frame that the results are told in."""
-    found = progress.found
-    if found is None:
+    if progress.found is None or T_out_object is None:
         return progress
-    for pose in poses:
-        found = moved_grasp(found, pose)
-    return replace(progress, found=found)
-
-
-def _with_threads(count: int, work: Callable[[], T]) -> T:
-    torch.set_num_threads(count)  # holds for the calling thread only
-    return work()
+    return replace(progress, found=moved_grasp(progress.found, T_out_object))
 
 
 def _empty(request: Request, stop: StopHook) -> Planned:
@@ -212,17 +273,3 @@ def _empty(request: Request, stop: StopHook) -> Planned:
 def overdue() -> Report[Planned]:
     """The end of a request whose deadline passed before its turn came."""
     return Report(WorkerEnding.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, ""), worked_on=False))
-
-
-def limited(tell: ProgressHook, rate: float, since: float = -float("inf")) -> ProgressHook:
-    """A hook that passes on at most `rate` reports a second; the last one before it was at `since` (monotonic)."""
-    last = since
-
-    def hook(progress: Progress) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= 1 / rate:
-            last = now
-            tell(progress)
-
-    return hook

@@ -131,14 +131,14 @@ def _hand(name: str, *, named_by_message: bool) -> Any:
 
 def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
     """A grasp out of its message. Raises ValueError: a joint is missing, or a number is not finite."""
+    from graspd_ros.convert import array_of, wxyz_of
 
     def posture(pose: Any, joints: Any) -> Posture:
         values = dict(zip(joints.name, joints.position, strict=True))
         missing = [name for name in joint_names if name not in values]
         if missing:
             raise ValueError(f"no value for joint {missing[0]}")
-        p, q = pose.position, pose.orientation
-        made = (np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z]), np.array([values[n] for n in joint_names]))
+        made = array_of(pose.position), wxyz_of(pose.orientation), np.array([values[name] for name in joint_names])
         if not all(np.isfinite(numbers).all() for numbers in made) or not 0.9 < np.linalg.norm(made[1]) < 1.1:
             raise ValueError("a posture that is not finite, or no unit quaternion")
         return Posture(*made)

@@ -410,3 +410,14 @@ def test_the_checker_sees_a_planted_breach(path: str, source: str, culprit: str)
 )
 def test_the_checker_lets_good_code_pass(path: str, source: str):
     assert breaches(path, source) == []
+
+
+def test_the_inputs_and_outputs_of_the_node_do_not_import_each_other():
+    found = [
+        f"{path.relative_to(ROOT)}:{line.line}"
+        for side, other in (("inputs", "outputs"), ("outputs", "inputs"))
+        for path in (ROOT / "graspd_ros" / side).glob("*.py")
+        for line in imports_of(path.read_text(), f"graspd_ros.{side}")
+        if line.module.startswith(f"graspd_ros.{other}")
+    ]
+    assert not found, "\n".join(found)

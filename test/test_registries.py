@@ -21,9 +21,8 @@ from graspd_core.verify.metrics import METRICS, Metric, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_ros.outputs.messages import grasp_message
-from graspd_ros.outputs.status_json import result_event
-from graspd_ros.outputs.trajectory import Pace
+from graspd_ros.outputs.messages import Pace, grasp_message
+from graspd_ros.outputs.responses import result_event
 
 ROOT = Path(__file__).parents[1]
 HEIGHT = Metric("height", "mm", 1e3, lambda g: float(g.placed.translations[0, 2]), "z of the base link", 1)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -16,33 +14,23 @@ from std_msgs.msg import String
 from graspd_core import Arm, Reach, load_arm
 from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
 from graspd_core.errors import ConfigError
-from graspd_ros.inputs.frames import pose_of_matrix
-from graspd_ros.inputs.requests import Request
+from graspd_ros.convert import wxyz_of_matrix
+from graspd_ros.request import FrameLookup, Request
 
 ROBOT_PATIENCE = 10.0  # seconds that the start waits for the robot
 
 
-def reach_of(
-    request: Request, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]], robot_description: str = ""
-) -> tuple[Reach, ...]:
-    """The restriction, in the frame of the request's object; none where the node has no arm.
+def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "") -> Reach:
+    """Return the restriction, in the frame of the request's object, whose settings name the arm and its base's frame.
 
-    Args:
-        request: its settings name the arm and the frame of its base.
-        lookup: `T_target_source` of two frames when the object was seen; may raise a TransformError.
-        robot_description: the URDF of a robot, which the arm may be part of.
+    `lookup` is of two frames when the object was seen, `robot_description` the URDF of a robot that has the arm.
     """
     settings = request.settings
-    if not settings.arm:
-        return ()
     arm = _arm(settings.arm, robot_description)
-    base = settings.arm_base_frame or arm.chain.base_link
-    T = np.eye(4) if base == request.frame else lookup(request.frame, base)
-    if request.T_frame_object is not None:
-        T = np.linalg.inv(request.T_frame_object) @ T
-    turn = pose_of_matrix(T).orientation
+    T = request.to_object(settings.arm_base_frame or arm.chain.base_link, np.eye(4), lookup)
     x, y, z = map(float, T[:3, 3])
-    return (Reach(arm, (x, y, z), (turn.w, turn.x, turn.y, turn.z)),)
+    qw, qx, qy, qz = map(float, wxyz_of_matrix(T))
+    return Reach(arm, (x, y, z), (qw, qx, qy, qz))
 
 
 # What is known of an arm takes a tenth of a second to make, and is kept with it.
@@ -52,14 +40,11 @@ def _arm(name: str, robot_description: str) -> Arm:
 
 
 def heard_robot(node: Node, arm: str) -> str:
-    """The URDF on the topic robot_description, where an arm is part of that robot; else nothing is waited for.
+    """Return the URDF on the topic robot_description if an arm is part of that robot; else nothing is waited for.
 
-    To be called at the start, before the node is spun.
-
-    Raises:
-        GraspdError: nothing came within `ROBOT_PATIENCE` seconds, or the arm is not in it.
+    To be called at the start, before the node is spun. Raises GraspdError: nothing came in time, or not with the arm.
     """
-    if not arm or not from_robot_description(read_arm_file(arm)[1]):
+    if not from_robot_description(read_arm_file(arm)[1]):
         return ""
     heard: list[String] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

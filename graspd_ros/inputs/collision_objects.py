@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-from jaxtyping import Float
 from moveit_msgs.msg import CollisionObject
 
 from graspd_core import Scene, SceneConfig, TriangleMesh, with_neighbours
 from graspd_core.config import load_scene_config
 from graspd_core.errors import TransformError
-from graspd_ros.inputs.requests import Request, pose_matrix
-from graspd_ros.inputs.solids import bad_message, mesh_shapes, primitive_shapes
+from graspd_ros.convert import Matrix, pose_matrix
+from graspd_ros.inputs.solids import bad_message, mesh_shapes, moved_mesh, primitive_shapes
+from graspd_ros.request import FrameLookup, Request
 
 MOST_THINGS = 1000
 
@@ -29,7 +28,7 @@ class Thing:
     """
 
     frame: str
-    T_frame_thing: Float[np.ndarray, "4 4"]
+    T_frame_thing: Matrix
     shapes: tuple[TriangleMesh, ...]
 
 
@@ -87,21 +86,13 @@ def _changed(there: Thing | None, message: CollisionObject, owner: str) -> Thing
     return Thing(frame, T, shapes)
 
 
-def among_things(
-    request: Request, things: Mapping[str, Thing], lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]
-) -> Request:
-    """The request whose scene has the things about its object.
+def among_things(request: Request, lookup: FrameLookup) -> Request:
+    """Return the request whose scene has its `things` about its object; none of its other fields changes.
 
-    Args:
-        request: none of its fields but `load` changes.
-        things: by id.
-        lookup: `T_target_source` of two frames when the object was seen; may raise a TransformError.
-
-    Raises:
-        TransformError: nobody knows where the frame of a thing is.
+    `lookup` is of two frames when the object was seen. Raises TransformError: it does not know a thing's frame.
     """
     settings, load = request.settings, request.load
-    placed = {name: _placed(name, thing, request, lookup) for name, thing in things.items()}
+    placed = {name: _placed(name, thing, request, lookup) for name, thing in request.things.items()}
 
     def loaded() -> Scene:
         config = load_scene_config(settings.scene_config) if settings.scene_config else SceneConfig()
@@ -110,18 +101,10 @@ def among_things(
     return replace(request, load=loaded)
 
 
-def _placed(
-    name: str, thing: Thing, request: Request, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]
-) -> list[TriangleMesh]:
+def _placed(name: str, thing: Thing, request: Request, lookup: FrameLookup) -> list[TriangleMesh]:
     """Its shapes in the object's own frame."""
     try:
-        T = (
-            thing.T_frame_thing
-            if thing.frame == request.frame
-            else lookup(request.frame, thing.frame) @ thing.T_frame_thing
-        )
+        T = request.to_object(thing.frame, thing.T_frame_thing, lookup)
     except TransformError as error:
         raise TransformError(f"collision object {name!r}: {error}") from None
-    if request.T_frame_object is not None:
-        T = np.linalg.inv(request.T_frame_object) @ T
-    return [TriangleMesh(shape.vertices @ T[:3, :3].T + T[:3, 3], shape.faces) for shape in thing.shapes]
+    return [moved_mesh(shape, T) for shape in thing.shapes]

@@ -1,34 +1,53 @@
-"""Messages to requests: from a mesh path, from what a camera showed, and from a GraspRequest."""
+"""Messages to requests: from a mesh path, from what a camera showed, and from a GraspRequest, which is checked here."""
 
 from __future__ import annotations
 
 import itertools
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose
 from graspd_msgs.msg import GraspRequest
 from sensor_msgs.msg import PointCloud2
+from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
 
-from graspd_core import Scene, Steering
-from graspd_ros.inputs.camera_place import place_of, seen_by_camera
-from graspd_ros.inputs.requests import Listener, Request, check_request, pose_matrix, settings_of
-from graspd_ros.inputs.sensor_frames import SensorFrame, Views, cloud_frame, nanoseconds
-from graspd_ros.inputs.source_registry import (
+from graspd_core import Box, NearPoints, Scene, Sphere, Steering, preset_names
+from graspd_core.planning.steering import zero_of_roll
+from graspd_ros.convert import Matrix, nanoseconds, near, pose_matrix, wxyz_of_matrix
+from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
+from graspd_ros.inputs.sensor_frames import (
+    MOST_CLOUD_BYTES,
     Lookup,
+    SensorFrame,
+    Views,
+    cloud_frame,
+    place_of,
+    seen_by_camera,
+)
+from graspd_ros.inputs.source_registry import (
     SourceInput,
     SourceObject,
     frame_loader,
     known_mesh,
     latest_frame,
     mesh_loader,
+    resolve_mesh,
     source_of,
 )
-from graspd_ros.inputs.steering_wishes import asks_for_any, steering_of
-from graspd_ros.parameters import Settings
+from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
+from graspd_ros.request import MOST_ID, Listener, Request
+
+MOST_EXCLUDED = 256
+MOST_BOXES = 64
+_ID = re.compile(rf"[A-Za-z0-9_.:@+-]{{1,{MOST_ID}}}")
+_OF_ONE_CLOUD = (GraspRequest.CLOUD, GraspRequest.LATEST_CLOUD)
+# The defaults of `Steering` stand for an angle of 0.
+_DEFAULTS = Steering()
 
 
 class RequestBuilder:
@@ -56,7 +75,7 @@ class RequestBuilder:
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
     def new_id(self, kind: str) -> str:
-        """A name that no request had before, not before a restart either: files are called by it."""
+        """Return a name that no request had before, not before a restart either: files are called by it."""
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
@@ -75,65 +94,60 @@ class RequestBuilder:
         self.views = self.views.add(frame, cloud, settings, self._lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
-        """A mesh named by its path alone. Raises MeshError."""
-        load, known = mesh_loader(uri, settings), known_mesh(uri, settings)
+        """Return the request for a mesh named by its path alone. Raises MeshError."""
+        path = resolve_mesh(uri, settings.mesh_roots)
+        load, known = mesh_loader(path, settings), known_mesh(path, settings)
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True, known=known)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
-        """What a camera showed unasked. Raises RequestError: it is too old."""
-        sensor_frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        load = frame_loader(sensor_frame, settings, place_of(settings), self._lookup_in_time)
+        """Return the request for what a camera showed unasked. Raises RequestError: it is too old."""
+        load = self._frame_loader(settings, sensor_frame)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
 
     def from_message(
         self, request_id: str, settings: Settings, message: GraspRequest, listener: Listener | None = None
     ) -> Request:
-        """What a client asks for.
+        """Return what a client asks for.
 
-        Raises:
-            GraspdError: a field is out of range, the mesh is out of reach, or the cloud is missing, old or elsewhere.
+        Raises GraspdError: a field is out of range, the mesh out of reach, or the cloud missing, old or elsewhere.
         """
         check_request(message, self._hand)
         settings = settings_of(message, settings)
-        source, now = source_of(message), self._now()
-        given = SourceInput(
-            message, settings, self.newest, self.views, nanoseconds(now), self._lookup, self._lookup_in_time
-        )
+        source, now = source_of(message), nanoseconds(self._now())
+        given = SourceInput(message, settings, self.newest, self.views, now, self._lookup, self._lookup_in_time)
         found = source.find(given)
-        steering = self._steering(message, found)
-        timeless = nanoseconds(found.stamp) == 0
-        return Request(
-            request_id,
-            source.name,
-            found.frame,
-            now if timeless else found.stamp,
-            settings,
-            found.load,
+        header = Header(frame_id=found.frame, stamp=found.stamp)
+        request = replace(
+            self.from_loader(request_id, source.name, header, settings, found.load, listener),
+            frame=found.frame,
             T_frame_object=found.T_frame_object,
-            listener=listener,
-            timeless=timeless,
             object_key=found.key,
             known=found.known,
             surface=found.surface,
+        )
+        return replace(
+            request,
+            steering=self._steering(message, request, found),
             exclude=tuple(message.exclude),
             exclude_poses=tuple(
                 (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
                 for stamped in message.exclude_poses
             ),
-            steering=steering,
         )
 
-    def _steering(self, message: GraspRequest, found: SourceObject) -> Callable[[], Steering] | None:
+    def _steering(self, message: GraspRequest, request: Request, found: SourceObject) -> Callable[[], Steering] | None:
         """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
         if not asks_for_any(message):
             return None
-        named = message.header.frame_id
-        T = np.eye(4) if named in ("", found.frame) else self._lookup(found.frame, named, message.header.stamp)
-        if found.T_frame_object is not None:
-            T = np.linalg.inv(found.T_frame_object) @ T
-        steering = steering_of(message, T)
-        return (lambda: steering_of(message, T, found.shown)) if message.region_mask.height else (lambda: steering)
+        stamp, shown = message.header.stamp, found.shown
+        T_object_header = request.to_object(
+            message.header.frame_id, np.eye(4), lambda target, source: self._lookup(target, source, stamp)
+        )
+        steering = steering_of(message, T_object_header)
+        if not message.region_mask.height or shown is None:
+            return lambda: steering
+        return lambda: replace(steering, region=NearPoints(shown()))
 
     def from_loader(
         self,
@@ -144,7 +158,7 @@ class RequestBuilder:
         load: Callable[[], Scene],
         listener: Listener | None,
     ) -> Request:
-        """An object that is read already, in the frame of a header; an empty one is `mesh_frame`."""
+        """Return the request for an object in the frame of a header; an empty one is `mesh_frame`."""
         timeless = nanoseconds(header.stamp) == 0
         stamp = self._now() if timeless else header.stamp
         frame = header.frame_id or settings.mesh_frame
@@ -153,8 +167,161 @@ class RequestBuilder:
     def from_cluster(
         self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
     ) -> Request:
-        """A cloud that shows one object, in the frame of a header. Raises RequestError: it is too large or too old."""
+        """Return the request for a cloud that shows one object. Raises RequestError: it is too large or too old."""
         seen = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
-        seen.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        load = frame_loader(seen, settings, place_of(settings), self._lookup_in_time)
+        load = self._frame_loader(settings, seen)
         return self.from_loader(request_id, "grasp_planning", header, settings, load, listener)
+
+    def _frame_loader(self, settings: Settings, frame: SensorFrame) -> Callable[[], Scene]:
+        frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
+        return frame_loader(frame, settings, place_of(settings), self._lookup_in_time)
+
+
+def check_request(message: GraspRequest, hand: str) -> None:
+    """Refuse what no settings can make good. The source is checked where its row is looked up (`source_of`).
+
+    Raises RequestError: the field, what it holds and what is valid.
+    """
+    if message.id and not _ID.fullmatch(message.id):
+        shown = message.id[:MOST_ID]
+        raise bad_request(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
+    if message.hand not in ("", hand):
+        raise RequestError(
+            ErrorCode.WRONG_HAND, f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
+        )
+    if message.num_grasps > MOST_GRASPS:
+        raise bad_request(f"num_grasps: {message.num_grasps}; valid: 1 to {MOST_GRASPS}, 0 for the parameter")
+    # Presets by path are for the node's owner: a message must not have files read.
+    if message.preset not in ("", *preset_names()):
+        raise bad_request(
+            f"preset: {message.preset[:MOST_ID]!r}; valid: {', '.join(preset_names())}, empty for the parameter"
+        )
+    if message.seed < -1:
+        raise bad_request(f"seed: {message.seed}; valid: 0 or more, -1 for the parameter")
+    _check_range("time_budget", message.time_budget, BUDGETS, "s, 0 for the parameter")
+    _check_range("mesh_scale", message.mesh_scale, SCALES, "m, 0 for 1")
+    if len(message.cloud.data) > MOST_CLOUD_BYTES:
+        raise bad_request(f"cloud: {len(message.cloud.data)} bytes; at most {MOST_CLOUD_BYTES} are taken")
+    if message.use_target_point:
+        near(message.target_point, "target_point")
+    _check_camera_and_mask(message)
+    if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
+        raise bad_request(f"surface: with source {message.source}, whose cloud shows it; valid with MESH=1 and KNOWN=4")
+    if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
+        told = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
+        raise bad_request(
+            f"known_object: {message.known_object[:MOST_ID]!r} with {told}; valid with KNOWN=4, without mesh_uri"
+        )
+    if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
+        raise bad_request(
+            f"exclude: {len(message.exclude)} ids, {len(message.exclude_poses)} poses; valid: {MOST_EXCLUDED}"
+        )
+
+
+def _check_camera_and_mask(message: GraspRequest) -> None:
+    """Refuse a view point that is no place, and a mask beside another wish."""
+    if message.use_view_point:
+        near(message.view_point, "view_point")
+    if message.target_mask.height and (message.use_target_point or message.alone):
+        other = "target_point" if message.use_target_point else "alone"
+        raise bad_request(f"target_mask: {other} is given too; give one of target_point, target_mask and alone")
+    _check_mask_source(message, "target_mask", message.target_mask.height)
+
+
+def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
+    """Refuse a mask where the source has no image for it. Raises RequestError."""
+    if height and message.source not in _OF_ONE_CLOUD:
+        raise bad_request(f"{name}: with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
+
+
+def settings_of(message: GraspRequest, settings: Settings) -> Settings:
+    """The settings with what a checked request asks for itself."""
+    return replace(
+        settings,
+        num_grasps=message.num_grasps or settings.num_grasps,
+        preset=message.preset or settings.preset,
+        seed=settings.seed if message.seed < 0 else message.seed,
+        deadline=message.time_budget or settings.deadline,
+        mesh_scale=message.mesh_scale or 1.0,
+        segment=settings.segment and not message.alone,
+    )
+
+
+def _check_range(name: str, value: float, limits: tuple[float, float], unit: str) -> None:
+    low, high = limits
+    if not (value == 0 or low <= value <= high):
+        raise bad_request(f"{name}: {value!r}; valid: {low:g} to {high:g} {unit}")
+
+
+def asks_for_any(message: GraspRequest) -> bool:
+    """Whether a request asks for any place or direction at all."""
+    angles = message.approach_angle, message.roll, message.roll_tolerance
+    masked = message.region_mask.height > 0
+    return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, message.avoid))
+
+
+def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
+    """Return the wishes of a request in the object's frame, without its `region_mask`, which has to be read first.
+
+    Raises GraspdError: a field, what it holds and what is valid.
+    """
+    _check(message)
+    rotation = T_object_header[:3, :3]
+    region, direction = _region(message, T_object_header), _direction(message)
+    zero = None
+    if message.use_roll and np.isfinite(direction).all() and direction:
+        zero = tuple((rotation @ zero_of_roll(np.array(direction) / np.linalg.norm(direction))).tolist())
+    return Steering(
+        approach_direction=tuple((rotation @ direction).tolist()) if direction else None,
+        approach_angle=message.approach_angle or _DEFAULTS.approach_angle,
+        region=region,
+        avoid=[
+            _box("avoid", solid, pose, T_object_header)
+            for solid, pose in zip(message.avoid, message.avoid_poses, strict=True)
+        ],
+        roll=message.roll if message.use_roll else None,
+        roll_tolerance=message.roll_tolerance or _DEFAULTS.roll_tolerance,
+        roll_zero=zero,
+    )
+
+
+def _check(message: GraspRequest) -> None:
+    """Refuse wishes that lack another, and those that say the same twice."""
+    if message.approach_angle and not _direction(message):
+        raise bad_request("approach_angle: it needs approach_direction")
+    if (message.roll or message.roll_tolerance) and not message.use_roll:
+        raise bad_request("roll: use_roll is false; set it true to ask for a roll")
+    if message.region_mask.height and message.region.dimensions:
+        raise bad_request("region_mask: region is given too; give one of them")
+    _check_mask_source(message, "region_mask", message.region_mask.height)
+    if len(message.avoid) != len(message.avoid_poses) or len(message.avoid) > MOST_BOXES:
+        counts = f"{len(message.avoid)} boxes, {len(message.avoid_poses)} poses"
+        raise bad_request(f"avoid: {counts}; valid: one avoid_poses for each, at most {MOST_BOXES}")
+
+
+def _direction(message: GraspRequest) -> tuple[float, ...]:
+    """The approach asked for; empty where it is all 0."""
+    given = message.approach_direction.x, message.approach_direction.y, message.approach_direction.z
+    return given if any(given) else ()
+
+
+def _region(message: GraspRequest, T_object_header: Matrix) -> Box | Sphere | None:
+    solid = message.region
+    if not solid.dimensions:
+        return None
+    if solid.type == SolidPrimitive.SPHERE:
+        if len(solid.dimensions) != 1:
+            raise bad_request(f"region: {len(solid.dimensions)} dimensions; valid: the radius of a SPHERE")
+        pose = T_object_header @ pose_matrix(message.region_pose, "region_pose")
+        return Sphere(pose[:3, 3], float(solid.dimensions[0]))
+    return _box("region", solid, message.region_pose, T_object_header)
+
+
+def _box(name: str, solid: SolidPrimitive, pose: Pose, T_object_header: Matrix) -> Box:
+    valid = "BOX=1 or SPHERE=2" if name == "region" else "BOX=1"
+    if solid.type != SolidPrimitive.BOX or len(solid.dimensions) != 3:
+        raise bad_request(
+            f"{name}: type {solid.type} of {len(solid.dimensions)} dimensions; valid: {valid}, 3 lengths of a box"
+        )
+    placed = T_object_header @ pose_matrix(pose, f"{name}_pose{'s' * (name == 'avoid')}")
+    return Box(placed[:3, 3], list(solid.dimensions), wxyz_of_matrix(placed))

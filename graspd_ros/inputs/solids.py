@@ -1,26 +1,23 @@
-"""Shapes of messages as meshes: those of an object to grasp, and of a thing in a planning scene."""
+"""Shapes of messages: solids and meshes as triangle meshes, and the plane that an object stands on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Pose
 from shape_msgs.msg import Mesh, SolidPrimitive
+from shape_msgs.msg import Plane as PlaneMessage
 
-from graspd_core import TriangleMesh
-from graspd_ros.inputs.requests import pose_matrix
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_core import Scene, TriangleMesh
+from graspd_core.types import Plane
+from graspd_ros.convert import Matrix, moved_plane, moved_points, pose_matrix
+from graspd_ros.error_codes import RequestError, bad_request
 
-_BOX, _SPHERE, _CYLINDER, _CONE = (
-    SolidPrimitive.BOX,
-    SolidPrimitive.SPHERE,
-    SolidPrimitive.CYLINDER,
-    SolidPrimitive.CONE,
-)
-# How many dimensions each has in the message.
-_SIZES = {_BOX: 3, _SPHERE: 1, _CYLINDER: 2, _CONE: 2}
+# How many dimensions each kind of solid has in the message.
+_SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLINDER: 2, SolidPrimitive.CONE: 2}
 
 
 def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
@@ -47,10 +44,12 @@ def _placed(
         raise bad_message(owner, f"{kind}_poses: {len(poses)} poses of {len(shapes)} shapes; give one for each")
     parts = [make(shape, owner) for shape in shapes]
     matrices = [pose_matrix(pose, f"{owner}: {kind}_poses") for pose in poses] or [np.eye(4)] * len(parts)
-    return [
-        TriangleMesh(part.vertices @ T[:3, :3].T + T[:3, 3], part.faces)
-        for part, T in zip(parts, matrices, strict=True)
-    ]
+    return [moved_mesh(part, T) for part, T in zip(parts, matrices, strict=True)]
+
+
+def moved_mesh(mesh: TriangleMesh, T: Matrix) -> TriangleMesh:
+    """Return a mesh in another frame."""
+    return TriangleMesh(moved_points(mesh.vertices, T), mesh.faces)
 
 
 def _mesh(shape: Mesh, owner: str) -> TriangleMesh:
@@ -75,12 +74,12 @@ def _primitive(shape: SolidPrimitive, owner: str) -> TriangleMesh:
 def _solid(kind: int, sizes: np.ndarray) -> Any:
     import trimesh
 
-    if kind == _BOX:
+    if kind == SolidPrimitive.BOX:
         return trimesh.creation.box(extents=sizes)
-    if kind == _SPHERE:
+    if kind == SolidPrimitive.SPHERE:
         return trimesh.creation.icosphere(subdivisions=3, radius=sizes[0])
     height, radius = sizes[SolidPrimitive.CYLINDER_HEIGHT], sizes[SolidPrimitive.CYLINDER_RADIUS]
-    if kind == _CYLINDER:
+    if kind == SolidPrimitive.CYLINDER:
         return trimesh.creation.cylinder(radius=radius, height=height)
     # ROS centres a cone on half of its height.
     cone = trimesh.creation.cone(radius=radius, height=height)
@@ -90,4 +89,29 @@ def _solid(kind: int, sizes: np.ndarray) -> Any:
 
 def bad_message(owner: str, message: str) -> RequestError:
     """The error about something of a message."""
-    return RequestError(ErrorCode.BAD_REQUEST, f"{owner}: {message}")
+    return bad_request(f"{owner}: {message}")
+
+
+def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
+    """Return the support surface in the object's frame; None where its numbers are 0. Raises RequestError: no plane."""
+    a, b, c, d = map(float, surface.coef)
+    if not any((a, b, c, d)):
+        return None
+    length = float(np.linalg.norm([a, b, c]))
+    if not (np.isfinite([a, b, c, d]).all() and length > 0):
+        raise bad_request(f"surface: {[a, b, c, d]} is no plane; its first three numbers are the normal")
+    plane = Plane(np.array([a, b, c]) / length, -d / length)
+    return plane if T_object_frame is None else moved_plane(plane, T_object_frame)
+
+
+def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
+    """Return a loader of the scene with what the object stands on; its free side is where the object is."""
+    if plane is None:
+        return load
+
+    def loaded() -> Scene:
+        scene = load()
+        above = float(plane.normal @ scene.object.mesh.vertices.mean(0)) > plane.offset
+        return replace(scene, support=plane if above else Plane(-plane.normal, -plane.offset))
+
+    return loaded

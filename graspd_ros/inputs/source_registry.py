@@ -3,8 +3,10 @@ in `GraspRequest.msg`; nothing else is edited."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -13,25 +15,31 @@ from jaxtyping import Float
 from sensor_msgs.msg import Image
 
 from graspd_core import Scene, Target, load_scene
+from graspd_core.errors import MeshError
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane
-from graspd_ros.inputs.camera_place import CameraPlace, masked_cloud, place_of, seen_by_camera
-from graspd_ros.inputs.mesh_path import resolve_mesh
-from graspd_ros.inputs.requests import KnownObject, point_of, pose_matrix
+from graspd_ros.convert import Matrix, moved_points, nanoseconds, near, pose_matrix
+from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.inputs.sensor_frames import (
+    CameraPlace,
+    Lookup,
     SensorFrame,
     Views,
     cloud_frame,
-    nanoseconds,
+    masked_cloud,
+    place_of,
     scene_of_views,
+    seen_by_camera,
     trimmed,
     within,
 )
-from graspd_ros.inputs.support_surface import plane_of, with_support
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError
+from graspd_ros.inputs.solids import plane_of, with_support
 from graspd_ros.parameters import Settings
+from graspd_ros.request import KnownObject
 
-Lookup = Callable[[str, str, Time], np.ndarray]
+MOST_MESH_BYTES = 10**8  # an OBJ of some 1.5 million faces; reading more takes minutes and gigabytes
+MOST_PATH = 4096
+_FORMS = "a path, file:///path or package://package/path"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +83,7 @@ class SourceObject:
     frame: str
     stamp: Time
     load: Callable[[], Scene]
-    T_frame_object: Float[np.ndarray, "4 4"] | None = None
+    T_frame_object: Matrix | None = None
     key: str = ""
     known: KnownObject | None = None
     surface: Plane | None = None
@@ -103,22 +111,15 @@ def latest_frame(newest: SensorFrame | None, now: int, settings: Settings) -> Se
     return newest
 
 
-def mesh_loader(uri: str, settings: Settings) -> Callable[[], Scene]:
-    """A function that reads the mesh at a path or URI. Raises MeshError: it is out of reach."""
-    path = resolve_mesh(uri, settings.mesh_roots)
+def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
+    """Return a function that reads a mesh."""
     mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
     return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
 
 
-def mesh_key(uri: str, settings: Settings) -> str:
-    """Same for the same mesh in the same size, as long as the file is not written again."""
-    changed = resolve_mesh(uri, settings.mesh_roots).stat().st_mtime_ns
-    return f"mesh {uri} {changed} {settings.mesh_scale} {settings.mass} {settings.friction}"
-
-
-def known_mesh(uri: str, settings: Settings) -> KnownObject | None:
-    """What a library may know a mesh by; None where the node has no library."""
-    return KnownObject("", str(resolve_mesh(uri, settings.mesh_roots)), False) if settings.grasp_library else None
+def known_mesh(path: Path, settings: Settings) -> KnownObject | None:
+    """Return what a library may know a mesh by; None if the node has no library."""
+    return KnownObject("", str(path), False) if settings.grasp_library else None
 
 
 def frame_loader(
@@ -129,15 +130,9 @@ def frame_loader(
     point: Float[np.ndarray, "3"] | None = None,
     mask: Image | None = None,
 ) -> Callable[[], Scene]:
-    """A function that makes a scene of one frame.
+    """Return a function that makes a scene of what one camera showed; `lookup` is for the worker's thread.
 
-    Args:
-        frame: what a camera showed.
-        settings: workspace, thinning, and whether the object is alone.
-        place: where the camera stood.
-        lookup: for the worker's thread.
-        point: on or near the object meant, in the frame's own frame [m].
-        mask: its pixels that show the object meant; checked on loading.
+    A `point` on or near the object, in the frame's own frame [m], or a `mask` of its pixels says which one is meant.
     """
 
     def load() -> Scene:
@@ -159,22 +154,22 @@ def _from_cloud(given: SourceInput) -> SourceObject:
 
 
 def _from_mesh(given: SourceInput) -> SourceObject:
-    header = given.message.header
-    frame, pose = header.frame_id or given.settings.mesh_frame, pose_matrix(given.message.object_pose)
-    uri, settings = given.message.mesh_uri, given.settings
-    surface = plane_of(given.message.surface, np.linalg.inv(pose))
-    load = with_support(mesh_loader(uri, settings), surface)
-    known = known_mesh(uri, settings)
+    settings, uri = given.settings, given.message.mesh_uri
+    path = resolve_mesh(uri, settings.mesh_roots)
+    # Same for the same mesh in the same size, as long as the file is not written again.
+    key = f"mesh {uri} {path.stat().st_mtime_ns} {settings.mesh_scale} {settings.mass} {settings.friction}"
+    found = _placed(given, mesh_loader(path, settings), key, known_mesh(path, settings))
+    if found.surface is None:
+        return found
     # Grasps of an earlier run stand for another one where the same things stand about the object.
-    stands = "" if surface is None else f" {surface.normal.round(4)} {surface.offset:.4f}"
-    key = mesh_key(uri, settings) + stands
-    return SourceObject(frame, header.stamp, load, pose, key, known=known, surface=surface)
+    stands = f" {found.surface.normal.round(4)} {found.surface.offset:.4f}"
+    return replace(found, key=found.key + stands)
 
 
 def _from_known(given: SourceInput) -> SourceObject:
     message, settings = given.message, given.settings
     if not settings.grasp_library:
-        raise RequestError(ErrorCode.BAD_REQUEST, "source: KNOWN=4, and the parameter grasp_library names no library")
+        raise bad_request("source: KNOWN=4, and the parameter grasp_library names no library")
     if not message.known_object:
         found = _from_mesh(given)
         return replace(found, known=found.known and replace(found.known, required=True))
@@ -182,11 +177,23 @@ def _from_known(given: SourceInput) -> SourceObject:
     from graspd_ros.known_objects import named_loader
 
     known = KnownObject(message.known_object, "", True)
-    pose, header = pose_matrix(message.object_pose), message.header
+    return _placed(given, named_loader(known, settings), f"known {message.known_object}", known)
+
+
+def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: KnownObject | None) -> SourceObject:
+    """An object that is known whole, where the request says that it stands."""
+    message = given.message
+    header, pose = message.header, pose_matrix(message.object_pose)
     surface = plane_of(message.surface, np.linalg.inv(pose))
-    load = with_support(named_loader(known, settings), surface)
-    frame, key = header.frame_id or settings.mesh_frame, f"known {message.known_object}"
-    return SourceObject(frame, header.stamp, load, pose, key, known=known, surface=surface)
+    return SourceObject(
+        header.frame_id or given.settings.mesh_frame,
+        header.stamp,
+        with_support(load, surface),
+        pose,
+        key,
+        known=known,
+        surface=surface,
+    )
 
 
 def _from_latest_cloud(given: SourceInput) -> SourceObject:
@@ -215,7 +222,7 @@ def source_of(message: GraspRequest) -> Source:
     """The row of the source that a request names. Raises RequestError: there is none."""
     if message.source not in SOURCES:
         valid = ", ".join(f"{source.name.upper()}={number}" for number, source in SOURCES.items())
-        raise RequestError(ErrorCode.BAD_REQUEST, f"source: {message.source}; valid: {valid}")
+        raise bad_request(f"source: {message.source}; valid: {valid}")
     return SOURCES[message.source]
 
 
@@ -238,8 +245,69 @@ def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
     message = given.message
     if not message.use_target_point:
         return None
-    point, named = point_of(message), message.header.frame_id
+    point, named = near(message.target_point, "target_point"), message.header.frame_id
     if named in ("", frame):
         return point
-    pose = given.lookup(frame, named, message.header.stamp)
-    return pose[:3, :3] @ point + pose[:3, 3]
+    return moved_points(point[None], given.lookup(frame, named, message.header.stamp))[0]
+
+
+def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
+    """Return the file that `uri` names: a path, `file://` or `package://`; relative paths start at the first root.
+
+    Links are followed before the file is compared with the roots, so a link inside a root does not lead out of it.
+    A root may itself be a `package://` name; one whose package is not installed is left out.
+    Raises MeshError: an unknown form or package, a path outside every root, no such file, a file too large.
+    """
+    uri = uri.strip()
+    if len(uri) > MOST_PATH:
+        raise MeshError(f"the mesh path is {len(uri)} characters long; at most {MOST_PATH} are looked at")
+    if not uri:
+        raise MeshError(f"the mesh path is empty; give {_FORMS}")
+    allowed = allowed_roots(roots)
+    if not allowed:
+        raise MeshError(f"{uri}: no mesh may be read, since mesh_roots {list(roots)} names no directory")
+    try:
+        path = (allowed[0] / _local_path(uri)).resolve()
+        if not any(path.is_relative_to(root) for root in allowed):
+            raise MeshError(f"{uri}: outside the allowed mesh_roots: {', '.join(map(str, allowed))}")
+        if not path.is_file():
+            kind = "a directory, not a mesh file" if path.is_dir() else "no such file"
+            raise MeshError(f"{uri}: {kind} (looked at {path})")
+        if (size := path.stat().st_size) > MOST_MESH_BYTES:
+            raise MeshError(f"{uri}: {size / 1e6:.0f} MB; at most {MOST_MESH_BYTES / 1e6:.0f} MB are read")
+    except (OSError, ValueError) as error:
+        raise MeshError(f"{uri!r}: not a usable path: {error}") from None
+    return path
+
+
+def allowed_roots(roots: Sequence[str]) -> list[Path]:
+    """The directories behind `mesh_roots`, links followed; those that do not exist are left out."""
+    found = []
+    for root in roots:
+        try:
+            path = _local_path(root).expanduser().resolve()
+        except MeshError:
+            continue  # a package that is not installed holds nothing to read
+        if path.is_dir():
+            found.append(path)
+    return found
+
+
+def _local_path(uri: str) -> Path:
+    if "://" not in uri:
+        return Path(uri)
+    parts = urlsplit(uri)
+    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
+        return Path(unquote(parts.path))
+    if parts.scheme == "package":
+        return _package_share(parts.netloc, uri) / unquote(parts.path).lstrip("/")
+    raise MeshError(f"{uri}: unknown form; give {_FORMS}")
+
+
+def _package_share(package: str, uri: str) -> Path:
+    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+    try:
+        return Path(get_package_share_directory(package))
+    except (PackageNotFoundError, ValueError, OSError):  # ValueError: a malformed name; OSError: no AMENT_PREFIX_PATH
+        raise MeshError(f"{uri}: package {package!r} is not installed") from None

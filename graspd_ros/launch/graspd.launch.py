@@ -13,44 +13,23 @@ from launch_ros.actions import Node
 
 from graspd_core.paths import config_dir
 
-PARAMETERS = {
-    "hand": "name or path of the hand",
-    "hand_prefix": "put before the names of the hand's joints and links",
-    "output_frame": "frame of the results, by /tf",
-    "sensor_frame": "frame at whose origin the camera of clouds stood, by /tf",
-    "use_sim_time": "whether /clock tells the time",
+# What differs from robot to robot, by name: the default, and what it is.
+ARGUMENTS = {
+    "points": ("points", "PointCloud2 topic to listen to"),
+    "depth_image": ("depth/image_rect", "depth image topic to listen to"),
+    "camera_info": ("depth/camera_info", "CameraInfo topic of the depth image"),
+    "hand": ("", "name or path of the hand"),
+    "hand_prefix": ("", "put before the names of the hand's joints and links"),
+    "output_frame": ("", "frame of the results, by /tf"),
+    "sensor_frame": ("", "frame at whose origin the camera of clouds stood, by /tf"),
+    "params": (str(config_dir() / "graspd.yaml"), "parameter file"),
+    "name": ("graspd", "name of the node"),
+    "namespace": ("", "namespace of the node"),
+    "use_sim_time": ("", "whether /clock tells the time"),
+    "large_clouds": ("false", "share 64 MB instead of 512 KB with this machine's cameras; they must do so too"),
+    "respawn": ("false", "start the node again when it dies"),
 }
-
-
-def _arguments() -> list[DeclareLaunchArgument]:
-    """What differs from robot to robot."""
-
-    def told(name: str) -> str:
-        return f"{PARAMETERS[name]}; empty: as the parameter file says"
-
-    return [
-        DeclareLaunchArgument("points", default_value="points", description="PointCloud2 topic to listen to"),
-        DeclareLaunchArgument(
-            "depth_image", default_value="depth/image_rect", description="depth image topic to listen to"
-        ),
-        DeclareLaunchArgument(
-            "camera_info", default_value="depth/camera_info", description="CameraInfo topic of the depth image"
-        ),
-        DeclareLaunchArgument("hand", default_value="", description=told("hand")),
-        DeclareLaunchArgument("hand_prefix", default_value="", description=told("hand_prefix")),
-        DeclareLaunchArgument("output_frame", default_value="", description=told("output_frame")),
-        DeclareLaunchArgument("sensor_frame", default_value="", description=told("sensor_frame")),
-        DeclareLaunchArgument("params", default_value=str(config_dir() / "graspd.yaml"), description="parameter file"),
-        DeclareLaunchArgument("name", default_value="graspd", description="name of the node"),
-        DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
-        DeclareLaunchArgument("use_sim_time", default_value="", description=told("use_sim_time")),
-        DeclareLaunchArgument(
-            "large_clouds",
-            default_value="false",
-            description="share 64 MB instead of 512 KB with this machine's cameras; they must do so too",
-        ),
-        DeclareLaunchArgument("respawn", default_value="false", description="start the node again when it dies"),
-    ]
+PARAMETERS = ("hand", "hand_prefix", "output_frame", "sensor_frame", "use_sim_time")
 
 
 def given(values: dict[str, str]) -> dict[str, str | bool]:
@@ -59,6 +38,12 @@ def given(values: dict[str, str]) -> dict[str, str | bool]:
     if "use_sim_time" in typed:
         typed["use_sim_time"] = values["use_sim_time"].lower() in ("true", "1")
     return typed
+
+
+def _argument(name: str) -> DeclareLaunchArgument:
+    default, told = ARGUMENTS[name]
+    told += "; empty: as the parameter file says" if name in PARAMETERS else ""
+    return DeclareLaunchArgument(name, default_value=default, description=told)
 
 
 def _node(context) -> list[Node]:
@@ -84,14 +69,9 @@ def _node(context) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     """One node, with arguments on the command line."""
-    return LaunchDescription(
-        [
-            *_arguments(),
-            SetEnvironmentVariable(
-                "FASTRTPS_DEFAULT_PROFILES_FILE",
-                str(config_dir() / "fastdds.xml"),
-                condition=IfCondition(LaunchConfiguration("large_clouds")),
-            ),
-            OpaqueFunction(function=_node),
-        ]
+    large_clouds = SetEnvironmentVariable(
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        str(config_dir() / "fastdds.xml"),
+        condition=IfCondition(LaunchConfiguration("large_clouds")),
     )
+    return LaunchDescription([*map(_argument, ARGUMENTS), large_clouds, OpaqueFunction(function=_node)])

@@ -11,8 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Vector3
-from jaxtyping import Float
+from geometry_msgs.msg import Point, Pose
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -20,8 +19,7 @@ from graspd_core import HandModel
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import Primitive
 from graspd_core.types import Contact, Grasp, Posture, Verdict
-from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
-from graspd_ros.outputs.status_json import pose_of
+from graspd_ros.convert import Matrix, matrix_of_posture, point_of, pose_of_matrix, vector_of
 
 IDS_OF_A_GRASP = 1000
 GEOMETRIES = ("visual", "collision")
@@ -40,8 +38,6 @@ _AXIS_LENGTH = 0.05
 _ARROW_LENGTH = 0.03
 _TEXT_HEIGHT = 0.015
 _TEXT_ABOVE = 0.12
-
-Matrix = Float[np.ndarray, "4 4"]
 
 
 def result_markers(
@@ -75,7 +71,7 @@ def result_markers(
 def _parts_of(
     grasp: Grasp, rank: int, hand: HandModel, solids: Sequence[Primitive]
 ) -> dict[str, Callable[[], Iterable[Marker]]]:
-    T_frame_base, colour = matrix_of_pose(pose_of(grasp.grasp)), COLOURS[grasp.verdict]
+    T_frame_base, colour = matrix_of_posture(grasp.grasp), COLOURS[grasp.verdict]
     return {
         "hand": lambda: _hand(hand, solids, grasp.grasp, colour),
         "pregrasp": lambda: _faint(_hand(hand, solids, grasp.pregrasp, colour)),
@@ -96,7 +92,7 @@ def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
     """The way that the hand would have come, in red, and what the trial said."""
     start, end = grasp.pregrasp.position, grasp.grasp.position
     yield _arrow(np.asarray(start), np.asarray(end), COLOURS[Verdict.FAILED])
-    text = _text(grasp, rank, matrix_of_pose(pose_of(grasp.grasp)))
+    text = _text(grasp, rank, matrix_of_posture(grasp.grasp))
     text.color = _colour(COLOURS[Verdict.FAILED], 1.0)
     yield text
 
@@ -105,14 +101,14 @@ def _hand(
     hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
 ) -> Iterator[Marker]:
     """The solids; a capsule is a cylinder and two balls."""
-    T_frame_base = matrix_of_pose(pose_of(posture))
+    T_frame_base = matrix_of_posture(posture)
     rotations, translations = link_poses(hand, posture.joint_positions)
     for solid in solids:
         T_base_link = _matrix(rotations[solid.link], translations[solid.link])
         T = T_frame_base @ T_base_link @ _matrix(solid.rotation, solid.translation)
         pose, size = pose_of_matrix(T), solid.size
         if solid.kind == "hull":
-            marker = Marker(type=Marker.TRIANGLE_LIST, pose=pose, scale=_vector(1, 1, 1), color=_colour(colour))
+            marker = Marker(type=Marker.TRIANGLE_LIST, pose=pose, scale=vector_of((1, 1, 1)), color=_colour(colour))
             marker.points = _corners(solid)
             yield marker
         elif solid.kind == "box":
@@ -131,7 +127,7 @@ def _hand(
 @lru_cache(maxsize=256)
 def _corners(mesh: Primitive) -> list[Point]:
     """The corners of its triangles, in its own frame."""
-    return [_point(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
+    return [point_of(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
 
 
 def _contact(contact: Contact) -> Marker:
@@ -159,21 +155,21 @@ def _text(grasp: Grasp, rank: int, T_frame_base: Matrix) -> Marker:
     return Marker(
         type=Marker.TEXT_VIEW_FACING,
         pose=pose_of_matrix(above),
-        scale=_vector(0, 0, _TEXT_HEIGHT),
+        scale=vector_of((0, 0, _TEXT_HEIGHT)),
         color=_colour((1.0, 1.0, 1.0), 1.0),
         text="\n".join(lines),
     )
 
 
 def _solid(kind: int, pose: Pose, size: np.ndarray, colour: tuple[float, float, float]) -> Marker:
-    return Marker(type=kind, pose=pose, scale=_vector(*size), color=_colour(colour))
+    return Marker(type=kind, pose=pose, scale=vector_of(size), color=_colour(colour))
 
 
 def _arrow(tail: np.ndarray, tip: np.ndarray, colour: tuple[float, float, float]) -> Marker:
     # Points are in the header's frame; RViz wants the pose beside them to be a rotation all the same.
-    marker = Marker(type=Marker.ARROW, scale=_vector(0.004, 0.008, 0.01), color=_colour(colour, 1.0))
+    marker = Marker(type=Marker.ARROW, scale=vector_of((0.004, 0.008, 0.01)), color=_colour(colour, 1.0))
     marker.pose.orientation.w = 1.0
-    marker.points = [_point(tail), _point(tip)]
+    marker.points = [point_of(tail), point_of(tip)]
     return marker
 
 
@@ -181,15 +177,6 @@ def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Matrix:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation
     return T
-
-
-def _point(position: np.ndarray) -> Point:
-    x, y, z = map(float, position)
-    return Point(x=x, y=y, z=z)
-
-
-def _vector(x: float, y: float, z: float) -> Vector3:
-    return Vector3(x=float(x), y=float(y), z=float(z))
 
 
 def _colour(rgb: tuple[float, float, float], alpha: float = 0.8) -> ColorRGBA:

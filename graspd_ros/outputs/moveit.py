@@ -14,13 +14,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, Vector3
+from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import Grasp
-from jaxtyping import Float
 from trajectory_msgs.msg import JointTrajectory
 
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
+from graspd_ros.convert import Matrix, matrix_of_pose, nanoseconds, pose_of_matrix, set_nanoseconds, vector_of
 
 # A hand that comes this much of the way is near enough to go on, as MoveIt asks for a least distance.
 _LEAST_APPROACH = 0.5
@@ -36,7 +35,7 @@ def moveit_grasp(
     retreat: tuple[float, float, float],
     retreat_frame: str,
     retreat_distance: float = 0.1,
-    T_parent_base: Float[np.ndarray, "4 4"] | None = None,
+    T_parent_base: Matrix | None = None,
     effort: Sequence[float] = (),
     messages: ModuleType | None = None,
 ) -> Any:
@@ -62,8 +61,7 @@ def moveit_grasp(
     if not (np.isfinite(up).all() and up.any()):
         raise ConfigError(f"retreat: {retreat}; it must be a direction")
     messages = messages or _moveit_messages()
-    pregrasp = matrix_of_pose(grasp.pregrasp_pose)
-    way = matrix_of_pose(grasp.grasp_pose)[:3, 3] - pregrasp[:3, 3]
+    way = matrix_of_pose(grasp.grasp_pose)[:3, 3] - matrix_of_pose(grasp.pregrasp_pose)[:3, 3]
     pose = grasp.mount_grasp_pose if grasp.mount_link else grasp.grasp_pose
     if T_parent_base is not None:
         pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ np.linalg.inv(T_parent_base))
@@ -84,10 +82,9 @@ def moveit_grasp(
 
 def _posture(grasp: Grasp, points: list[Any], since: Any = None) -> JointTrajectory:
     """Some points of the trajectory, times counted from `since`."""
-    began = _nanoseconds(since.time_from_start) if since else 0
+    began = nanoseconds(since.time_from_start) if since else 0
     for point in points:
-        seconds, nanoseconds = divmod(_nanoseconds(point.time_from_start) - began, 1_000_000_000)
-        point.time_from_start.sec, point.time_from_start.nanosec = seconds, nanoseconds
+        set_nanoseconds(point.time_from_start, nanoseconds(point.time_from_start) - began)
     return JointTrajectory(
         header=grasp.trajectory.header, joint_names=list(grasp.trajectory.joint_names), points=points
     )
@@ -95,15 +92,10 @@ def _posture(grasp: Grasp, points: list[Any], since: Any = None) -> JointTraject
 
 def _translation(messages: ModuleType, direction: np.ndarray, frame: str, distance: float) -> Any:
     length = math.hypot(*direction)
-    x, y, z = (float(value) for value in (direction / length if length else direction))
     translation = messages.GripperTranslation(desired_distance=distance, min_distance=_LEAST_APPROACH * distance)
     translation.direction.header.frame_id = frame
-    translation.direction.vector = Vector3(x=x, y=y, z=z)
+    translation.direction.vector = vector_of(direction / length if length else direction)
     return translation
-
-
-def _nanoseconds(duration: Any) -> int:
-    return duration.sec * 1_000_000_000 + duration.nanosec
 
 
 def _moveit_messages() -> ModuleType:

@@ -6,30 +6,39 @@ Clouds that come unasked are the exception: those that gave way to a newer one b
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import threading
 import time
 import traceback
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import GraspArray, GraspProgress
 from rclpy.node import Node
-from std_msgs.msg import Header
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from graspd_core import HandModel
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import Primitive
-from graspd_core.types import Progress, ProgressHook, Stage
-from graspd_ros.counters import Counters
-from graspd_ros.inputs.requests import MOST_ID, Listener, Request
+from graspd_core.io.grasps_json import grasp_figures
+from graspd_core.types import Grasp, GraspResult, Progress, ProgressHook, Stage, Verdict
+from graspd_ros.diagnostics import ACCEPTED, SUPERSEDED, Counters
+from graspd_ros.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs import messages
-from graspd_ros.outputs import status_json as convert
-from graspd_ros.outputs.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs.markers import result_markers
-from graspd_ros.outputs.publishers import Publishers
-from graspd_ros.outputs.trajectory import Pace
+from graspd_ros.outputs.messages import Pace
 from graspd_ros.parameters import Settings
-from graspd_ros.request_planner import Planned, limited
+from graspd_ros.request import MOST_ID, Listener, Request
+from graspd_ros.request_planner import Planned
 from graspd_ros.worker import Admission, Refusal, Report, WorkerEnding
 
 COUNT_PERIOD = 1.0  # seconds between two counts of superseded clouds, and between two complaints about clouds
@@ -44,6 +53,67 @@ _ENDINGS = {
         GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, "a newer request took its place"
     ),
 }
+
+SHOWN = {
+    JointState: "~/joint_states",
+    PoseStamped: "~/grasp_pose",
+    JointTrajectory: "~/trajectory",
+    MarkerArray: "~/markers",
+}
+# Late joiners get the last of these.
+LATCHED = {GraspArray: "~/grasps", **SHOWN}
+
+
+class Publishers:
+    """One publisher for each type of message."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        self._closed = False
+        self._publishers: dict[type, Any] = {
+            # Latched: who is discovered after the start, or after a restart, still hears that the node is ready.
+            String: node.create_publisher(
+                String, "~/status", QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            ),
+            GraspProgress: node.create_publisher(GraspProgress, "~/progress", 50),
+        }
+        self._publishers |= {kind: self._latched(kind) for kind in LATCHED}
+
+    def _latched(self, kind: type) -> Any:
+        return self._node.create_publisher(
+            kind,
+            LATCHED[kind],
+            QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def publish(self, message: Any) -> None:
+        """Publish on the topic of the message's type; nothing after `close`."""
+        with self._lock:
+            if not self._closed:
+                self._publishers[type(message)].publish(message)
+
+    def tell(self, event: str, request_id: str, source: str, **details: Any) -> None:
+        """One event on ~/status."""
+        stamp = self._node.get_clock().now().nanoseconds * 1e-9
+        line = {"event": event, "request": request_id, "source": source, "stamp": stamp, **details}
+        self.publish(String(data=status_line(line)))
+
+    def forget(self) -> None:
+        """Late joiners get none of the poses, joint values and markers from before now.
+
+        Answers stay: a new publisher has to be found by its readers first, and those that follow at once were lost.
+        """
+        with self._lock:
+            for kind in SHOWN:
+                self._node.destroy_publisher(self._publishers[kind])
+                self._publishers[kind] = self._latched(kind)
+
+    def close(self) -> None:
+        """Publish no more."""
+        with self._lock:
+            self._closed = True
 
 
 class Responses:
@@ -72,9 +142,7 @@ class Responses:
             code, message = _REFUSALS[admission.refusal], admission.reason
             self.publishers.tell("refused", request.id, request.source, code=code, message=message)
             self._log().warning(f"{request.id}: refused: {message}")
-            self._publish(
-                self._answer(request, messages.AnswerEnding(GraspArray.REFUSED, code, message)), request.listener
-            )
+            self._end(request, messages.AnswerEnding(GraspArray.REFUSED, code, message))
         elif not request.only_newest:
             self._accepted(request, admission.ahead)
 
@@ -103,7 +171,7 @@ class Responses:
         self._log().warning(f"refused: {message}")
 
     def _accepted(self, request: Request, ahead: int) -> None:
-        self.counters.count("accepted")
+        self.counters.count(ACCEPTED)
         self.publishers.tell("accepted", request.id, request.source, ahead=ahead)
         if ahead:
             self._report(request, messages.queued_message(request.id, request.frame_out, self._now(), ahead))
@@ -118,27 +186,27 @@ class Responses:
 
     def progress_hook(self, request: Request) -> ProgressHook:
         """Tells of the request's progress, not too often."""
-        lowest = math.inf
+        lowest, last, period = math.inf, -math.inf, 1 / request.settings.progress_rate
 
         def tell(progress: Progress) -> None:
-            nonlocal lowest
-            elapsed = request.elapsed()
+            nonlocal lowest, last
+            if (now := time.monotonic()) - last < period:
+                return
+            last, elapsed = now, request.elapsed()
             if progress.stage is Stage.OPTIMISE and progress.step:
                 lowest = min(lowest, progress.best)
             progress = dataclasses.replace(progress, best=lowest if math.isfinite(lowest) else 0.0)
-            event = {**convert.progress_event(progress), "elapsed": elapsed}
+            event = {**progress_event(progress), "elapsed": elapsed}
             self.publishers.tell("progress", request.id, request.source, **event)
             message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
             self._report(request, message)
-
-        limited_tell = limited(tell, request.settings.progress_rate)
 
         def hook(progress: Progress) -> None:
             if progress.found is not None and request.listener is not None:
                 rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
                 found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
                 request.listener.found(found)
-            limited_tell(progress)
+            tell(progress)
 
         return hook
 
@@ -163,14 +231,12 @@ class Responses:
         if report.error is not None:
             self.tell_error(request.id, request.source, report.error)
             code, message = code_of(report.error), sentence_of(report.error)
-            self._publish(
-                self._answer(request, messages.AnswerEnding(GraspArray.FAILED, code, message)), request.listener
-            )
+            self._end(request, messages.AnswerEnding(GraspArray.FAILED, code, message))
         elif report.ending is WorkerEnding.DONE and report.value is not None:
             self._result(request, report.value)
         elif report.ending is WorkerEnding.SUPERSEDED and request.only_newest and report.value is None:
             self._superseded += 1
-            self.counters.count("clouds_superseded")
+            self.counters.count(SUPERSEDED)
             if time.monotonic() - self._superseded_told >= COUNT_PERIOD:
                 self._tell_superseded(request.id)
         else:
@@ -183,12 +249,12 @@ class Responses:
         result, hand = planned.result, self._hand
         # Everything is made before anything is published: a result that cannot be told is an error as a whole.
         answer = self._answer(request, messages.ending_of(result))
-        event = convert.result_event(result)
+        event = result_event(result)
         shown = []
-        best = convert.presentable(result)
+        best = presentable(result)
         if best is not None:
-            shown.append(convert.joint_message(best.grasp, hand, request.stamp))
-            shown.append(convert.pose_message(best, request.frame_out, request.stamp))
+            shown.append(messages.joint_message(best.grasp, hand, request.stamp))
+            shown.append(messages.pose_message(best, request.frame_out, request.stamp))
             shown.append(next(iter(answer.grasps)).trajectory)
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
@@ -218,6 +284,9 @@ class Responses:
     def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
         return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, _pace(request))
+
+    def _end(self, request: Request, ending: messages.AnswerEnding) -> None:
+        self._publish(self._answer(request, ending), request.listener)
 
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
         self.counters.answered(message)
@@ -261,3 +330,58 @@ class Responses:
 def _pace(request: Request) -> Pace:
     settings = request.settings
     return Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
+
+
+def presentable(result: GraspResult) -> Grasp | None:
+    """The best grasp, if it is as sure as was asked for: one known to be bad or less sure is never published as one."""
+    best = result.grasps[0] if result.grasps else None
+    return best if best is not None and best.usable else None
+
+
+def progress_event(progress: Progress) -> dict[str, Any]:
+    """A progress report; `fraction` is that of its stage."""
+    told = {name: value for name, value in vars(progress).items() if name != "found"}
+    return {**told, "fraction": messages.fraction_of(progress)}
+
+
+def result_event(result: GraspResult) -> dict[str, Any]:
+    """Outcome, counts, timing and the best grasp's figures; `best` is null when no grasp is worth publishing."""
+    best = presentable(result)
+    return {
+        "outcome": result.outcome.name.lower(),
+        "message": result.message or result.outcome.value,
+        "warnings": list(result.warnings),
+        "grasps": len(result.grasps),
+        "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
+        "timing": dataclasses.asdict(result.timing),
+        "audits": dataclasses.asdict(result.audits),
+        "best": None if best is None else _summary(best),
+    }
+
+
+def _summary(grasp: Grasp) -> dict[str, Any]:
+    pose = grasp.grasp
+    return {
+        "verdict": grasp.verdict,
+        "score": grasp.score,
+        "probability": grasp.probability,
+        "position": [float(value) for value in pose.position],
+        "quaternion_wxyz": [float(value) for value in pose.quaternion_wxyz],
+        "links": [contact.link for contact in grasp.contacts],
+        **grasp_figures(grasp),
+    }
+
+
+def status_line(event: dict[str, Any]) -> str:
+    """One JSON object on one line; numbers that JSON does not know become null."""
+    return json.dumps(_finite(event), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

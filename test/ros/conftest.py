@@ -21,10 +21,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
 from rcl_interfaces.srv import SetParameters
+from rclpy.action.client import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
@@ -160,8 +162,21 @@ class Client:
         service = self._services.get(name) or self.node.create_client(kind, f"/graspd/{name}")
         self._services[name] = service
         self.spin_until(service.service_is_ready, f"service {name}")
-        future = service.call_async(request or kind.Request())
-        return self.spin_until(lambda: future.done() and future.result(), f"answer of {name}")
+        return self.done(service.call_async(request or kind.Request()), f"answer of {name}")
+
+    def actions(self, kind: Any, name: str, **qos: Any) -> ActionClient:
+        """A client of an action that the node serves."""
+        found = ActionClient(self.node, kind, f"/graspd/{name}", **qos)
+        self.spin_until(found.server_is_ready, "action server")
+        return found
+
+    def done(self, future: Any, what: str) -> Any:
+        """Wait for what a future gives."""
+        return self.spin_until(lambda: future.done() and future.result(), what)
+
+    def send_goal(self, actions: ActionClient, goal: Any, tell: Callable[[Any], Any] | None = None) -> Any:
+        """Send a goal and wait until it is taken or not; gives its handle."""
+        return self.done(actions.send_goal_async(goal, feedback_callback=tell), "answer to a goal")
 
     def send_cancel(self, request_id: str) -> None:
         self._cancel.publish(String(data=request_id))
@@ -237,6 +252,38 @@ def cloud_message(points: np.ndarray, frame: str = "camera") -> PointCloud2:
     message.header.frame_id = frame
     message.data = array.array("B", data.tobytes())
     return message
+
+
+@pytest.fixture(scope="session")
+def seen_ball() -> np.ndarray:
+    """The half of a ball of 35 mm that a camera at the origin sees, 0.5 m ahead [m]."""
+    directions = np.random.default_rng(0).normal(size=(8000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.array([0.0, 0.0, 0.5]) + 0.035 * directions[directions[:, 2] < 0]
+
+
+@pytest.fixture(scope="session")
+def typestore() -> Any:
+    """rosbags' own reading of the definitions, which shares no code with rosidl."""
+    store, types = get_typestore(Stores.ROS2_JAZZY), {}
+    for file in (Path(__file__).parents[2] / "msg_defs" / "msg").glob("*.msg"):
+        types |= get_types_from_msg(file.read_text(), f"graspd_msgs/msg/{file.stem}")
+    store.register(types)
+    return store
+
+
+def _agree(theirs: Any, ours: Any) -> bool:
+    if hasattr(ours, "get_fields_and_field_types"):
+        return all(_agree(getattr(theirs, name), getattr(ours, name)) for name in ours.get_fields_and_field_types())
+    if isinstance(ours, list | array.array | np.ndarray):
+        return len(theirs) == len(ours) and all(map(_agree, theirs, ours))
+    return theirs == ours
+
+
+@pytest.fixture(scope="session")
+def agree() -> Callable[[Any, Any], bool]:
+    """Whether a message of rosbags' carries what one of rclpy's does."""
+    return _agree
 
 
 @pytest.fixture(scope="session")

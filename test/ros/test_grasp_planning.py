@@ -15,7 +15,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose
 from grasping_msgs.action import GraspPlanning
 from grasping_msgs.msg import Object
-from rclpy.action.client import ActionClient
 from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -24,9 +23,9 @@ from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import cloud_from_depth
+from graspd_ros.error_codes import code_of
 from graspd_ros.grasp_planning import PlanningMessages, request_from_goal
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.outputs.error_codes import code_of
 from graspd_ros.parameters import Settings
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "moveit_client.py"
@@ -60,8 +59,7 @@ def cluster(make_cloud) -> Object:
 
 @pytest.fixture
 def planning(client, node):
-    actions = ActionClient(client.node, GraspPlanning, "/graspd/grasp_planning")
-    client.spin_until(actions.server_is_ready, "action server")
+    actions = client.actions(GraspPlanning, "grasp_planning")
     client.set_parameters(**FEW)
     yield actions
     actions.destroy()
@@ -71,10 +69,8 @@ def ask(client, planning, target: Object, group: str = "") -> tuple[int, list, l
     """How a goal ended, its grasps, and how many each feedback told of before."""
     feedback: list[int] = []
     goal = GraspPlanning.Goal(object=target, group_name=group)
-    sent = planning.send_goal_async(goal, feedback_callback=lambda m: feedback.append(len(m.feedback.grasps)))
-    handle = client.spin_until(lambda: sent.done() and sent.result(), "answer to a goal")
-    asked = handle.get_result_async()
-    ended = client.spin_until(lambda: asked.done() and asked.result(), "result")
+    handle = client.send_goal(planning, goal, lambda message: feedback.append(len(message.feedback.grasps)))
+    ended = client.done(handle.get_result_async(), "result")
     return ended.status, list(ended.result.grasps), feedback
 
 

@@ -19,12 +19,11 @@ from std_msgs.msg import Header
 from graspd_core.errors import GraspdError
 from graspd_core.io.bags import add_transforms
 from graspd_core.transforms import TransformBuffer
-from graspd_ros.inputs.depth_stream import ImagePairs
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.requests import Request
-from graspd_ros.inputs.sensor_frames import cloud_frame, depth_sensor_frame
-from graspd_ros.outputs.status_json import status_line
+from graspd_ros.inputs.sensor_frames import ImagePairs, cloud_frame, depth_sensor_frame
+from graspd_ros.outputs.responses import status_line
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
 
 HAND = "allegro_right"
 floats = st.one_of(st.floats(), st.sampled_from([0.0, 1.0, np.nan, np.inf, -np.inf, 1e308, 5e-324]))
@@ -119,8 +118,8 @@ def test_any_cloud_is_read_or_refused_in_one_line(message: PointCloud2, now: Tim
 @given(image=images, info=infos)
 def test_any_depth_image_is_read_or_refused_in_one_line(image: Image, info: CameraInfo):
     pairs = ImagePairs()
-    pairs.add_image(image)
-    pairs.add_info(info)
+    pairs.add(image)
+    pairs.add(info)
     info.header.frame_id = image.header.frame_id
     view, _ = refused(depth_sensor_frame(image, info, 5).read)
     if view is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -15,13 +14,6 @@ LONG = {"num_grasps": 256, "preset": "accurate", "deadline": 600.0, "busy_policy
 HAND_LENGTH = 0.25  # metres; the base of a hand that holds something is within this of it
 
 pytestmark = pytest.mark.timeout(300)
-
-
-def seen_from_the_camera(count: int = 4000) -> np.ndarray:
-    """The half of a 35 mm sphere that a camera at the origin sees, 0.5 m ahead [m]."""
-    directions = np.random.default_rng(0).normal(size=(2 * count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.array([0.0, 0.0, 0.5]) + 0.035 * directions[directions[:, 2] < 0]
 
 
 def position_of(pose) -> np.ndarray:
@@ -53,9 +45,9 @@ def test_a_mesh_becomes_progress_and_a_grasp(client, node):
     assert order == ["accepted", *["progress"] * (len(order) - 2), "result"]
 
 
-def test_a_cloud_becomes_a_grasp_in_its_own_frame(client, node, make_cloud):
+def test_a_cloud_becomes_a_grasp_in_its_own_frame(client, node, make_cloud, seen_ball):
     client.set_parameters(**FEW)
-    client.send_cloud(make_cloud(seen_from_the_camera()))
+    client.send_cloud(make_cloud(seen_ball))
     result = client.event(event="result", source="cloud")
     assert result["verified"] >= 1
     client.spin_until(lambda: client.poses, "grasp pose")
@@ -65,24 +57,11 @@ def test_a_cloud_becomes_a_grasp_in_its_own_frame(client, node, make_cloud):
 
 def test_bad_input_is_named_and_the_node_lives_on(client, node, make_cloud):
     client.set_parameters(**FEW)
-    outside = node.directory.parent / "outside.obj"
-    outside.write_text("v 0 0 0\n")
-    (node.directory / "link.obj").symlink_to(outside)
     (node.directory / "junk.obj").write_text("this is no mesh")
-    wrong_type = make_cloud(np.zeros((10, 3)))
-    wrong_type.fields[0].datatype = 5
     cases = [
-        (lambda: client.send_mesh(outside), "outside the allowed mesh_roots"),
         (lambda: client.send_mesh("../outside.obj"), "outside the allowed mesh_roots"),
-        (lambda: client.send_mesh("link.obj"), "outside the allowed mesh_roots"),
-        (lambda: client.send_mesh("missing.obj"), "missing.obj: no such file"),
-        (lambda: client.send_mesh("."), "a directory"),
-        (lambda: client.send_mesh("http://somewhere/mug.obj"), "unknown form"),
-        (lambda: client.send_mesh("package://no_such_package/mug.obj"), "no_such_package"),
         (lambda: client.send_mesh("junk.obj"), "junk.obj"),
         (lambda: client.send_cloud(make_cloud(np.zeros((0, 3)))), "empty: width=0"),
-        (lambda: client.send_cloud(make_cloud(np.full((500, 3), np.nan))), "no finite point"),
-        (lambda: client.send_cloud(wrong_type), "field 'x' is INT32"),
         (lambda: client.send_cancel("mesh-99"), "no request 'mesh-99'"),
     ]
     for send, culprit in cases:
@@ -127,9 +106,9 @@ def test_a_busy_node_obeys_its_policy(client, node, policy, ends_as):
     assert (ended["request"] == first) is (policy == "replace")
 
 
-def test_only_the_newest_cloud_waits_and_the_others_are_counted(client, node, make_cloud):
+def test_only_the_newest_cloud_waits_and_the_others_are_counted(client, node, make_cloud, seen_ball):
     client.set_parameters(**LONG)
-    cloud = make_cloud(seen_from_the_camera())
+    cloud = make_cloud(seen_ball)
     client.send_cloud(cloud)
     running = client.event(event="progress", source="cloud")["request"]
     # A camera's clouds are sent once: the node may miss some.
@@ -147,19 +126,18 @@ def test_only_the_newest_cloud_waits_and_the_others_are_counted(client, node, ma
     assert sum(e["count"] for e in client.events if e["event"] == "superseded") == superseded
 
 
-def test_callbacks_answer_through_a_whole_request(client, node):
+def test_callbacks_answer_while_the_node_works(client, node):
     """Neither the optimiser nor the trials keep a caller waiting: benchmarks/soak.py tells how long it waits."""
-    client.set_parameters(num_grasps=64, preset="balanced", deadline=100.0, busy_policy="queue")
     service = client.node.create_client(GetParameters, "/graspd/get_parameters")
     client.spin_until(service.service_is_ready, "parameter service")
-    client.forget()
-    client.send_mesh("mug.obj")
-    answers = Counter()
-    while not any(e["event"] in ("result", "error") for e in client.events):
-        future = service.call_async(GetParameters.Request(names=["seed"]))
-        client.spin_until(future.done, "answer")
-        told = [e["stage"] for e in client.events if e["event"] == "progress"]
-        answers[told[-1] if told else ""] += 1
-        client.spin_for(0.02)
-    # Callbacks that wait for the end of a stage would answer once a stage; these answer dozens of times.
-    assert min(answers["optimise"], answers["verify"]) >= 5, answers
+    for stage, preset in (("optimise", "accurate"), ("verify", "fast")):
+        client.forget()
+        client.set_parameters(**LONG | {"preset": preset})
+        client.send_mesh("mug.obj")
+        request = client.event(event="progress", stage=stage)["request"]
+        # Callbacks that wait for the end of the work would answer after it.
+        for _ in range(5):
+            client.done(service.call_async(GetParameters.Request(names=["seed"])), "answer")
+        assert not [event for event in client.events if event["event"] == "result"]
+        client.send_cancel(request)
+        client.event(event="cancelled", request=request)

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspRequest
-from rclpy.action.client import ActionClient
 
 from graspd_ros.node import main
 
@@ -40,15 +39,14 @@ pytestmark = pytest.mark.timeout(300)
 def test_a_signal_ends_a_busy_node_cleanly(client, shared_node, number):
     process = shared_node.process()
     client.forget()
-    actions = ActionClient(client.node, SynthesizeGrasps, "/graspd/synthesize")
-    client.spin_until(actions.server_is_ready, "action server")
-    sent = actions.send_goal_async(SynthesizeGrasps.Goal(request=GraspRequest(id="goal", **SPHERE, **LONG)))
-    goal = client.spin_until(lambda: sent.done() and sent.result(), "answer to a goal").get_result_async()
+    actions = client.actions(SynthesizeGrasps, "synthesize")
+    goal = SynthesizeGrasps.Goal(request=GraspRequest(id="goal", **SPHERE, **LONG))
+    asked = client.send_goal(actions, goal).get_result_async()
     client.event(event="progress", stage="optimise")
     status, log = process.stop(number)
     assert status == 0
     assert "Traceback" not in log
-    ended = client.spin_until(lambda: goal.done() and goal.result(), "result of the goal")
+    ended = client.done(asked, "result of the goal")
     assert ended.result.result.status == GraspArray.CANCELLED
     assert client.answer("goal").status == GraspArray.CANCELLED
     actions.destroy()

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
+import yaml
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
 from graspd_core import PointCloud
+from graspd_core.paths import config_dir
 from graspd_ros.inputs.sensor_frames import scene_of_views
-from graspd_ros.parameters import Settings, check_parameters, declare_settings, doubts
+from graspd_ros.parameters import LiveSettings, Settings, check_parameters, doubts
 
 
 @pytest.mark.parametrize(
@@ -27,6 +30,7 @@ from graspd_ros.parameters import Settings, check_parameters, declare_settings, 
         ("roi_min", [0.0, 1.0], "three finite numbers"),
         ("roi_max", [0.0, 1.0, math.nan], "three finite numbers"),
         ("view_point", "here", "three finite numbers"),
+        ("arm", "ur99", "unknown arm 'ur99'; known: "),
         ("deadline", "soon", "'soon' is no number"),
         ("deadline", True, "True is no number"),
         ("deadline", 0, "0.0; valid: 0.1 to 3600"),
@@ -45,6 +49,8 @@ def test_what_is_no_choice_is_refused_by_name(name, value, culprit):
         ("cloud_policy", "off"),
         ("cloud_policy", False),  # what YAML makes of an unquoted off
         ("scene_config", ""),
+        ("arm", ""),
+        ("arm", "ur5e_like"),
         ("roi_min", [-1.0, -1.0, 0.0]),
         ("use_sim_time", True),
         ("deadline", 5),
@@ -74,7 +80,7 @@ def started(*arguments: str) -> tuple[Settings, list[str]]:
     rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))], context=context)
     node = rclpy.create_node("parameters", context=context)
     try:
-        settings = declare_settings(node)
+        settings = LiveSettings(node).now
         return settings, doubts(node, settings)
     finally:
         node.destroy_node()
@@ -95,3 +101,20 @@ def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(tmp_pat
     ]
     assert "is above roi_max" in told[2]
     assert told[3] == "mesh_roots: '/no/such/place' is no directory"
+
+
+def test_the_shipped_parameter_file_holds_every_parameter_at_its_default():
+    shipped = yaml.safe_load((config_dir() / "graspd.yaml").read_text())["/**"]["ros__parameters"]
+    assert shipped == dataclasses.asdict(Settings())
+
+
+def test_settings_follow_the_parameters():
+    context = Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("parameters", context=context)
+    settings = LiveSettings(node)
+    before = settings.now
+    node.set_parameters([Parameter("seed", value=7), Parameter("deadline", value=-1.0)])
+    assert (settings.now.seed, settings.now.deadline, before.seed) == (7, 60.0, 0)
+    node.destroy_node()
+    rclpy.shutdown(context=context)

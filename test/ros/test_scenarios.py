@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import os
 import signal
 import subprocess
@@ -17,14 +16,12 @@ import pytest
 from bag_writer import Record, camera_info_message, depth_message, transforms_message, write_bag
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Pose, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import Grasp, GraspArray, GraspRequest
-from rclpy.action.client import ActionClient
 from rclpy.serialization import deserialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
@@ -34,6 +31,7 @@ from graspd_bench.rendering.tabletop import TabletopScene, depth_views, ring_pos
 from graspd_core.io.grasps_json import grasps_of, load_document
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
+from graspd_ros.convert import matrix_of_pose
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 ONE = {"num_grasps": 1, "preset": "fast"}
@@ -64,14 +62,6 @@ rclpy.spin_until_future_complete(node, answer)
 """
 
 pytestmark = pytest.mark.timeout(300)
-
-
-def matrix(pose: Pose) -> np.ndarray:
-    p, q = pose.position, pose.orientation
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = p.x, p.y, p.z
-    return T
 
 
 def rigid(rotation: Rotation, place: list[float]) -> np.ndarray:
@@ -133,28 +123,15 @@ def record_scene(path: Path, scene: TabletopScene) -> np.ndarray:
     return T_world_camera
 
 
-def record_answer(path: Path, data: bytes) -> None:
+def record_answer(path: Path, data: bytes, typestore: Any) -> None:
     """One GraspArray as `ros2 bag record` writes it: the bytes of DDS, and the definitions of the types."""
-    store, types = get_typestore(Stores.ROS2_JAZZY), {}
-    for file in (Path(__file__).parents[2] / "msg_defs" / "msg").glob("*.msg"):
-        types |= get_types_from_msg(file.read_text(), f"graspd_msgs/msg/{file.stem}")
-    store.register(types)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topic = writer.add_connection("/recorded/grasps", "graspd_msgs/msg/GraspArray", typestore=store)
+        topic = writer.add_connection("/recorded/grasps", "graspd_msgs/msg/GraspArray", typestore=typestore)
         writer.write(topic, START, data)
 
 
-def agree(theirs: Any, ours: Any) -> bool:
-    """Whether a message of rosbags', which shares no code with rosidl, carries what one of rclpy's does."""
-    if hasattr(ours, "get_fields_and_field_types"):
-        return all(agree(getattr(theirs, name), getattr(ours, name)) for name in ours.get_fields_and_field_types())
-    if isinstance(ours, list | array.array | np.ndarray):
-        return len(theirs) == len(ours) and all(map(agree, theirs, ours))
-    return theirs == ours
-
-
 def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_reads_back(
-    client, node, start_process, tmp_path
+    client, node, start_process, tmp_path, typestore, agree
 ):
     scene = tabletop("cylinder", yaw=0.3)
     T_world_camera = record_scene(tmp_path / "scene", scene)
@@ -171,7 +148,7 @@ def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_read
     assert (answer.status, answer.header.frame_id) == (GraspArray.SUCCEEDED, "world"), answer.message
     best = answer.grasps[0]
     assert (best.verdict, best.header.frame_id) == (Grasp.VERIFIED, "world")
-    T_world_base = matrix(best.grasp_pose)
+    T_world_base = matrix_of_pose(best.grasp_pose)
     low, high = scene.truth.vertices.min(0), scene.truth.vertices.max(0)
     assert np.linalg.norm(T_world_base[:3, 3] - (low + high) / 2) < REACH
     contacts = np.array([[c.position.x, c.position.y, c.position.z] for c in best.contacts])
@@ -184,7 +161,7 @@ def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_read
 
     client.spin_until(lambda: raw, "the answer as bytes")
     client.node.destroy_subscription(recorder)
-    record_answer(tmp_path / "answer", raw[0])
+    record_answer(tmp_path / "answer", raw[0], typestore)
     with AnyReader([tmp_path / "answer"]) as reader:
         ((connection, _, data),) = reader.messages()
         assert agree(reader.deserialize(data, connection.msgtype), answer)
@@ -227,20 +204,18 @@ def test_a_client_killed_amid_its_goal_leaves_the_node_serving(client, node, sta
     doomed.send_signal(signal.SIGKILL)
     assert doomed.wait() == -signal.SIGKILL
     # Nobody waits for it any more; it can be cancelled still, and a goal that waits behind it is served.
-    actions = ActionClient(client.node, SynthesizeGrasps, "/graspd/synthesize")
-    client.spin_until(actions.server_is_ready, "action server")
-    sent = actions.send_goal_async(SynthesizeGrasps.Goal(request=GraspRequest(id="heir", **SPHERE, **ONE)))
-    handle = client.spin_until(lambda: sent.done() and sent.result(), "answer to a goal")
-    asked = handle.get_result_async()
+    actions = client.actions(SynthesizeGrasps, "synthesize")
+    goal = SynthesizeGrasps.Goal(request=GraspRequest(id="heir", **SPHERE, **ONE))
+    asked = client.send_goal(actions, goal).get_result_async()
     client.send_cancel("orphan")
     assert client.answer("orphan").status == GraspArray.CANCELLED
-    ended = client.spin_until(lambda: asked.done() and asked.result(), "result")
+    ended = client.done(asked, "result")
     assert ended.result.result.status == GraspArray.SUCCEEDED
     assert node.alive()
     actions.destroy()
 
 
-def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_node, publish, make_cloud):
+def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_node, publish, make_cloud, seen_ball):
     process = start_node(use_sim_time=True, **ONE)
     health: list[DiagnosticArray] = []
     subscription = client.node.create_subscription(DiagnosticArray, "/diagnostics", health.append, 10)
@@ -252,9 +227,7 @@ def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_no
 
         client.spin_until(told, "the node's time")
 
-    directions = np.random.default_rng(0).normal(size=(8000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    cloud = make_cloud(np.array([0.0, 0.0, 0.5]) + 0.035 * directions[directions[:, 2] < 0])
+    cloud = make_cloud(seen_ball)
     cloud.header.stamp = Time(sec=START // SECOND)
     set_time(START + SECOND)
     client.send_cloud(cloud)

@@ -14,7 +14,7 @@ from graspd_core.errors import HandError
 from graspd_core.hands.model import all_joint_names
 from graspd_core.paths import config_dir
 from graspd_ros.node import log_directory
-from graspd_ros.probe import foreign_rclpy
+from graspd_ros.ros_command import foreign_rclpy
 
 LAUNCH = Path(__file__).parents[2] / "graspd_ros" / "launch" / "graspd.launch.py"
 

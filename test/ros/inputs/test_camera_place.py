@@ -16,10 +16,9 @@ from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError, TransformError
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
-from graspd_ros.inputs.camera_place import CameraPlace, place_of, seen_by_camera
+from graspd_ros.error_codes import ErrorCode, RequestError, code_of
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.sensor_frames import cloud_frame
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError, code_of
+from graspd_ros.inputs.sensor_frames import CameraPlace, cloud_frame, place_of, seen_by_camera
 from graspd_ros.parameters import Settings
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,10 +16,10 @@ from std_msgs.msg import Header
 
 from graspd_core import load_scene
 from graspd_core.errors import GraspdError, TransformError
-from graspd_ros.inputs.collision_objects import MOST_THINGS, among_things, changed_things
-from graspd_ros.inputs.requests import Request
-from graspd_ros.outputs.error_codes import code_of
+from graspd_ros.error_codes import code_of
+from graspd_ros.inputs.collision_objects import MOST_THINGS, Thing, among_things, changed_things
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
 
 QUARTER = Quaternion(w=np.sqrt(0.5), z=np.sqrt(0.5))
 
@@ -88,8 +89,9 @@ def test_there_is_an_end_of_things():
     assert changed_things(many, message(name="7", **box()))
 
 
-def request(pose: np.ndarray | None = None) -> Request:
-    return Request("r", "mesh", "map", Time(), Settings(), lambda: load_scene("shape:box"), T_frame_object=pose)
+def request(things: Mapping[str, Thing], pose: np.ndarray | None = None) -> Request:
+    load = lambda: load_scene("shape:box")  # noqa: E731
+    return Request("r", "mesh", "map", Time(), Settings(), load, T_frame_object=pose, things=things)
 
 
 def test_things_come_to_the_object_through_their_frame_and_its_pose():
@@ -97,11 +99,11 @@ def test_things_come_to_the_object_through_their_frame_and_its_pose():
     T_map_shelf, T_map_object = np.eye(4), np.eye(4)
     T_map_shelf[:3, 3] = [1.0, 0.0, 0.0]
     T_map_object[:3, 3] = [0.95, 0.0, 0.0]
-    scene = among_things(request(T_map_object), things, lambda *asked: {("map", "shelf"): T_map_shelf}[asked]).load()
+    scene = among_things(request(things, T_map_object), lambda *asked: {("map", "shelf"): T_map_shelf}[asked]).load()
     (obstacle,) = scene.obstacles
     assert obstacle.mesh.vertices[:, 0].mean() == pytest.approx(0.15, abs=0.005)
     own = {"wall": replace(things["wall"], frame="map")}
-    assert not among_things(request(T_map_object), own, lambda *_: pytest.fail("asked")).load().obstacles
+    assert not among_things(request(own, T_map_object), lambda *_: pytest.fail("asked")).load().obstacles
 
 
 def test_a_frame_that_nobody_knows_names_the_thing():
@@ -110,4 +112,4 @@ def test_a_frame_that_nobody_knows_names_the_thing():
 
     things = changed_things({}, message(frame="shelf", **box()))
     with pytest.raises(TransformError, match="collision object 'wall': unknown frame 'shelf'; known: map"):
-        among_things(request(), things, lookup)
+        among_things(request(things), lookup)

@@ -15,8 +15,7 @@ from std_msgs.msg import Header
 
 from graspd_core.errors import CloudError
 from graspd_core.io.bags import camera_from_message
-from graspd_core.perception.cloud.camera import cloud_from_depth, distort
-from graspd_ros.inputs.depth_stream import ImagePairs, frame_of
+from graspd_ros.inputs.sensor_frames import ImagePairs, depth_and_camera
 
 SECOND = 1_000_000_000
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -62,19 +61,9 @@ def test_every_layout_gives_the_same_metres(
     encoding: str, big: bool, padding: int, width: int, height: int, random: random.Random
 ):
     depth = np.array([[random.randrange(0, 8000) / 1000 for _ in range(width)] for _ in range(height)])
-    found = frame_of(image(depth, encoding, big, padding), calibration(width, height))
-    np.testing.assert_allclose(found.depth, depth, atol=1e-6)
-    assert (found.camera.width, found.camera.height) == (width, height)
-
-
-def test_what_is_no_depth_is_zero():
-    depth = np.array([[np.nan, np.inf, -1.0, 0.0, 0.5]])
-    np.testing.assert_array_equal(frame_of(image(depth, "32FC1"), calibration(5, 1)).depth, [[0, 0, 0, 0, 0.5]])
-
-
-def test_the_frame_and_the_stamp_are_the_images():
-    found = frame_of(image(np.ones((2, 2)), "16UC1", stamp=7 * SECOND + 5), calibration(2, 2))
-    assert (found.frame, found.stamp) == ("camera", 7 * SECOND + 5)
+    found, camera = depth_and_camera(image(depth, encoding, big, padding), calibration(width, height))
+    np.testing.assert_allclose(found, depth, atol=1e-6)
+    assert (camera.width, camera.height) == (width, height)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +81,7 @@ def test_a_malformed_image_is_refused_with_the_culprit(change: dict, culprit: st
     for name, value in change.items():
         setattr(message, name, value)
     with pytest.raises(CloudError, match=culprit):
-        frame_of(message, calibration(4, 4))
+        depth_and_camera(message, calibration(4, 4))
 
 
 def test_an_uncalibrated_camera_is_refused():
@@ -119,49 +108,28 @@ def test_binning_and_a_region_shift_and_scale_the_camera():
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25.0, 12.5, 10.0, 3.0)
 
 
-@pytest.mark.parametrize("rectified", [True, False])
-def test_a_sphere_seen_through_the_messages_lies_on_its_surface(rectified: bool):
-    """Each pixel's depth is worked out from its ray by hand; through a lens, too."""
-    centre, radius = np.array([0.02, -0.01, 0.5]), 0.08
-    info = calibration()
-    camera = camera_from_message(info, rectified=rectified)
-    column, row = np.meshgrid(np.arange(64), np.arange(48))
-    plane = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
-    ideal = plane.copy()
-    for _ in range(50):  # the lens undone by fixed point, since it is weak
-        ideal = plane - (distort(ideal, camera.distortion) - ideal)
-    rays = np.concatenate([ideal, np.ones((48, 64, 1))], -1)
-    a, b, c = (rays**2).sum(-1), rays @ centre, centre @ centre - radius**2
-    inside = b * b - a * c
-    depth = np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, 0)
-    found = frame_of(image(depth, "32FC1"), info, rectified)
-    points = cloud_from_depth(found.depth, found.camera).points
-    assert len(points) == (inside > 0).sum() > 100
-    np.testing.assert_allclose(np.linalg.norm(points - centre, axis=1), radius, atol=1e-5)
-
-
 # Pairs.
 
 
 def test_images_and_calibrations_of_one_stamp_find_each_other_in_any_order():
     pairs = ImagePairs()
     first, second = image(np.ones((1, 1)), "16UC1", stamp=SECOND), image(np.ones((1, 1)), "16UC1", stamp=2 * SECOND)
-    assert pairs.add_image(first) is None
-    assert pairs.add_info(calibration(stamp=2 * SECOND)) is None
-    found = pairs.add_info(calibration(stamp=SECOND))
+    assert pairs.add(first) is None
+    assert pairs.add(calibration(stamp=2 * SECOND)) is None
+    found = pairs.add(calibration(stamp=SECOND))
     assert found is not None
     assert found[0] is first
     assert found[1].header.stamp.sec == 1
-    found = pairs.add_image(second)
+    found = pairs.add(second)
     assert found is not None
     assert (found[0], found[1].header.stamp.sec) == (second, 2)
 
 
 def test_stamps_pair_within_the_slop_only():
     pairs = ImagePairs(slop=0.01)
-    assert pairs.add_info(calibration(stamp=SECOND)) is None
-    assert pairs.add_image(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_001)) is None
-    assert pairs.add_image(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_000)) is not None
+    assert pairs.add(calibration(stamp=SECOND)) is None
+    assert pairs.add(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_001)) is None
+    assert pairs.add(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_000)) is not None
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=80))
@@ -170,22 +138,10 @@ def test_memory_is_bounded_and_no_image_is_given_out_twice(arrivals: list[tuple[
     given_out: list[Image] = []
     for is_image, tick in arrivals:
         stamp = tick * SECOND // 30
-        if is_image:
-            pair = pairs.add_image(image(np.ones((1, 1)), "16UC1", stamp=stamp))
-        else:
-            pair = pairs.add_info(calibration(1, 1, stamp=stamp))
+        message = image(np.ones((1, 1)), "16UC1", stamp=stamp) if is_image else calibration(1, 1, stamp=stamp)
+        pair = pairs.add(message)
         assert len(pairs) <= 6
         if pair is not None:
             assert pair[0].header.stamp == pair[1].header.stamp
             assert not any(pair[0] is image for image in given_out)
             given_out.append(pair[0])
-
-
-def test_thirty_hertz_of_both_pair_all_and_keep_little():
-    pairs, found = ImagePairs(), 0
-    for tick in range(300):
-        stamp = tick * SECOND // 30
-        found += pairs.add_info(calibration(1, 1, stamp=stamp)) is not None
-        found += pairs.add_image(image(np.ones((1, 1)), "16UC1", stamp=stamp)) is not None
-        assert len(pairs) <= 2
-    assert found == 300

@@ -25,7 +25,8 @@ from scipy.spatial.transform import Rotation
 from graspd_core.errors import TransformError
 from graspd_core.transforms import TransformBuffer
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Plane, Posture, Timing
-from graspd_ros.inputs import frames
+from graspd_ros import convert
+from graspd_ros.inputs import tf_listener
 
 ROOT = Path(__file__).parents[3]
 SECOND = 1_000_000_000
@@ -88,27 +89,27 @@ def turned(seed: int) -> Rotation:
 @given(PLACES, TURNS)
 def test_poses_and_matrices_are_inverse_to_each_other(xyz, seed):
     rotation = turned(seed)
-    T = frames.matrix_of_pose(pose(xyz, rotation))
+    T = convert.matrix_of_pose(pose(xyz, rotation))
     np.testing.assert_allclose(T, matrix(xyz, rotation), atol=1e-12)
-    np.testing.assert_allclose(frames.matrix_of_pose(frames.pose_of_matrix(T)), T, atol=1e-12)
+    np.testing.assert_allclose(convert.matrix_of_pose(convert.pose_of_matrix(T)), T, atol=1e-12)
     q = pose(xyz, rotation).orientation
     transform = Transform(translation=Vector3(x=xyz[0], y=xyz[1], z=xyz[2]), rotation=q)
-    np.testing.assert_array_equal(frames.matrix_of_transform(transform), T)
+    np.testing.assert_array_equal(convert.matrix_of_transform(transform), T)
 
 
 def test_the_order_of_the_quaternion_is_that_of_ros():
     quarter_about_z = Pose(orientation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5)))
-    np.testing.assert_allclose(frames.matrix_of_pose(quarter_about_z)[:3, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(convert.matrix_of_pose(quarter_about_z)[:3, 0], [0, 1, 0], atol=1e-12)
 
 
 def test_a_rounded_quaternion_is_made_unit_and_a_wrong_one_refused():
-    rounded = frames.matrix_of_pose(Pose(orientation=Quaternion(z=0.7, w=0.7)))
+    rounded = convert.matrix_of_pose(Pose(orientation=Quaternion(z=0.7, w=0.7)))
     np.testing.assert_allclose(rounded[:3, :3] @ rounded[:3, :3].T, np.eye(3), atol=1e-12)
     for wrong in (Quaternion(w=0.0), Quaternion(w=2.0), Quaternion(w=math.nan), Quaternion(w=math.inf)):
         with pytest.raises(TransformError, match="length"):
-            frames.matrix_of_pose(Pose(orientation=wrong))
+            convert.matrix_of_pose(Pose(orientation=wrong))
     with pytest.raises(TransformError, match="position"):
-        frames.matrix_of_pose(Pose(position=Point(x=math.nan)))
+        convert.matrix_of_pose(Pose(position=Point(x=math.nan)))
 
 
 @given(PLACES, TURNS, PLACES, TURNS)
@@ -120,7 +121,7 @@ def test_a_moved_result_is_the_same_grasp_seen_from_elsewhere(where, how, base, 
     normal = np.array([0.0, 0.0, 1.0])
     grasp = Grasp(posture, posture, posture, (Contact("tip", base, (1.0, 0.0, 0.0)),), score=2.0)
     result = GraspResult(Outcome.SUCCEEDED, (grasp,), Timing(), 0, "closed_form", support=Plane(normal, 0.3))
-    moved = frames.moved_result(result, T)
+    moved = convert.moved_result(result, T)
     found = moved.grasps[0]
     for new in (found.pregrasp, found.grasp, found.squeeze):
         seen = matrix(tuple(new.position), Rotation.from_quat(np.roll(new.quaternion_wxyz, -1)))
@@ -146,7 +147,7 @@ def test_a_transform_that_comes_late_is_waited_for():
             buffer.add("world", "camera", matrix((1.0, 0.0, 0.0), Rotation.identity()), 5, static=True)
         return False
 
-    found = frames.wait_for_transform(buffer, "world", "camera", 5, timeout=1e6, stop=stop)
+    found = tf_listener.wait_for_transform(buffer, "world", "camera", 5, timeout=1e6, stop=stop)
     assert found[0, 3] == 1.0
     assert len(asked) == 3
 
@@ -156,10 +157,10 @@ def test_waiting_ends_with_what_is_missing_at_the_timeout_or_when_stopped():
     buffer.add("world", "base", np.eye(4), 5, static=True)
     begun = time.monotonic()
     with pytest.raises(TransformError, match=r"'camera'.*base, world"):
-        frames.wait_for_transform(buffer, "world", "camera", None, timeout=0.1)
+        tf_listener.wait_for_transform(buffer, "world", "camera", None, timeout=0.1)
     assert time.monotonic() - begun >= 0.1
     with pytest.raises(TransformError, match="camera"):
-        frames.wait_for_transform(buffer, "world", "camera", None, timeout=1e6, stop=lambda: True)
+        tf_listener.wait_for_transform(buffer, "world", "camera", None, timeout=1e6, stop=lambda: True)
 
 
 @pytest.fixture
@@ -178,7 +179,7 @@ def test_without_tf2_msgs_the_node_says_so_once_and_goes_on(
 ):
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
     before = len(list(node.subscriptions))
-    listener = frames.TransformListener(node, TransformBuffer())
+    listener = tf_listener.TransformListener(node, TransformBuffer())
     assert not listener.available
     assert len(list(node.subscriptions)) == before
     assert "".join(capfd.readouterr()).count("tf2_msgs is not installed") == 1
@@ -207,7 +208,7 @@ def test_tf_of_another_process_is_heard_and_told_right(node: Node, robot: subpro
     assert robot.stdout is not None
     assert robot.stdout.readline() == "ready\n"  # published before anyone listened: /tf_static comes late all the same
     buffer = TransformBuffer()
-    listener = frames.TransformListener(node, buffer)
+    listener = tf_listener.TransformListener(node, buffer)
     assert listener.available
 
     def knows(stamp: int) -> bool:
@@ -236,11 +237,11 @@ def test_a_message_is_learnt_with_its_stamp_and_a_wrong_one_refused():
     message = TransformStamped(child_frame_id="camera")
     message.header.frame_id = "world"
     message.header.stamp.sec, message.header.stamp.nanosec = 3, 7
-    frames.learn(buffer, message, static=False)
+    tf_listener.add_transform(buffer, message, static=False)
     np.testing.assert_array_equal(buffer.lookup("world", "camera", 3 * SECOND + 7), np.eye(4))
     message.child_frame_id = ""
     with pytest.raises(TransformError, match="without a name"):
-        frames.learn(buffer, message, static=False)
+        tf_listener.add_transform(buffer, message, static=False)
 
 
 def test_when_time_jumps_back_everything_is_forgotten(node: Node):
@@ -248,7 +249,7 @@ def test_when_time_jumps_back_everything_is_forgotten(node: Node):
 
     node.set_parameters([Parameter("use_sim_time", value=True)])
     buffer = TransformBuffer()
-    listener = frames.TransformListener(node, buffer)
+    listener = tf_listener.TransformListener(node, buffer)
     clock = node.create_publisher(Clock, "/clock", 10)
     spin_until(node, lambda: clock.get_subscription_count() > 0)
 

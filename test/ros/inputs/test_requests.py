@@ -18,10 +18,10 @@ from std_msgs.msg import Header
 from graspd_core.errors import CloudError, GraspdError, NoObjectError, ResourceError, TransformError
 from graspd_core.optimize.plan_config import preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.requests import MOST_CLOUD_BYTES, check_request, pose_matrix, settings_of
-from graspd_ros.inputs.sensor_frames import MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError, code_of, sentence_of
+from graspd_ros.convert import pose_matrix
+from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
+from graspd_ros.inputs.request_builder import RequestBuilder, check_request, settings_of
+from graspd_ros.inputs.sensor_frames import MOST_CLOUD_BYTES, MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed
 from graspd_ros.parameters import MOST_GRASPS, Settings
 
 NOW = Time(sec=1000)

@@ -11,9 +11,9 @@ from graspd_msgs.msg import GraspRequest
 from std_msgs.msg import Header
 
 from graspd_core import load_scene
+from graspd_ros.error_codes import ErrorCode, RequestError
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.source_registry import SOURCES, Source, SourceInput, SourceObject
-from graspd_ros.outputs.error_codes import ErrorCode, RequestError
 from graspd_ros.parameters import Settings
 
 NOW, SEEN = Time(sec=1000), Time(sec=999)

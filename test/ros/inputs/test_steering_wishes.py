@@ -13,11 +13,10 @@ from std_msgs.msg import Header
 
 from graspd_core import Box, Sphere
 from graspd_core.errors import GraspdError
+from graspd_ros.error_codes import ErrorCode, code_of
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.requests import Request
-from graspd_ros.inputs.steering_wishes import steering_of
-from graspd_ros.outputs.error_codes import ErrorCode, code_of
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
 
 # A quarter turn about x: the object's z is the header's −y.
 LYING = Pose(position=Point(x=0.5), orientation=Quaternion(x=np.sqrt(0.5), w=np.sqrt(0.5)))
@@ -82,15 +81,6 @@ def test_wishes_in_another_frame_than_the_cloud_go_by_tf():
         steering = builder.from_message("r", Settings(), message).steering
         assert steering is not None
         assert np.allclose(np.asarray(steering().approach_direction), direction)
-
-
-def test_a_mask_becomes_a_region_of_its_points():
-    message = GraspRequest(region_mask=Image(height=2, width=2))
-    shown = np.array([[0.0, 0.1, 0.5], [0.0, 0.1, 0.6]])
-    region = steering_of(message, np.eye(4), lambda: shown).region
-    assert region is not None
-    assert np.allclose(region.distance(shown), -0.01)
-    assert steering_of(message, np.eye(4)).region is None
 
 
 def test_a_box_may_be_the_region(tmp_path):

@@ -19,7 +19,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult, Verdict
-from graspd_ros.inputs.frames import matrix_of_pose
+from graspd_ros.convert import matrix_of_pose
 from graspd_ros.outputs.markers import COLOURS, IDS_OF_A_GRASP, PARTS, result_markers
 
 HAND = load_hand("allegro_right")

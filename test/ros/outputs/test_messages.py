@@ -16,13 +16,11 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from graspd_core.hands.library import load_hand
-from graspd_core.optimize.plan_config import preset_names
 from graspd_core.types import HYPOTHESES, GraspResult, Outcome, Posture, Timing, TrialResult
 from graspd_core.types import Grasp as CoreGrasp
-from graspd_ros.inputs.frames import moved_result
-from graspd_ros.outputs.messages import array_message, ending_of
-from graspd_ros.outputs.status_json import presentable
-from graspd_ros.outputs.trajectory import Pace
+from graspd_ros.convert import moved_result
+from graspd_ros.outputs.messages import Pace, array_message, ending_of
+from graspd_ros.outputs.responses import presentable
 
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
@@ -35,13 +33,6 @@ pytestmark = pytest.mark.timeout(300)
 
 def place(pose: Pose) -> np.ndarray:
     return np.array([pose.position.x, pose.position.y, pose.position.z])
-
-
-def seen_ball(count: int = 4000) -> np.ndarray:
-    """The half of the ball that a camera at the origin sees [m]."""
-    directions = np.random.default_rng(0).normal(size=(2 * count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return BALL + RADIUS * directions[directions[:, 2] < 0]
 
 
 def stamp_now(client):
@@ -79,10 +70,8 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert (hold.name, hold.passed, hold.reason) == ("hold", True, "")
     assert 0 <= hold.displacement < 0.02
     assert {p.request_id for p in client.progress} == {"mine-1"}
-    # Ten reports a second at most: a stage may take less than that.
-    stages = {p.stage for p in client.progress}
-    assert "load" in stages
-    assert stages & {"optimise", "verify"}
+    # Ten reports a second at most, and a stage may take less than that: the first is told always.
+    assert "load" in {p.stage for p in client.progress}
     assert all(0 <= p.fraction <= 1 and p.message for p in client.progress)
     elapsed = [p.elapsed for p in client.progress]
     assert elapsed == sorted(elapsed)
@@ -113,15 +102,10 @@ def test_whatever_cannot_be_served_is_refused_by_name(client, node):
     cases = [
         ({"source": 9}, "BAD_REQUEST", "source: 9"),
         ({**SPHERE, "hand": "no_such_hand"}, "WRONG_HAND", "'no_such_hand' is not loaded"),
-        ({**SPHERE, "preset": "no_such_preset"}, "BAD_REQUEST", f"valid: {', '.join(preset_names())}"),
-        ({**SPHERE, "time_budget": float("nan")}, "BAD_REQUEST", "time_budget: nan"),
-        ({**SPHERE, "num_grasps": 100_000}, "BAD_REQUEST", "num_grasps: 100000"),
         ({**SPHERE, "object_pose": Pose(position=Point(x=float("nan")))}, "BAD_REQUEST", "object_pose"),
-        ({**SPHERE, "object_pose": Pose(orientation=Quaternion(w=3.0))}, "BAD_REQUEST", "length 3"),
         ({"source": GraspRequest.MESH, "mesh_uri": "/etc/passwd"}, "BAD_MESH", "outside the allowed mesh_roots"),
         ({"source": GraspRequest.MESH, "mesh_uri": "m" * 10**6}, "BAD_MESH", "1000000 characters long"),
         ({"source": GraspRequest.LATEST_CLOUD}, "NO_CLOUD", "no cloud or depth image"),
-        ({"source": GraspRequest.VIEWS}, "NO_CLOUD", "~/add_view"),
     ]
     for number, (fields, _, _) in enumerate(cases):
         client.send_request(id=f"bad-{number}", **fields)
@@ -168,9 +152,9 @@ def test_a_deadline_that_passes_in_the_queue_is_answered_then(client, node):
     assert client.answer("long").status == GraspArray.CANCELLED
 
 
-def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud):
+def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud, seen_ball):
     client.set_parameters(cloud_policy="off")
-    cloud = make_cloud(seen_ball())
+    cloud = make_cloud(seen_ball)
     cloud.header.stamp = stamp_now(client)
     cloud.header.stamp.sec -= 60
     while int(client.health()["clouds received"]) == 0:

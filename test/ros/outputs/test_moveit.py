@@ -23,10 +23,9 @@ from std_msgs.msg import Header
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.types import Grasp, GraspMetrics, Posture, TrialResult, Verdict
-from graspd_ros.inputs.frames import matrix_of_pose, pose_of_matrix
-from graspd_ros.outputs.messages import grasp_message
+from graspd_ros.convert import matrix_of_pose, pose_of_matrix
+from graspd_ros.outputs.messages import Pace, grasp_message
 from graspd_ros.outputs.moveit import MoveItMissing, moveit_grasp
-from graspd_ros.outputs.trajectory import Pace
 
 HAND = load_hand("allegro_right")
 FIELDS = {

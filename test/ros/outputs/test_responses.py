@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -19,10 +20,23 @@ from visualization_msgs.msg import MarkerArray
 from graspd_core.errors import MeshError
 from graspd_core.hands.library import load_hand
 from graspd_core.perception.scene import Scene
-from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Progress, Stage, Timing, TrialResult
-from graspd_ros.inputs.requests import Request
+from graspd_core.types import (
+    Contact,
+    Grasp,
+    GraspMetrics,
+    GraspResult,
+    Outcome,
+    Posture,
+    Progress,
+    Stage,
+    Timing,
+    TrialResult,
+    Verdict,
+)
+from graspd_ros.outputs import messages, responses
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
 from graspd_ros.request_planner import Planned, overdue
 from graspd_ros.worker import Report, WorkerEnding
 
@@ -86,8 +100,8 @@ def done(*grasps: Grasp) -> Report[Planned]:
 
 @pytest.mark.parametrize("culprit", NOT_A_NUMBER)
 def test_a_result_that_holds_a_nan_is_an_error_and_nothing_of_it_is_published(node, culprit):
-    messages, events = published(node, done(GRASP, replace(GRASP, **NOT_A_NUMBER[culprit])))
-    (answer,) = messages
+    told, events = published(node, done(GRASP, replace(GRASP, **NOT_A_NUMBER[culprit])))
+    (answer,) = told
     assert (answer.status, answer.error_code, list(answer.grasps)) == (GraspArray.FAILED, "INTERNAL", [])
     assert f"grasp 1: not finite: {culprit}" in answer.message
     assert events == ["error"]
@@ -95,10 +109,10 @@ def test_a_result_that_holds_a_nan_is_an_error_and_nothing_of_it_is_published(no
 
 @pytest.mark.parametrize("listener", [None, Broken()])
 def test_a_result_is_answered_once_whatever_its_listener_does(node, listener):
-    messages, events = published(node, done(GRASP), listener)
-    assert [answer.status for answer in messages if isinstance(answer, GraspArray)] == [GraspArray.SUCCEEDED]
-    assert {type(message) for message in messages} >= {PoseStamped, MarkerArray}
-    assert isinstance(messages[-1], GraspArray)
+    told, events = published(node, done(GRASP), listener)
+    assert [answer.status for answer in told if isinstance(answer, GraspArray)] == [GraspArray.SUCCEEDED]
+    assert {type(message) for message in told} >= {PoseStamped, MarkerArray}
+    assert isinstance(told[-1], GraspArray)
     assert events == ["result"]
 
 
@@ -114,14 +128,78 @@ def test_progress_is_told_at_the_rate_that_is_set(node):
 
 
 def test_a_request_that_was_never_worked_on_leaves_the_markers_as_they_are(node):
-    messages, events = published(node, overdue())
-    assert [(type(message), message.error_code) for message in messages] == [(GraspArray, "DEADLINE")]
+    told, events = published(node, overdue())
+    assert [(type(message), message.error_code) for message in told] == [(GraspArray, "DEADLINE")]
     assert events == ["result"]
 
 
 def test_markers_draw_what_is_asked_for_and_a_hand_without_its_files_as_it_collides(node, tmp_path):
-    responses, visual = Responses(node, HAND), Settings()
-    assert responses.drawn(replace(visual, marker_geometry="collision")) is HAND.primitives
-    assert responses.drawn(visual) is not HAND.primitives
+    answers, visual = Responses(node, HAND), Settings()
+    assert answers.drawn(replace(visual, marker_geometry="collision")) is HAND.primitives
+    assert answers.drawn(visual) is not HAND.primitives
     gone = Responses(node, replace(HAND, urdf=str(tmp_path / "gone.urdf")))
-    assert gone.drawn(visual) is gone._hand.primitives
+    assert gone.drawn(visual) is HAND.primitives
+
+
+def a_grasp(verdict: Verdict) -> Grasp:
+    posture = Posture(np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.1, -0.7, 0.5]), np.array([0.25, -1.0]))
+    hold = TrialResult("hold", verdict is Verdict.VERIFIED, 0.002, 0.01)
+    trials = () if verdict is Verdict.UNVERIFIED else (hold,)
+    return Grasp(posture, posture, posture, (), score=1.5, metrics=GraspMetrics({"penetration": 0.001}), trials=trials)
+
+
+def a_result(*grasps: Grasp) -> GraspResult:
+    return GraspResult(Outcome.TOO_FEW, grasps, Timing(total=1.0), seed=0, method="closed_form")
+
+
+def test_the_pose_names_its_frame_and_turns_wxyz_to_xyzw():
+    message = messages.pose_message(a_grasp(Verdict.VERIFIED), "camera", Time(sec=7))
+    assert message.header.frame_id == "camera"
+    assert message.header.stamp.sec == 7
+    orientation = message.pose.orientation
+    assert (orientation.w, orientation.x, orientation.y, orientation.z) == (0.5, 0.1, -0.7, 0.5)
+    assert (message.pose.position.x, message.pose.position.y, message.pose.position.z) == (1.0, 2.0, 3.0)
+
+
+def test_the_joint_state_names_its_joints_and_carries_positions_only():
+    hand = load_hand("parallel_gripper", candidates=8)
+    posture = replace(a_grasp(Verdict.VERIFIED).grasp, joint_positions=np.array([0.0625]))
+    message = messages.joint_message(posture, hand, Time())
+    assert message.header.frame_id == "base_link"
+    # The jaw that follows the other has its own value.
+    assert list(message.name) == ["left_jaw", "right_jaw"]
+    assert list(message.position) == [0.0625, 0.0625]
+    assert not message.velocity
+    assert not message.effort
+
+
+def test_a_grasp_known_to_be_bad_is_not_presented():
+    good, unknown, bad = (a_grasp(v) for v in (Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED))
+    assert responses.presentable(a_result(good, bad)) is good
+    assert responses.presentable(a_result(unknown)) is unknown
+    assert responses.presentable(a_result(bad)) is None
+    assert responses.presentable(a_result()) is None
+    event = responses.result_event(a_result(bad))
+    assert (event["best"], event["grasps"], event["verified"]) == (None, 1, 0)
+
+
+def test_every_event_is_one_line_of_json_without_nan():
+    odd = {
+        "a": float("nan"),
+        "b": [np.float32(1.5), np.inf],
+        "c": {"d": np.int64(3)},
+        "e": "two\nlines",
+        "f": Stage.LOAD,
+    }
+    line = responses.status_line(odd)
+    assert "\n" not in line
+    assert json.loads(line) == {"a": None, "b": [1.5, None], "c": {"d": 3}, "e": "two\nlines", "f": "load"}
+    progress = Progress(Stage.OPTIMISE, 5, 10, float("inf"), 0, 0.5)
+    assert json.loads(responses.status_line(responses.progress_event(progress)))["fraction"] == 0.5
+    summary = json.loads(responses.status_line(responses.result_event(a_result(a_grasp(Verdict.VERIFIED)))))
+    assert summary["best"]["metrics"]["penetration_mm"] == 1.0
+    assert summary["best"]["metrics"]["epsilon"] is None
+    assert summary["best"]["trials"] == [
+        {"name": "hold", "passed": True, "displacement": 0.002, "rotation": 0.01, "reason": ""}
+    ]
+    assert summary["outcome"] == "too_few"

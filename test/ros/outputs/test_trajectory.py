@@ -16,17 +16,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
-from trajectory_msgs.msg import JointTrajectory
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from graspd_core.arms.arm_paths import STAGE_ROWS
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
-from graspd_core.hands.model import HandModel
+from graspd_core.hands.model import HandModel, Mount
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import Grasp, Posture
+from graspd_core.types import ArmPath, Grasp, Posture
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_ros.outputs.trajectory import Pace, base_poses, stage_times, trajectory_of
+from graspd_ros.convert import matrix_of_pose
+from graspd_ros.outputs.messages import (
+    Pace,
+    arm_trajectory,
+    base_poses,
+    grasp_message,
+    matrix_of_mount,
+    stage_times,
+    trajectory_of,
+)
 
 HAND = load_hand("allegro_right")
 SHARES = st.lists(st.floats(0.0, 1.0), min_size=HAND.num_joints, max_size=HAND.num_joints)
@@ -129,6 +140,125 @@ def test_the_message_names_joints_and_starts_on_receipt():
 def test_a_pace_that_is_none_is_refused(value: float):
     with pytest.raises(ConfigError, match="base_turn"):
         Pace(base_turn=value)
+
+
+# The flange's z is the hand's, 3 cm before the mount; an eighth of a turn about it.
+MOUNT = Mount("tool0", (0.0, 0.0, 0.03), (float(np.cos(np.pi / 8)), 0.0, 0.0, float(np.sin(np.pi / 8))))
+
+
+@pytest.fixture(scope="module")
+def mounted() -> HandModel:
+    return dataclasses.replace(load_hand("barrett_like", candidates=8), mount=MOUNT)
+
+
+def spread(mounted: HandModel, share: float, height: float) -> Posture:
+    joints = mounted.lower + share * (mounted.upper - mounted.lower)
+    return Posture(np.array([0.1, -0.2, height]), np.array([0.5, 0.5, -0.5, 0.5]), joints)
+
+
+@pytest.fixture(scope="module")
+def carried(mounted: HandModel) -> Grasp:
+    return Grasp(spread(mounted, 0.2, 0.3), spread(mounted, 0.4, 0.25), spread(mounted, 0.5, 0.25), (), 1.0)
+
+
+def test_the_arms_link_is_where_the_mount_puts_it(mounted: HandModel, carried: Grasp) -> None:
+    message = grasp_message(carried, 0, "r", Header(frame_id="camera"), mounted, Pace())
+    assert message.mount_link == "tool0"
+    for base, parent in (
+        (message.pregrasp_pose, message.mount_pregrasp_pose),
+        (message.grasp_pose, message.mount_grasp_pose),
+    ):
+        # T_frame_parent · T_parent_base is the base link's pose again.
+        again = matrix_of_pose(parent) @ matrix_of_mount(MOUNT)
+        np.testing.assert_allclose(again, matrix_of_pose(base), atol=1e-12)
+    # By mounted: the base's z is turned by the quaternion (0.5, 0.5, -0.5, 0.5) onto -y; 3 cm back along it.
+    z = matrix_of_pose(message.grasp_pose)[:3, 2]
+    at = message.mount_grasp_pose.position
+    np.testing.assert_allclose([at.x, at.y, at.z], np.array([0.1, -0.2, 0.25]) - 0.03 * z, atol=1e-12)
+
+
+def test_a_floating_hand_names_no_link(mounted: HandModel, carried: Grasp) -> None:
+    message = grasp_message(
+        carried, 0, "r", Header(frame_id="camera"), dataclasses.replace(mounted, mount=None), Pace()
+    )
+    assert message.mount_link == ""
+
+
+def test_all_movable_joints_are_in_every_message(mounted: HandModel, carried: Grasp) -> None:
+    message = grasp_message(carried, 0, "r", Header(frame_id="camera", stamp=Time()), mounted, Pace())
+    names = [
+        "f1_spread",
+        "f1_proximal",
+        "f1_distal",
+        "f2_spread",
+        "f2_proximal",
+        "f2_distal",
+        "f3_proximal",
+        "f3_distal",
+    ]
+    assert list(message.grasp_joints.name) == names
+    # Controllers refuse joints that have no command of their own.
+    assert list(message.trajectory.joint_names) == list(mounted.joint_names)
+    assert set(mounted.joint_names) < set(names)
+    value = dict(zip(names, message.squeeze_joints.position, strict=True))
+    assert value["f2_spread"] == pytest.approx(-value["f1_spread"])
+    assert value["f3_distal"] == pytest.approx(value["f3_proximal"] / 3)
+    for point, at in zip(message.trajectory.points, (carried.pregrasp, carried.grasp, carried.squeeze), strict=True):
+        np.testing.assert_allclose(point.positions, at.joint_positions)
+        assert len(point.velocities) == mounted.num_joints
+
+
+def test_a_follower_is_no_faster_than_its_kind_may_be(mounted: HandModel, carried: Grasp) -> None:
+    """A joint that follows three times as fast makes its leader three times as slow."""
+    quick = dataclasses.replace(
+        mounted,
+        mimics=tuple(dataclasses.replace(m, multiplier=3.0) for m in mounted.mimics),
+        velocity=np.full(4, np.inf),
+    )
+    pace = Pace(joint_speed=0.1, shortest=0.01)
+    travel = carried.grasp.joint_positions - carried.pregrasp.joint_positions
+    first, closed, _ = stage_times(carried, quick, pace)
+    assert closed - first == pytest.approx(1.5 * 3 * np.abs(travel).max() / 0.1)
+
+
+NAMES = ("shoulder", "elbow")
+
+
+def grasp_with(step: float) -> Grasp:
+    """A grasp 4 cm from its pregrasp, whose arm moves one joint by `step` [rad] between waypoints."""
+    hand = load_hand("barrett_like", candidates=50)
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    before, there = (Posture(np.array([0.0, 0.0, z]), turn, hand.open_posture) for z in (0.24, 0.2))
+    positions = np.column_stack([step * np.arange(STAGE_ROWS[-1] + 1), np.zeros(STAGE_ROWS[-1] + 1)])
+    return Grasp(before, there, there, arm=ArmPath(NAMES, positions, STAGE_ROWS))
+
+
+def at(point: JointTrajectoryPoint) -> float:
+    return point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
+
+
+@pytest.mark.parametrize("step", [0.0, 0.02, 0.2])
+def test_no_joint_and_no_hand_is_faster_than_asked(step: float):
+    grasp, pace = grasp_with(step), Pace(joint_speed=0.5, base_speed=0.1, shortest=0.2)
+    assert grasp.arm is not None
+    trajectory = arm_trajectory(grasp, grasp.arm, pace)
+    assert list(trajectory.joint_names) == list(NAMES)
+    assert np.allclose([point.positions for point in trajectory.points], grasp.arm.positions)
+    times = np.array([at(point) for point in trajectory.points])
+    assert times[0] == pytest.approx(pace.shortest)
+    assert step / np.diff(times).min() <= 0.5
+    stages = np.diff(times[list(STAGE_ROWS)])
+    assert (stages >= np.maximum(0.2, np.array([0.1, 0.04, 0.1]) / 0.1) - 1e-6).all()
+
+
+def test_the_message_of_a_grasp_has_it_only_where_there_is_an_arm():
+    hand, grasp = load_hand("barrett_like", candidates=50), grasp_with(0.02)
+    told = grasp_message(grasp, 0, "id", Header(frame_id="world"), hand, Pace())
+    assert list(told.arm_stages) == list(STAGE_ROWS)
+    assert len(told.arm_trajectory.points) == STAGE_ROWS[-1] + 1
+    bare = grasp_message(Grasp(grasp.pregrasp, grasp.grasp, grasp.squeeze), 0, "id", Header(), hand, Pace())
+    assert list(bare.arm_stages) == []
+    assert bare.arm_trajectory.points == []
 
 
 def play(found: Grasp, hand: HandModel, scene) -> float:

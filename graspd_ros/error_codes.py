@@ -50,6 +50,11 @@ class RequestError(GraspdError):
         self.code = code
 
 
+def bad_request(message: str) -> RequestError:
+    """Return the error about a field or a message that cannot be meant."""
+    return RequestError(ErrorCode.BAD_REQUEST, message)
+
+
 # The first that fits: subclasses stand before their bases.
 _CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
     (NoObjectError, ErrorCode.NO_OBJECT),

@@ -1,0 +1,189 @@
+"""Between messages and core values, both ways: stamps, points, poses, transforms; and results in another frame.
+
+Quaternions turn from wxyz (core) to xyzw (messages) and back here and nowhere else. `T_a_b` maps coordinates in frame b
+to frame a.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from graspd_core.errors import TransformError
+from graspd_core.transforms import SECOND
+from graspd_core.types import Contact, Grasp, GraspResult, Plane, Posture
+from graspd_ros.error_codes import bad_request
+
+Matrix = Float[np.ndarray, "4 4"]
+
+_FARTHEST = 1e3  # metres; what is farther away is a mistake, and costs precision
+_ROUNDED = 0.05  # quaternions written by hand are off their unit length by this much, those that are wrong by more
+
+
+def nanoseconds(stamp: Time | Duration) -> int:
+    """Return a stamp or a duration as one number [ns]."""
+    return stamp.sec * SECOND + stamp.nanosec
+
+
+def set_nanoseconds(stamp: Time | Duration, value: int) -> None:
+    """Set a stamp or a duration in a message [ns]."""
+    stamp.sec, stamp.nanosec = divmod(value, SECOND)
+
+
+def duration_of(seconds: float) -> Duration:
+    """Return a duration in whole nanoseconds, rounded up: a motion is never faster than allowed."""
+    whole, rest = divmod(math.ceil(seconds * 1e9), SECOND)
+    return Duration(sec=whole, nanosec=rest)
+
+
+def array_of(point: Point | Vector3) -> Float[np.ndarray, "3"]:
+    """Return a point or a vector as an array."""
+    return np.array([point.x, point.y, point.z])
+
+
+def point_of(position: Sequence[float] | np.ndarray) -> Point:
+    """Return a position as a message."""
+    x, y, z = map(float, position)
+    return Point(x=x, y=y, z=z)
+
+
+def vector_of(direction: Sequence[float] | np.ndarray) -> Vector3:
+    """Return a direction or a size as a message."""
+    x, y, z = map(float, direction)
+    return Vector3(x=x, y=y, z=z)
+
+
+def wxyz_of(turn: Quaternion) -> Float[np.ndarray, "4"]:
+    """Return a quaternion as core has it."""
+    return np.array([turn.w, turn.x, turn.y, turn.z])
+
+
+def pose_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Pose:
+    """Return a position [m] and a quaternion as a message."""
+    w, x, y, z = map(float, quaternion_wxyz)
+    return Pose(position=point_of(position), orientation=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def pose_of_posture(posture: Posture) -> Pose:
+    """Return the pose of the hand's base link."""
+    return pose_of(posture.position, posture.quaternion_wxyz)
+
+
+def pose_of_matrix(T: Matrix) -> Pose:
+    """Return the pose that a matrix stands for."""
+    return pose_of(T[:3, 3], wxyz_of_matrix(T))
+
+
+def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
+    """Return the rotation of a matrix as a unit quaternion."""
+    return np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)
+
+
+def matrix_of_pose(pose: Pose) -> Matrix:
+    """Return a pose as a matrix. Raises TransformError: not finite, or no rotation."""
+    return _matrix(pose.position, pose.orientation)
+
+
+def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
+    """Return a place [m]; `name` is its field. Raises RequestError: not finite, or not within 1 km."""
+    place = array_of(point)
+    if not (np.abs(place) <= _FARTHEST).all():
+        raise bad_request(f"{name}: {what}{place.tolist()}; it must be finite, within {_FARTHEST:g} m")
+    return place
+
+
+def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
+    """Return a pose as a matrix; an all-zero quaternion turns nothing. Raises RequestError: no pose within 1 km."""
+    near(pose.position, name, "position ")
+    length = float(np.linalg.norm(wxyz_of(pose.orientation)))
+    if length == 0:
+        pose = Pose(position=pose.position)
+    elif not abs(length - 1) < 0.01:
+        raise bad_request(f"{name}: a quaternion of length {length:.3g}; it must be 1 (or 0, for no turn)")
+    return matrix_of_pose(pose)
+
+
+def matrix_of_transform(transform: Transform) -> Matrix:
+    """Return a transform as a matrix. Raises TransformError: not finite, or no rotation."""
+    return _matrix(transform.translation, transform.rotation)
+
+
+def matrix_of_posture(posture: Posture) -> Matrix:
+    """Return the pose of the hand's base link as a matrix. Raises TransformError: not finite, or no rotation."""
+    return matrix_of(posture.position, posture.quaternion_wxyz)
+
+
+def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Matrix:
+    """Return a position and a quaternion as a matrix. Raises TransformError: not finite, or no rotation."""
+    px, py, pz = map(float, position)
+    w, x, y, z = map(float, quaternion_wxyz)
+    # In plain numbers: robots send thousands of transforms a second, and small arrays are slow.
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not (math.isfinite(px) and math.isfinite(py) and math.isfinite(pz)):
+        raise TransformError(f"position {[px, py, pz]}: not finite")
+    if not abs(length - 1) <= _ROUNDED:
+        raise TransformError(f"quaternion x y z w {[x, y, z, w]}: its length is {length:.3g}; it must be 1")
+    x, y, z, w = x / length, y / length, z / length, w / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), px],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), py],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), pz],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _matrix(place: Any, turn: Quaternion) -> Matrix:
+    return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
+
+
+def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarray, "n 3"]:
+    """Return points in another frame."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
+    """Return a result in another frame: postures, contacts, the support and the next view. All else has no frame."""
+    return replace(
+        result,
+        grasps=tuple(moved_grasp(grasp, T_new_old) for grasp in result.grasps),
+        support=None if result.support is None else moved_plane(result.support, T_new_old),
+        next_view=None if result.next_view is None else T_new_old @ result.next_view,
+    )
+
+
+def moved_grasp(grasp: Grasp, T: Matrix) -> Grasp:
+    """Return a grasp in another frame."""
+    return replace(
+        grasp,
+        pregrasp=_moved_posture(grasp.pregrasp, T),
+        grasp=_moved_posture(grasp.grasp, T),
+        squeeze=_moved_posture(grasp.squeeze, T),
+        contacts=tuple(_moved_contact(contact, T) for contact in grasp.contacts),
+    )
+
+
+def moved_plane(plane: Plane, T: Matrix) -> Plane:
+    """Return a plane in another frame."""
+    normal = T[:3, :3] @ plane.normal
+    return Plane(normal, plane.offset + float(normal @ T[:3, 3]))
+
+
+def _moved_posture(posture: Posture, T: Matrix) -> Posture:
+    pose = T @ matrix_of_posture(posture)
+    return replace(posture, position=pose[:3, 3], quaternion_wxyz=wxyz_of_matrix(pose))
+
+
+def _moved_contact(contact: Contact, T: Matrix) -> Contact:
+    x, y, z = map(float, T[:3, :3] @ contact.position + T[:3, 3])
+    nx, ny, nz = map(float, T[:3, :3] @ contact.normal)
+    return replace(contact, position=(x, y, z), normal=(nx, ny, nz))

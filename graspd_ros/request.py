@@ -1,0 +1,117 @@
+"""What the worker works off: one object to grasp, with all that is asked of its grasps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from graspd_msgs.msg import Grasp, GraspArray, GraspProgress
+
+from graspd_core import Scene, Steering
+from graspd_core.types import Plane
+from graspd_ros.convert import Matrix
+from graspd_ros.parameters import Settings
+
+if TYPE_CHECKING:
+    from graspd_ros.inputs.collision_objects import Thing
+
+MOST_ID = 128
+# `T_target_source` of two frames; may raise a TransformError.
+FrameLookup = Callable[[str, str], Matrix]
+
+
+class Listener(Protocol):
+    """One more who wants to know of one request, beside the topics; called in the thread that publishes."""
+
+    def progressed(self, message: GraspProgress) -> None: ...
+    def found(self, message: Grasp) -> None: ...
+    def ended(self, message: GraspArray) -> None: ...
+
+
+@dataclass(frozen=True)
+class KnownObject:
+    """An object as a request names it.
+
+    Attributes:
+        name: what the library calls it; empty: `path` is meant.
+        path: of its mesh file.
+        required: whether a library must know it.
+    """
+
+    name: str
+    path: str
+    required: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """One object to grasp.
+
+    Attributes:
+        id: names the request in every answer.
+        source: name of its source (`source_registry`): mesh, cloud, latest_cloud, views or known.
+        frame: the frame that the results are told in, unless the settings name an output_frame.
+        stamp: when the object was as it was given.
+        settings: the parameters at the time of the request, with what the request itself asks for.
+        load: reads the object; slow, may raise a GraspdError.
+        T_frame_object: pose of the object's own frame in `frame`; None where they are one.
+        only_newest: whether a newer request of this kind takes its place while it waits.
+        listener: who is told of it beside the topics; None where nobody is.
+        timeless: whether it came without a time of its own: then the newest transforms are meant.
+        object_key: same for requests of the very same object, as it is or was seen then; empty: none is the same.
+        exclude: ids of grasps that the answer must not be like.
+        exclude_poses: the same by frame and pose of the base link in it.
+        known: what a library of grasps may know the object by; None: nothing.
+        surface: what the object stands on, in its own frame; None: nothing.
+        steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
+            GraspdError. None where nothing is asked.
+        things: what stood in the planning scene by then, by id, wherever it is; empty where no such topic is heard.
+        accepted: when the request came, by the monotonic clock [s].
+    """
+
+    id: str
+    source: str
+    frame: str
+    stamp: Time
+    settings: Settings
+    load: Callable[[], Scene]
+    T_frame_object: Matrix | None = None
+    only_newest: bool = False
+    listener: Listener | None = None
+    timeless: bool = False
+    object_key: str = ""
+    exclude: tuple[str, ...] = ()
+    exclude_poses: tuple[tuple[str, Matrix], ...] = ()
+    known: KnownObject | None = None
+    surface: Plane | None = None
+    steering: Callable[[], Steering] | None = None
+    things: Mapping[str, Thing] = field(default_factory=dict)
+    accepted: float = field(default_factory=time.monotonic)
+
+    @property
+    def frame_out(self) -> str:
+        """The frame that the results are told in."""
+        return self.settings.output_frame or self.frame
+
+    def elapsed(self) -> float:
+        """Seconds since the request came."""
+        return time.monotonic() - self.accepted
+
+    def time_left(self) -> float:
+        """Seconds until its deadline."""
+        return self.settings.deadline - self.elapsed()
+
+    def to_object(self, frame: str, T: Matrix, lookup: FrameLookup) -> Matrix:
+        """Return a pose of another frame in the object's own frame. Raises TransformError: as the look-up.
+
+        Args:
+            frame: the frame of the pose; empty: that of the request.
+            T: the pose.
+            lookup: is asked only if the frame is another one than the request's.
+        """
+        placed = T if frame in ("", self.frame) else lookup(self.frame, frame) @ T
+        return placed if self.T_frame_object is None else np.linalg.inv(self.T_frame_object) @ placed
