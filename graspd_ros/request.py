@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import Grasp, GraspArray, GraspProgress
+from jaxtyping import Float
 
 from graspd_core import Scene, Steering
 from graspd_core.types import Plane
@@ -69,6 +70,7 @@ class Request:
         surface: what the object stands on, in its own frame; None: nothing.
         steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
             GraspdError. None where nothing is asked.
+        shown: reads the points that the request's region_mask shows, in `frame` [m]; None where there is no image.
         things: what stood in the planning scene by then, by id, wherever it is; empty where no such topic is heard.
         accepted: when the request came, by the monotonic clock [s].
     """
@@ -89,6 +91,7 @@ class Request:
     known: KnownObject | None = None
     surface: Plane | None = None
     steering: Callable[[], Steering] | None = None
+    shown: Callable[[], Float[np.ndarray, "points 3"]] | None = None
     things: Mapping[str, Thing] = field(default_factory=dict)
     accepted: float = field(default_factory=time.monotonic)
 

@@ -12,19 +12,22 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
-from graspd_core import HandModel, Reach, load_preset, plan_grasps, save_result
+from graspd_core import HandModel, load_preset, plan_grasps, save_result
 from graspd_core.types import Grasp, GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing, Verdict
 from graspd_core.verify.robustness import begin_in_thread
 from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
 from graspd_ros.error_codes import bad_request
 from graspd_ros.request import FrameLookup, Request
 from graspd_ros.worker import Report, WorkerEnding
+
+if TYPE_CHECKING:
+    from graspd_core import Reach
 
 PATIENCE = 0.15  # seconds that work gets to end by itself when its request is over
 _POLL = 0.02  # seconds between two looks at stop and deadline

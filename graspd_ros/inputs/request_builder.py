@@ -31,7 +31,6 @@ from graspd_ros.inputs.sensor_frames import (
 )
 from graspd_ros.inputs.source_registry import (
     SourceInput,
-    SourceObject,
     frame_loader,
     known_mesh,
     latest_frame,
@@ -114,21 +113,23 @@ class RequestBuilder:
         """
         check_request(message, self._hand)
         settings = settings_of(message, settings)
-        source, now = source_of(message), nanoseconds(self._now())
-        given = SourceInput(message, settings, self.newest, self.views, now, self._lookup, self._lookup_in_time)
-        found = source.find(given)
-        header = Header(frame_id=found.frame, stamp=found.stamp)
-        request = replace(
-            self.from_loader(request_id, source.name, header, settings, found.load, listener),
-            frame=found.frame,
-            T_frame_object=found.T_frame_object,
-            object_key=found.key,
-            known=found.known,
-            surface=found.surface,
+        source = source_of(message)
+        given = SourceInput(
+            request_id=request_id,
+            source=source.name,
+            message=message,
+            settings=settings,
+            listener=listener,
+            newest=self.newest,
+            views=self.views,
+            now=self._now(),
+            lookup=self._lookup,
+            lookup_in_time=self._lookup_in_time,
         )
+        request = source.find(given)
         return replace(
             request,
-            steering=self._steering(message, request, found),
+            steering=self._steering(message, request),
             exclude=tuple(message.exclude),
             exclude_poses=tuple(
                 (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
@@ -136,11 +137,11 @@ class RequestBuilder:
             ),
         )
 
-    def _steering(self, message: GraspRequest, request: Request, found: SourceObject) -> Callable[[], Steering] | None:
+    def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
         """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
         if not asks_for_any(message):
             return None
-        stamp, shown = message.header.stamp, found.shown
+        stamp, shown = message.header.stamp, request.shown
         T_object_header = request.to_object(
             message.header.frame_id, np.eye(4), lambda target, source: self._lookup(target, source, stamp)
         )

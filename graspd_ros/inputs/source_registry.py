@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
@@ -17,8 +18,7 @@ from sensor_msgs.msg import Image
 from graspd_core import Scene, Target, load_scene
 from graspd_core.errors import MeshError
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.types import Plane
-from graspd_ros.convert import Matrix, moved_points, nanoseconds, near, pose_matrix
+from graspd_ros.convert import moved_points, nanoseconds, near, pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.inputs.sensor_frames import (
     CameraPlace,
@@ -35,59 +35,48 @@ from graspd_ros.inputs.sensor_frames import (
 )
 from graspd_ros.inputs.solids import plane_of, with_support
 from graspd_ros.parameters import Settings
-from graspd_ros.request import KnownObject
+from graspd_ros.request import KnownObject, Listener, Request
 
 MOST_MESH_BYTES = 10**8  # an OBJ of some 1.5 million faces; reading more takes minutes and gigabytes
 MOST_PATH = 4096
 _FORMS = "a path, file:///path or package://package/path"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SourceInput:
     """What a source may look at.
 
     Attributes:
+        request_id: what the request goes by.
+        source: name of the source.
         message: the request; its fields are checked.
         settings: the parameters, with what the request asks for itself.
+        listener: who is told of it beside the topics; None where nobody is.
         newest: the newest frame that a camera sent; None before the first.
         views: the frames that were kept.
-        now: the node's clock [ns].
+        now: by the node's clock.
         lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
         lookup_in_time: the same for the worker's thread; waits for what comes late.
     """
 
+    request_id: str
+    source: str
     message: GraspRequest
     settings: Settings
+    listener: Listener | None = None
     newest: SensorFrame | None
     views: Views
-    now: int
+    now: Time
     lookup: Lookup
     lookup_in_time: Lookup
 
-
-@dataclass(frozen=True, eq=False)
-class SourceObject:
-    """The object that a source gives.
-
-    Attributes:
-        frame: the frame that the object is in.
-        stamp: when it was as it was given; zero where the source does not say.
-        load: reads the object; slow, may raise a GraspdError.
-        T_frame_object: pose of the object's own frame in `frame`; None where they are one.
-        key: same for the very same object, as it is or was seen then; empty where nobody can tell.
-        known: what a library of grasps may know it by; None: nothing.
-        surface: what it stands on, in its own frame; None: nothing, or the cloud shows it.
-        shown: reads the points that the request's region_mask shows, in `frame` [m]; None where there is no image.
-    """
-
-    frame: str
-    stamp: Time
-    load: Callable[[], Scene]
-    T_frame_object: Matrix | None = None
-    key: str = ""
-    known: KnownObject | None = None
-    surface: Plane | None = None
-    shown: Callable[[], Float[np.ndarray, "points 3"]] | None = None
+    def request(self, frame: str, stamp: Time, load: Callable[[], Scene], **fields: Any) -> Request:
+        """Return the request for an object in a frame; a stamp of zero is that of now. `fields` are more of Request."""
+        timeless = nanoseconds(stamp) == 0
+        fields |= {"listener": self.listener, "timeless": timeless}
+        return Request(
+            self.request_id, self.source, frame, self.now if timeless else stamp, self.settings, load, **fields
+        )
 
 
 @dataclass(frozen=True)
@@ -100,7 +89,7 @@ class Source:
     """
 
     name: str
-    find: Callable[[SourceInput], SourceObject]
+    find: Callable[[SourceInput], Request]
 
 
 def latest_frame(newest: SensorFrame | None, now: int, settings: Settings) -> SensorFrame:
@@ -147,13 +136,13 @@ def frame_loader(
     return load
 
 
-def _from_cloud(given: SourceInput) -> SourceObject:
-    frame = cloud_frame(given.message.cloud, given.now)
-    frame.check_age(given.now, given.settings.cloud_max_age)
+def _from_cloud(given: SourceInput) -> Request:
+    frame = cloud_frame(given.message.cloud, nanoseconds(given.now))
+    frame.check_age(nanoseconds(given.now), given.settings.cloud_max_age)
     return _of_frame(given, frame)
 
 
-def _from_mesh(given: SourceInput) -> SourceObject:
+def _from_mesh(given: SourceInput) -> Request:
     settings, uri = given.settings, given.message.mesh_uri
     path = resolve_mesh(uri, settings.mesh_roots)
     # Same for the same mesh in the same size, as long as the file is not written again.
@@ -163,10 +152,10 @@ def _from_mesh(given: SourceInput) -> SourceObject:
         return found
     # Grasps of an earlier run stand for another one where the same things stand about the object.
     stands = f" {found.surface.normal.round(4)} {found.surface.offset:.4f}"
-    return replace(found, key=found.key + stands)
+    return replace(found, object_key=found.object_key + stands)
 
 
-def _from_known(given: SourceInput) -> SourceObject:
+def _from_known(given: SourceInput) -> Request:
     message, settings = given.message, given.settings
     if not settings.grasp_library:
         raise bad_request("source: KNOWN=4, and the parameter grasp_library names no library")
@@ -180,33 +169,27 @@ def _from_known(given: SourceInput) -> SourceObject:
     return _placed(given, named_loader(known, settings), f"known {message.known_object}", known)
 
 
-def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: KnownObject | None) -> SourceObject:
+def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: KnownObject | None) -> Request:
     """An object that is known whole, where the request says that it stands."""
     message = given.message
     header, pose = message.header, pose_matrix(message.object_pose)
     surface = plane_of(message.surface, np.linalg.inv(pose))
-    return SourceObject(
-        header.frame_id or given.settings.mesh_frame,
-        header.stamp,
-        with_support(load, surface),
-        pose,
-        key,
-        known=known,
-        surface=surface,
-    )
+    frame, load = header.frame_id or given.settings.mesh_frame, with_support(load, surface)
+    about = {"T_frame_object": pose, "object_key": key, "known": known, "surface": surface}
+    return given.request(frame, header.stamp, load, **about)
 
 
-def _from_latest_cloud(given: SourceInput) -> SourceObject:
-    return _of_frame(given, latest_frame(given.newest, given.now, given.settings))
+def _from_latest_cloud(given: SourceInput) -> Request:
+    return _of_frame(given, latest_frame(given.newest, nanoseconds(given.now), given.settings))
 
 
-def _from_views(given: SourceInput) -> SourceObject:
+def _from_views(given: SourceInput) -> Request:
     views, settings = given.views, given.settings
     if not views.clouds:
         raise RequestError(ErrorCode.NO_CLOUD, "no view is kept: call ~/add_view while clouds come")
     point = _target(given, views.frame)
     target = None if point is None else Target(point=point)
-    return SourceObject(views.frame, views.stamp, lambda: scene_of_views(views.clouds, settings, target))
+    return given.request(views.frame, views.stamp, lambda: scene_of_views(views.clouds, settings, target))
 
 
 SOURCES: dict[int, Source] = {
@@ -226,13 +209,14 @@ def source_of(message: GraspRequest) -> Source:
     return SOURCES[message.source]
 
 
-def _of_frame(given: SourceInput, frame: SensorFrame) -> SourceObject:
+def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     message, place = given.message, place_of(given.settings, given.message)
     point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
     load = frame_loader(frame, given.settings, place, given.lookup_in_time, point, mask)
     meant = "" if mask is not None else f"{point} {place} {given.settings.segment}"
     key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
-    return SourceObject(frame.frame, frame.stamp, load, key=key, shown=lambda: _shown(frame, message.region_mask))
+    shown = lambda: _shown(frame, message.region_mask)  # noqa: E731
+    return given.request(frame.frame, frame.stamp, load, object_key=key, shown=shown)
 
 
 def _shown(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:

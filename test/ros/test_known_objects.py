@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -206,11 +205,8 @@ def test_a_node_without_a_library_imports_none_of_it():
 @pytest.mark.timeout(300)
 def test_a_node_answers_another_process_from_its_library(client, start_node, folder: Path):
     process = start_node(grasp_library="known.grasps", num_grasps=2)
-    began = time.monotonic()
     client.send_request(**known(id="first"))
     answer = client.answer("first")
-    # Planning would take longer than this; a library takes some ten milliseconds.
-    assert time.monotonic() - began < 30
     assert (answer.status, len(answer.grasps)) == (GraspArray.SUCCEEDED, 2), answer.message
     assert "2 grasps of the library known.grasps" in answer.message
     client.send_request(**known(id="none", known_object="bell"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,11 +53,13 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     shelf.transform.translation, shelf.transform.rotation = Vector3(x=WALL + 0.25), Quaternion(w=1.0)
     frames.publish(TFMessage(transforms=[shelf]))
 
-    def ask(name: str) -> GraspArray:
-        client.send_request(id=name, source=GraspRequest.MESH, mesh_uri="mug.obj")
+    def ask(name: str, **fields: Any) -> GraspArray:
+        client.send_request(id=name, source=GraspRequest.MESH, mesh_uri="mug.obj", **fields)
         return client.answer(name)
 
-    assert farthest(ask("free")) > WALL
+    # From the side that the wall will be on.
+    there = {"approach_direction": Vector3(x=-1.0), "approach_angle": 0.8}
+    assert farthest(ask("free", **there)) > WALL
     things.publish(CollisionObject(id="cup", operation=CollisionObject.REMOVE))
     told = client.event(event="refused", source="collision_objects")
     assert told["message"] == "collision object 'cup': REMOVE: there is none; there are: none"
@@ -85,7 +88,7 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     things.publish(CollisionObject(id="nobody", operation=CollisionObject.REMOVE))
     client.forget()
     client.event(event="refused", source="collision_objects")
-    assert farthest(ask("cleared")) > WALL
+    assert farthest(ask("cleared", **there)) > WALL
 
 
 def test_without_the_messages_the_node_says_so_in_one_line(start_node, monkeypatch, tmp_path):

@@ -147,19 +147,20 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
     assert first.outcome is Outcome.SUCCEEDED
     second = ask("second", "first/0")
     assert len(loaded) == 1
-    assert second.grasps == first.grasps[1:2]
-    pose = matrix_of_posture(first.grasps[1].grasp)
-    third = ask("third", "first/0", poses=(("object", pose),))
-    assert third.grasps == first.grasps[2:3]
-    # When all are lost, another run begins, and gives none like them.
-    fourth = ask("fourth", "first/0", "second/0", "third/0")
-    assert len(loaded) == 2
-    assert fourth.outcome is Outcome.SUCCEEDED
     lost = [matrix_of_posture(grasp.grasp) for grasp in first.grasps]
+    assert list(second.grasps) == unlike(first.grasps, lost[:1])[:1]
+    pose = matrix_of_posture(second.grasps[0].grasp)
+    third = ask("third", "first/0", poses=(("object", pose),))
+    assert unlike(third.grasps, [lost[0], pose]) == list(third.grasps)
+    # When all are lost, another run begins, and gives none like them.
+    before = len(loaded)
+    fourth = ask("fourth", *(f"first/{rank}" for rank in range(len(first.grasps))), "third/0")
+    assert len(loaded) == before + 1
+    assert fourth.outcome is Outcome.SUCCEEDED
     assert unlike(fourth.grasps, lost) == list(fourth.grasps)
     # Seen anew, the object is another: a run, and still none like the lost one.
     fifth = ask("fifth", "first/0", key="cloud 2")
-    assert len(loaded) == 3
+    assert len(loaded) == before + 2
     assert unlike(fifth.grasps, lost[:1]) == list(fifth.grasps)
     with pytest.raises(RequestError, match="exclude: no grasp 'nobody/0' in the last 16 runs; kept: first, second"):
         ask("sixth", "nobody/0")

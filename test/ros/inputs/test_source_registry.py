@@ -13,8 +13,9 @@ from std_msgs.msg import Header
 from graspd_core import load_scene
 from graspd_ros.error_codes import ErrorCode, RequestError
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.source_registry import SOURCES, Source, SourceInput, SourceObject
+from graspd_ros.inputs.source_registry import SOURCES, Source, SourceInput
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
 
 NOW, SEEN = Time(sec=1000), Time(sec=999)
 SCANNER = 9
@@ -47,14 +48,14 @@ def test_a_source_without_a_row_is_refused_and_the_rows_are_named(builder, monke
 def test_a_source_is_one_row(builder, monkeypatch: pytest.MonkeyPatch):
     scene, given = load_scene("shape:box", resolution=16), []
 
-    def from_scanner(asked: SourceInput) -> SourceObject:
+    def from_scanner(asked: SourceInput) -> Request:
         given.append((asked.message, asked.settings.num_grasps, asked.now))
-        return SourceObject("scanner", SEEN, lambda: scene)
+        return asked.request("scanner", SEEN, lambda: scene)
 
     monkeypatch.setitem(SOURCES, SCANNER, Source("scanner", from_scanner))
     message = GraspRequest(source=SCANNER, num_grasps=3, header=Header(frame_id="map"))
     request = builder.from_message("r", Settings(), message)
-    assert given == [(message, 3, 1000 * 10**9)]
+    assert given == [(message, 3, NOW)]
     assert (request.source, request.frame, request.stamp, request.timeless) == ("scanner", "scanner", SEEN, False)
     assert request.T_frame_object is None
     assert request.settings.num_grasps == 3

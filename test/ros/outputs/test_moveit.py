@@ -1,23 +1,16 @@
-"""A grasp as MoveIt's message, tried on the real message class: rosidl makes it from the fields of moveit_msgs here.
-
-moveit_msgs is not on PyPI. The fields and types below are those of its release for Jazzy; rosidl's Python classes check
-the type of every assignment.
-"""
+"""A grasp as MoveIt's message: every field as MoveIt reads it, and what is refused."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
-from importlib import import_module
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
+from moveit_msgs.msg import Grasp as MoveItGrasp
 from std_msgs.msg import Header
 
 from graspd_core.errors import ConfigError
@@ -28,42 +21,6 @@ from graspd_ros.outputs.messages import Pace, grasp_message
 from graspd_ros.outputs.moveit import MoveItMissing, moveit_grasp
 
 HAND = load_hand("allegro_right")
-FIELDS = {
-    "GripperTranslation": "geometry_msgs/Vector3Stamped direction\nfloat32 desired_distance\nfloat32 min_distance\n",
-    "Grasp": """string id
-trajectory_msgs/JointTrajectory pre_grasp_posture
-trajectory_msgs/JointTrajectory grasp_posture
-geometry_msgs/PoseStamped grasp_pose
-float64 grasp_quality
-GripperTranslation pre_grasp_approach
-GripperTranslation post_grasp_retreat
-GripperTranslation post_place_retreat
-float32 max_contact_force
-string[] allowed_touch_objects
-""",
-}
-
-
-@pytest.fixture(scope="module")
-def moveit_msgs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
-    root = tmp_path_factory.mktemp("moveit")
-    convert = import_module("rosidl_adapter.msg").convert_msg_to_idl
-    (root / "msg").mkdir()
-    for name, fields in FIELDS.items():
-        (root / "msg" / f"{name}.msg").write_text(fields)
-        convert(root, "moveit_msgs", Path("msg") / f"{name}.msg", root / "msg")
-    share = Path(sys.prefix) / "share"
-    includes = [f"{package}:{share / package}" for package in ("geometry_msgs", "trajectory_msgs", "std_msgs")]
-    files = [f"{root}:msg/{name}.idl" for name in FIELDS]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
-        generator = import_module("rosidl_generator_py.cli").GeneratePython("rosidl_generator_py")
-        generator.generate("moveit_msgs", files, includes, root / "made" / "moveit_msgs")
-        (root / "made" / "moveit_msgs" / "__init__.py").touch()
-        patch.syspath_prepend(root / "made")
-        yield import_module("moveit_msgs.msg")
-    for name in [name for name in sys.modules if name.split(".")[0] == "moveit_msgs"]:
-        del sys.modules[name]
 
 
 def message(verdict: Verdict = Verdict.VERIFIED) -> Any:
@@ -80,17 +37,18 @@ def message(verdict: Verdict = Verdict.VERIFIED) -> Any:
 UP = {"retreat": (0.0, 0.0, 2.0), "retreat_frame": "world"}
 
 
-def test_every_field_is_filled_as_moveit_reads_it(moveit_msgs: ModuleType):
+def test_every_field_is_filled_as_moveit_reads_it():
     ours = message()
     theirs = moveit_grasp(ours, **UP, retreat_distance=0.2)
-    assert isinstance(theirs, moveit_msgs.Grasp)
+    assert isinstance(theirs, MoveItGrasp)
     assert theirs.id == ours.id == "mesh-1/0"
     assert theirs.grasp_quality == 0.25
     assert theirs.grasp_pose.header.frame_id == "camera"
     assert theirs.grasp_pose.pose.position.z == pytest.approx(0.22)
     assert theirs.grasp_pose.pose.orientation.y == pytest.approx(math.sin(0.3))
     # Open first; then the closing, its clock starting where the opening ended.
-    opening, closing = theirs.pre_grasp_posture, theirs.grasp_posture
+    opening: Any = theirs.pre_grasp_posture
+    closing: Any = theirs.grasp_posture
     assert list(opening.points[0].positions) == list(ours.trajectory.points[0].positions)
     assert [list(p.positions) for p in closing.points] == [list(p.positions) for p in ours.trajectory.points[1:]]
     assert list(opening.joint_names) == list(closing.joint_names) == list(ours.trajectory.joint_names)
@@ -107,39 +65,39 @@ def test_every_field_is_filled_as_moveit_reads_it(moveit_msgs: ModuleType):
     assert retreat.desired_distance == pytest.approx(0.2)
 
 
-def test_the_message_it_is_made_from_stays_as_it_is(moveit_msgs: ModuleType):
+def test_the_message_it_is_made_from_stays_as_it_is():
     ours = message()
-    moveit_grasp(ours, **UP, messages=moveit_msgs)
+    moveit_grasp(ours, **UP)
     assert ours == message()
 
 
-def test_the_pose_is_that_of_the_arms_last_link(moveit_msgs: ModuleType):
+def test_the_pose_is_that_of_the_arms_last_link():
     # The hand is mounted 5 cm along the wrist's z, turned a quarter about it.
     wrist_base = matrix_of_pose(
         Pose(position=Point(z=0.05), orientation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5)))
     )
-    theirs = moveit_grasp(message(), **UP, T_parent_base=wrist_base, messages=moveit_msgs)
+    theirs = moveit_grasp(message(), **UP, T_parent_base=wrist_base)
     back = pose_of_matrix(matrix_of_pose(theirs.grasp_pose.pose) @ wrist_base)
     np.testing.assert_allclose(matrix_of_pose(back), matrix_of_pose(message().grasp_pose), atol=1e-12)
 
 
-def test_the_pose_of_a_mounted_hand_is_that_of_the_link_that_carries_it(moveit_msgs: ModuleType):
+def test_the_pose_of_a_mounted_hand_is_that_of_the_link_that_carries_it():
     ours = message()
     ours.mount_link, ours.mount_grasp_pose = "tool0", Pose(position=Point(z=0.4))
-    assert moveit_grasp(ours, **UP, messages=moveit_msgs).grasp_pose.pose == ours.mount_grasp_pose
+    assert moveit_grasp(ours, **UP).grasp_pose.pose == ours.mount_grasp_pose
     # What is said here counts for more.
-    theirs = moveit_grasp(ours, **UP, T_parent_base=np.eye(4), messages=moveit_msgs)
+    theirs = moveit_grasp(ours, **UP, T_parent_base=np.eye(4))
     np.testing.assert_allclose(matrix_of_pose(theirs.grasp_pose.pose), matrix_of_pose(ours.grasp_pose), atol=1e-12)
 
 
-def test_a_failed_grasp_is_not_handed_on(moveit_msgs: ModuleType):
+def test_a_failed_grasp_is_not_handed_on():
     with pytest.raises(ConfigError, match=r"mesh-1/0.*lost the object"):
-        moveit_grasp(message(Verdict.FAILED), **UP, messages=moveit_msgs)
+        moveit_grasp(message(Verdict.FAILED), **UP)
 
 
-def test_a_retreat_needs_a_direction(moveit_msgs: ModuleType):
+def test_a_retreat_needs_a_direction():
     with pytest.raises(ConfigError, match="retreat"):
-        moveit_grasp(message(), retreat=(0.0, 0.0, 0.0), retreat_frame="world", messages=moveit_msgs)
+        moveit_grasp(message(), retreat=(0.0, 0.0, 0.0), retreat_frame="world")
 
 
 def test_without_moveit_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
