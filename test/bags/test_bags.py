@@ -8,14 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import (
-    Record,
-    camera_info_message,
-    cloud_message,
-    depth_message,
-    transforms_message,
-    write_bag,
-)
+from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
 
 from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import BagError, CloudError, TransformError

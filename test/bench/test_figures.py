@@ -132,25 +132,6 @@ def test_a_metric_of_the_registry_has_a_column(record, monkeypatch: pytest.Monke
     assert "| box | 1/1 | 250.0 |" in table
 
 
-def test_hands_have_a_table_of_their_own_and_the_worst_object_of_each(record):
-    records = [
-        record("hand:leap_right", "box"),
-        record("hand:leap_right", "mug", held=1),
-        record("hand:parallel_gripper", "box", held=4),
-        record("balanced", "box"),
-    ]
-    table = tables.hands_table(records).splitlines()
-    assert [line.split(" | ")[0] for line in table] == [
-        "| hand",
-        "|---|---|---|---|---|---|---|---|---|",
-        "| `leap_right`",
-        "| `parallel_gripper`",
-    ]
-    assert [line.split(" | ")[-1] for line in table[2:]] == ["mug 1/4 |", "box 4/4 |"]
-    assert "hand:" not in tables.summary_table(records)
-    assert tables.summary_table(records[:3]) == ""
-
-
 def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     document = tmp_path / "page.md"
     spoken_of = "fills `<!-- bench:begin -->` and others"
@@ -176,15 +157,6 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
         report.fill(document, sections)
     with pytest.raises(ConfigError, match="No such file"):
         report.fill(tmp_path / "nowhere.md", {})
-
-
-def test_decades_are_shares_over_all_objects(record):
-    names = [f"problem.friction={value}" for value in ("0.2", "0.4")]
-    blocks = tables.decades_sections([record(name, thing) for name in names for thing in ("box", "mug")], None)[
-        "decades"
-    ]
-    assert "| closed form, friction | 0.02 | 0.06 | 0.2 | 0.4 | 2 | 6 | 20 |" in str(blocks[-1])
-    assert "| `problem.friction` | – | – | 4/8 | 4/8 | – | – | – |" in str(blocks[-1])
 
 
 def test_a_comparison_shows_what_moved_and_only_that(record, planned):

@@ -168,11 +168,11 @@ def test_what_raises_is_a_record_with_its_error_and_runs_again(tmp_path: Path, j
 
 @pytest.mark.timeout(120)
 def test_a_death_and_a_hang_cost_their_case_only(tmp_path: Path, job):
-    jobs = [job(what, alone=True, patience=20.0 if what == "sleep" else 600.0) for what in ("end", "sleep", "tell")]
+    jobs = [job(what, alone=True, patience=2.0 if what == "sleep" else 600.0) for what in ("end", "sleep", "tell")]
     records = {done.case: record for done, record in run_cases(jobs, tmp_path / "out", 3)}
     died, hung, told = (records[wanted.case] for wanted in jobs)
     assert (died["failed"], died["error"]) == ("died", "RuntimeError: its process died with exit code 7")
-    assert (hung["failed"], hung["error"]) == ("hung", "TimeoutError: no end after 20 s")
+    assert (hung["failed"], hung["error"]) == ("hung", "TimeoutError: no end after 2 s")
     assert told["environment"] == ENVIRONMENT
     assert told["odd"] is None, "JSON knows no infinity"
     kept = [store.read_record(tmp_path / "out", "errands", wanted.case, "1+a", failed=True) for wanted in jobs]

@@ -14,14 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import (
-    Record,
-    camera_info_message,
-    cloud_message,
-    depth_message,
-    transforms_message,
-    write_bag,
-)
+from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
 
 from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.cli import main
@@ -89,13 +82,6 @@ def test_a_bad_object_is_named_in_one_line(tmp_path: Path, capsys: pytest.Captur
 def test_a_bad_option_is_named_in_one_line(capsys: pytest.CaptureFixture[str], options: list[str], culprit: str):
     assert main(["synthesize", "shape:box", *options]) == EXIT_BAD_INPUT
     assert culprit in the_line(capsys)
-
-
-@pytest.mark.parametrize("option", ["--hand", "--preset"])
-def test_malformed_yaml_is_named_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str):
-    (tmp_path / "broken.yaml").write_text("a: [1\nb: {")
-    assert main(["synthesize", "shape:box", option, str(tmp_path / "broken.yaml")]) == EXIT_BAD_INPUT
-    assert "broken.yaml" in the_line(capsys)
 
 
 @pytest.mark.parametrize("option", ["--out", "--html"])

@@ -51,21 +51,14 @@ def one_point(height: float, velocity: list[float], **constants: float) -> list[
     return force[0, 0, 0].tolist()
 
 
-def test_one_millimetre_is_a_thousand_newtons_as_published():
+def test_one_point_by_hand():
     assert one_point(-0.001, [0, 0, 0]) == pytest.approx([0, 0, -1000.0])
     assert one_point(-0.001, [0, 0, 0.01]) == pytest.approx([0, 0, -1000.0])
-
-
-def test_friction_is_coulombs_where_it_slides():
     # μ times the normal force against the object's motion across the normal; its motion along it does not matter.
     assert one_point(-0.001, [0.003, 0.004, 0.02]) == pytest.approx([-480.0, -640.0, -1000.0])
-
-
-def test_friction_is_viscous_below_coulombs_bound():
+    # Friction is viscous below Coulomb's bound.
     assert one_point(-0.001, [0.003, 0.004, 0], friction_stiffness=100.0) == pytest.approx([-0.3, -0.4, -1000.0])
-
-
-def test_out_of_contact_there_is_no_force():
+    # Out of contact there is no force.
     assert one_point(0.001, [0.01, 0.01, 0.01]) == [0.0, 0.0, 0.0]
     assert one_point(0.0, [0.01, 0.01, 0.01]) == [0.0, 0.0, 0.0]
 
@@ -176,14 +169,11 @@ def pushed(velocity: list[float], contact: list[float]) -> tuple[list[float], li
     return linear[0, 0].tolist(), angular[0, 0].tolist()
 
 
-def test_a_point_pushes_a_ball_by_force_times_time_over_mass():
+def test_a_point_pushes_a_ball_and_friction_brakes_and_turns_it():
     linear, angular = pushed([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     # 1000 N for 10 µs on 100 g.
     assert linear == pytest.approx([-0.1, 0.0, 0.0])
     assert angular == pytest.approx([0.0, 0.0, 0.0])
-
-
-def test_friction_brakes_a_ball_and_turns_it():
     linear, angular = pushed([0.0, 0.0, 0.5], [1.0, 0.0, 0.0])
     # 800 N against the motion along z, 29 mm out along x: a torque about y of 23.2 N·m for 10 µs.
     assert linear == pytest.approx([-0.1, 0.0, 0.5 - 0.08])

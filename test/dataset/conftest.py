@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_dataset.blocks import Block, blocks_of
+from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -26,6 +26,14 @@ def made(blocks: tuple[Block, ...], tmp_path_factory: pytest.TempPathFactory) ->
     """The data set; not to be changed."""
     store = DatasetStore(str(tmp_path_factory.mktemp("dataset")))
     make_here(blocks, store)
+    return store
+
+
+@pytest.fixture(scope="session")
+def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
+    """Eight grasps of a mug; not to be changed."""
+    store = DatasetStore(str(tmp_path_factory.mktemp("allegro")))
+    make_here(blocks_of(DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")), store)
     return store
 
 

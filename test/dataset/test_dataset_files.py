@@ -20,7 +20,7 @@ from graspd_dataset.run_dataset import missing_blocks
 Run = Callable[..., int]
 
 
-def test_what_is_missing_is_found_by_listing(copied: DatasetStore, blocks: tuple[Block, ...]):
+def test_what_is_missing_is_found_by_listing(copied: DatasetStore, blocks: tuple[Block, ...], tmp_path: Path):
     assert missing_blocks(blocks, copied) == []
     first = next(path for path in copied.list("grasps") if key_of(path) == blocks[0].key)
     (Path(copied.where) / first).unlink()
@@ -31,9 +31,7 @@ def test_what_is_missing_is_found_by_listing(copied: DatasetStore, blocks: tuple
     copied.write(f"failed/{blocks[0].key}.json", b"{}")
     assert missing_blocks(blocks, copied) == []
     assert missing_blocks(blocks, copied, retry_failed=True) == [blocks[0]]
-
-
-def test_blocks_of_an_object_that_failed_are_not_tried_again(blocks: tuple[Block, ...], tmp_path: Path):
+    # Blocks of an object that failed are not tried again.
     store = DatasetStore(str(tmp_path))
     store.write(f"failed/{blocks[0].object.key}.json", b"{}")
     assert missing_blocks(blocks, store) == []

@@ -7,24 +7,13 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import pytest
 import yaml
-from small_dataset import make_here
 
 from graspd_core import load_hand, load_mesh
 from graspd_core.hands.kinematics import link_poses
-from graspd_dataset.blocks import DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.foreign_grasps import read_foreign
 from graspd_dataset.inspect_dataset import tables_of
-
-
-@pytest.fixture(scope="module")
-def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
-    store = DatasetStore(str(tmp_path_factory.mktemp("allegro")))
-    request = DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")
-    make_here(blocks_of(request), store)
-    return store
 
 
 def rows_of(store: DatasetStore) -> list[dict]:
@@ -95,9 +84,13 @@ def rows_of_objects(store: DatasetStore) -> list[dict]:
     return pd.read_parquet(f"{store.where}/objects").to_dict("records")
 
 
-def test_an_unknown_format_is_refused(allegro: DatasetStore, tmp_path: Path, graspd, capsys):
+def test_an_unknown_format_and_a_hand_that_a_format_does_not_know_are_refused(
+    allegro: DatasetStore, tmp_path: Path, graspd, capsys, made: DatasetStore
+):
     assert graspd("dataset", "export", allegro.where, "--to", "usd", "--out", tmp_path) == 2
     assert "to: 'usd'; valid: isaac, graspgen, dexgraspbench" in capsys.readouterr().err
+    assert graspd("dataset", "export", made.where, "--to", "dexgraspbench", "--out", tmp_path / "x") == 2
+    assert "hand 'parallel_gripper'; valid: allegro_right" in capsys.readouterr().err
 
 
 def menagerie_like() -> str:
@@ -152,8 +145,3 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
     assert np.allclose(
         np.ptp(np.concatenate([part.vertices for part in parts]), axis=0), np.ptp(whole.vertices, axis=0), atol=0.003
     )
-
-
-def test_dexgraspbench_knows_its_hands_only(made: DatasetStore, tmp_path: Path, graspd, capsys):
-    assert graspd("dataset", "export", made.where, "--to", "dexgraspbench", "--out", tmp_path / "x") == 2
-    assert "hand 'parallel_gripper'; valid: allegro_right" in capsys.readouterr().err

@@ -14,14 +14,12 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from small_dataset import make_here
 
 from graspd_core import load_grasps, load_hand
 from graspd_core.errors import FormatError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
 from graspd_core.types import Posture, Verdict
-from graspd_dataset.blocks import DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign
 from graspd_dataset.inspect_dataset import tables_of
@@ -30,16 +28,14 @@ HAND = load_hand("allegro_right")
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+def exported(allegro: DatasetStore, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
     """A folder with eight grasps of a mug in every format, and the rows that they were."""
     from graspd_core.cli import main
 
-    store = DatasetStore(str(tmp_path_factory.mktemp("rows")))
-    make_here(blocks_of(DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")), store)
     folder = tmp_path_factory.mktemp("exported")
     for kind in ("isaac", "graspgen", "dexgraspbench"):
-        assert main(["dataset", "export", store.where, "--to", kind, "--out", str(folder / kind)]) == 0
-    return folder, [row for _, _, table, _ in tables_of(store) for row in table.to_pylist()]
+        assert main(["dataset", "export", allegro.where, "--to", kind, "--out", str(folder / kind)]) == 0
+    return folder, [row for _, _, table, _ in tables_of(allegro) for row in table.to_pylist()]
 
 
 def links_at(posture: Posture) -> np.ndarray:
@@ -170,13 +166,16 @@ def test_a_file_that_runs_code_is_refused_and_runs_nothing(exported, tmp_path: P
     assert not witness.exists()
 
 
-def test_plain_values_of_every_protocol_are_read(tmp_path: Path):
+def test_plain_values_of_every_protocol_are_read_and_an_array_of_numbers_is_no_grasp(tmp_path: Path):
     values = {"obj_path": "x", "obj_scale": np.float32(0.5), "grasp_qpos": np.arange(23.0), "n": [1, (2, 3)]}
     for protocol in range(5):
         file = BytesIO()
         np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": ()})
         pickle.dump(np.array(values, dtype=object), file, protocol=protocol)
         assert set(npy_dictionary(tmp_path, file.getvalue())) == set(values)
+    np.save(tmp_path / "numbers.npy", np.zeros(23))
+    with pytest.raises(FormatError, match="holds an array of float64 of shape"):
+        read_foreign(tmp_path, HAND)
 
 
 CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
@@ -233,12 +232,6 @@ def test_a_truncated_npy_is_refused_wherever_it_ends(exported, tmp_path: Path):
         cut.write_bytes(content[:size])
         with pytest.raises(FormatError, match=r"cut\.npy: "):
             read_foreign(cut, HAND, mesh="shape:mug")
-
-
-def test_an_array_of_numbers_is_no_grasp(tmp_path: Path):
-    np.save(tmp_path / "numbers.npy", np.zeros(23))
-    with pytest.raises(FormatError, match="holds an array of float64 of shape"):
-        read_foreign(tmp_path, HAND)
 
 
 def test_isaac_joints_go_by_name(exported, tmp_path: Path):
@@ -301,13 +294,8 @@ def test_a_bench_tries_them_beside_ours(exported, tmp_path: Path, graspd, capsys
     away.mkdir()
     np.save(away / "0.npy", np.load(good, allow_pickle=True), allow_pickle=True)
     np.save(away / "1.npy", np.array(values, dtype=object), allow_pickle=True)
-    words = (
-        "bench",
-        "--import",
-        away,
-        "--objects",
-        *(exported[0] / "dexgraspbench" / "objects").rglob("simplified.obj"),
-    )
+    meshes = (exported[0] / "dexgraspbench" / "objects").rglob("simplified.obj")
+    words = ("bench", "--import", away, "--objects", *meshes)
     words += ("--hand", "allegro_right", "--presets", "fast", "--trials", "standard,gravity", "--out", tmp_path / "out")
     assert graspd(*words) == 0
     (record,) = json.loads((tmp_path / "out" / "results.json").read_text())["records"]

@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from graspd_core import load_hand, load_scene, plan_grasps
@@ -15,7 +14,6 @@ from graspd_core.hands.model import all_joint_names, all_joint_positions
 from graspd_core.runtime.worker_process import WorkerProcess
 from graspd_core.verify.metrics import METRICS
 from graspd_dataset import block_rows
-from graspd_dataset.block_rows import kind_of_reason
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of, by_object
 from graspd_dataset.dataset_store import DatasetStore, key_of, parquet_bytes, read_parquet
 from graspd_dataset.inspect_dataset import tables_of
@@ -142,19 +140,3 @@ def test_a_request_that_makes_no_sense_is_refused(changes: dict, culprit: str):
 def test_what_is_named_must_be_there():
     with pytest.raises(MeshError, match=r"no_such\.obj"):
         blocks_of(DatasetRequest(("no_such.obj",)))
-
-
-def test_reasons_are_counted_without_their_numbers():
-    assert kind_of_reason("hold", "the object turned 17° while squeezing") == "hold: the object turned while squeezing"
-    assert kind_of_reason("lift", "the object moved 13.3 cm under a pull along +y") == (
-        "lift: the object moved under a pull along +y"
-    )
-
-
-def test_postures_are_unit_quaternions_in_the_objects_frame(made: DatasetStore):
-    for _, _, table, _ in tables_of(made):
-        q = np.array(table["grasp_quaternion_wxyz"].to_pylist())
-        assert np.allclose(np.linalg.norm(q, axis=1), 1.0)
-        # A sphere of 35 mm about the origin: the hand's base is outside of it and near.
-        distance = np.linalg.norm(np.array(table["grasp_position"].to_pylist()), axis=1)
-        assert ((distance > 0.035) & (distance < 0.4)).all()

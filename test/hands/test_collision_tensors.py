@@ -1,7 +1,9 @@
-"""Distances to primitives: by hand, their gradients, and all solids at once as each on its own."""
+"""Distances to primitives and of all solids at once; forward kinematics against finite differences."""
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +14,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
+from graspd_core.hands.kinematics import (
+    Kinematics,
+    forward,
+    make_kinematics,
+    place_points,
+    placement,
+    point_jacobian,
+    points_in_base,
+)
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import (
     CollisionTensors,
@@ -26,6 +36,7 @@ from graspd_core.hands.link_distance import (
     sphere_sdf,
 )
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.se3 import SE3
 
 
@@ -55,7 +66,7 @@ def drawn(hand: HandModel, seed: int, postures: int = 2, points: int = 12) -> tu
 
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=8)
-def test_distances_are_those_of_the_primitives(hand, solids, kinematics, seed):
+def test_distances_are_those_of_the_primitives_and_pairs_are_entries_of_the_whole(hand, solids, kinematics, seed):
     q, points = drawn(hand, seed)
     links = forward(kinematics, q)
     together = solid_distance(solids, links, points)
@@ -71,13 +82,6 @@ def test_distances_are_those_of_the_primitives(hand, solids, kinematics, seed):
         if own.any():
             union = torch.stack([primitive_sdf(p, local) for p in hand.primitives_of[link]]).amin(0)
             assert together[..., own].amin(-1).numpy() == pytest.approx(union.numpy(), abs=1e-12)
-
-
-@given(seed=st.integers(0, 2**31))
-@settings(max_examples=8)
-def test_pairs_are_entries_of_the_whole(hand, solids, kinematics, seed):
-    q, points = drawn(hand, seed)
-    links = forward(kinematics, q)
     which = torch.randint(len(solids.link), points.shape[:2], generator=torch.Generator().manual_seed(seed))
     pairs = pair_distance(solids, links, points, which)
     whole = solid_distance(solids, links, points).gather(-1, which[..., None]).squeeze(-1)
@@ -180,3 +184,92 @@ def test_distance_changes_no_faster_than_one_moves(name, seed):
     a, b = (torch.rand(16, 3, generator=generator, dtype=torch.float64) - 0.5 for _ in range(2))
     change = (KERNELS[name](a) - KERNELS[name](b)).abs()
     assert (change <= (a - b).norm(dim=-1) + 1e-12).all()
+
+
+SLIDER = """<robot name="slider">
+  <link name="rail"/><link name="cart"/><link name="plate"/><link name="arm"/><link name="second"/>
+  <link name="third"/>
+  <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/>
+    <origin xyz="0.1 0 0" rpy="0.3 -0.2 0.5"/><axis xyz="0 1 1"/>
+    <limit lower="-0.1" upper="0.2" effort="5" velocity="1"/></joint>
+  <joint name="weld" type="fixed"><parent link="cart"/><child link="plate"/><origin xyz="0 0 0.05" rpy="0 0 1"/></joint>
+  <joint name="turn" type="continuous"><parent link="plate"/><child link="arm"/><axis xyz="1 2 2"/></joint>
+  <joint name="other" type="revolute"><parent link="rail"/><child link="second"/><origin xyz="0 0.2 0"/>
+    <axis xyz="0 0 -1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="follows" type="revolute"><parent link="arm"/><child link="third"/><origin xyz="0.03 0 0" rpy="1 0 0"/>
+    <axis xyz="0 1 0"/><limit lower="-9" upper="9"/><mimic joint="other" multiplier="-0.7" offset="0.2"/></joint>
+</robot>"""
+
+
+@pytest.fixture(scope="module")
+def allegro() -> HandModel:
+    return load_hand("allegro_right")
+
+
+@pytest.fixture(scope="module")
+def slider(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
+    path = tmp_path_factory.mktemp("slider") / "slider.urdf"
+    path.write_text(SLIDER)
+    return read_urdf(path)
+
+
+@pytest.fixture(scope="module", params=["allegro", "slider"])
+def moving(request: pytest.FixtureRequest) -> HandModel:
+    return request.getfixturevalue(request.param)
+
+
+def _random_q(moving: HandModel, count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(moving.lower, moving.upper, (count, moving.num_joints))
+
+
+def test_gradients_by_finite_differences(moving: HandModel) -> None:
+    kinematics = make_kinematics(moving, dtype=torch.float64)
+    q = torch.as_tensor(_random_q(moving, 2, 2)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: tuple(vars(forward(kinematics, x)).values()), q)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_link_poses_are_rigid_and_placing_agrees_with_them(allegro: HandModel, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    q = _random_q(allegro, 3, seed)
+    points, links = rng.normal(size=(30, 3)), rng.integers(0, allegro.num_links, 30)
+    kinematics = make_kinematics(allegro, dtype=torch.float64)
+    poses = forward(kinematics, torch.as_tensor(q))
+    rotations, translations = poses.rotation, poses.translation
+    eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
+    torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
+    expected = (rotations[:, links] @ torch.as_tensor(points)[None, :, :, None]).squeeze(-1)
+    turned = place_points(
+        placement(allegro.num_links, torch.as_tensor(points), torch.as_tensor(links), directions=True),
+        poses,
+    )
+    torch.testing.assert_close(turned, expected, atol=1e-12, rtol=0)
+    moved = points_in_base(kinematics, torch.as_tensor(q), torch.as_tensor(points), torch.as_tensor(links))
+    torch.testing.assert_close(moved, expected + translations[:, links], atol=1e-12, rtol=0)
+
+
+def test_point_jacobian_is_the_derivative(moving: HandModel) -> None:
+    rng = np.random.default_rng(3)
+    q = _random_q(moving, 1, 3)[0]
+    points, links = rng.normal(size=(25, 3)) * 0.05, rng.integers(0, moving.num_links, 25)
+    kinematics = make_kinematics(moving, dtype=torch.float64)
+
+    def positions(x: torch.Tensor) -> torch.Tensor:
+        return points_in_base(kinematics, x[None], torch.as_tensor(points), torch.as_tensor(links))[0]
+
+    expected = torch.autograd.functional.jacobian(positions, torch.as_tensor(q))
+    np.testing.assert_allclose(point_jacobian(moving, q, points, links), np.asarray(expected), atol=1e-12)
+
+
+def test_a_hand_is_laid_out_once_and_let_go_again(allegro: HandModel) -> None:
+    assert make_kinematics(allegro) is make_kinematics(allegro, torch.device("cpu"), torch.float32)
+    assert make_kinematics(allegro) is not make_kinematics(allegro, dtype=torch.float64)
+    solids = [make_collision_tensors(allegro, device, torch.float32) for device in ("cpu", torch.device("cpu"))]
+    assert solids[0] is solids[1]
+    first = weakref.ref(copy := replace(allegro))
+    assert make_kinematics(copy) is not make_kinematics(allegro)
+    for copy in (replace(allegro) for _ in range(20)):
+        make_kinematics(copy)
+    gc.collect()
+    assert first() is None

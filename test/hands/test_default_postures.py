@@ -109,7 +109,6 @@ def test_a_guessed_hand_holds_a_box(name: str) -> None:
     assert result.outcome is Outcome.SUCCEEDED
 
 
-QUARTER = np.pi / 2
 SIDES = np.deg2rad([0.0, 120.0, 240.0])
 Vector = tuple[float, float, float]
 
@@ -192,30 +191,6 @@ def robotiq() -> Gripper:
     return Gripper(text, (0, 1, 0), (0, 0.0214, 0), ((0, 0, 1), (0, 0, 1), (0, 0, -1)), (0, 0.035, 0))
 
 
-def barrett() -> Gripper:
-    """After the BarrettHand: a spread of half a turn under two fingers, tips bent by 42 degrees and coupled.
-
-    The palm faces −x. Fingers close with negative values. The third's root stands 34 mm above those of the two, whose
-    spread joints lie that much deeper.
-    """
-    text = bar("palm", (0.0754, 0, 0), (0, 0, 0), (0.085, 0.085)) + '<link name="face"/>'
-    # z of the face is −x of the palm, y is z.
-    text += fixed(("palm", "face"), origin((0, 0, 0), (QUARTER, 0, -QUARTER)))
-    for i, x in enumerate((0.025, -0.025, 0.0)):
-        parent, place = "face", origin((0, 0.05, 0.008), (0, 0, QUARTER))
-        if i < 2:
-            limits, follows = ((0.0, 3.1416), None) if i == 0 else ((-3.1416, 0.0), ("j_base_0", -1.0))
-            text += bar(f"base_{i}", (0, 0, 0.036), (0.05, 0, 0.036), (0.02, 0.01))
-            text += joint(("face", f"base_{i}"), origin((x, 0, -0.0259), (0, 0, -QUARTER)), (0, 0, 1), limits, follows)
-            parent, place = f"base_{i}", origin((0.05, 0, 0.0339))
-        text += bar(f"first_{i}", (0, 0, 0), (0.07, 0, 0)) + bar(f"tip_{i}", (0, 0, 0), (0.058, 0, 0))
-        text += joint((parent, f"first_{i}"), place, (0, 1, 0), (-2.44, 0.0))
-        bent = origin((0.07, 0, 0), (0, -0.733, 0))
-        text += joint((f"first_{i}", f"tip_{i}"), bent, (0, 1, 0), (-0.84, 0.0), (f"j_first_{i}", 1 / 3))
-    down, up = (0, 0, -1), (0, 0, 1)
-    return Gripper(text, (-1, 0, 0), (0, 0, 0), (down, down, up), (0.058, 0, 0))
-
-
 def sdh() -> Gripper:
     """After Schunk's SDH: roots on a triangle with sides of 66 mm, limits of 90 degrees either way, straight at zero.
 
@@ -276,7 +251,7 @@ def one_motor() -> Gripper:
     return Gripper(text, (0, 0, -1), (0, 0, 0), ((-1, 0, 0), (-1, 0, 0), (1, 0, 0)), (0, 0, -0.05))
 
 
-GRIPPERS = {make.__name__: make for make in (robotiq, barrett, sdh, three_jaw, one_motor)}
+GRIPPERS = {make.__name__: make for make in (robotiq, sdh, three_jaw, one_motor)}
 
 
 def write(text: str, folder: Path) -> Path:

@@ -83,9 +83,13 @@ def test_a_bare_urdf_with_a_mesh_loads_with_a_warning(gripper: Path) -> None:
     assert {0, 1} == set(hand.candidate_link.tolist())
 
 
-def test_unknown_hand_lists_the_known_ones() -> None:
+def test_unknown_hand_lists_the_known_ones_and_a_description_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
     with pytest.raises(HandError, match=r"unknown hand 'alegro'; known: .*allegro_right"):
         load_hand("alegro")
+    path = tmp_path / "hand.yaml"
+    path.write_text("- 1\n")
+    with pytest.raises(HandError, match=r"hand.yaml:1: the file: expected a mapping"):
+        read_description(path)
 
 
 @pytest.mark.parametrize(
@@ -149,13 +153,6 @@ def test_a_mount_is_read_and_its_quaternion_made_exact(allegro_copy: Path, entry
         assert mount.quaternion_wxyz == pytest.approx(expected.quaternion_wxyz, abs=1e-15)
 
 
-def test_a_description_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "hand.yaml"
-    path.write_text("- 1\n")
-    with pytest.raises(HandError, match=r"hand.yaml:1: the file: expected a mapping"):
-        read_description(path)
-
-
 @pytest.mark.parametrize("count", [0, -5])
 def test_no_candidates_is_refused(count: int) -> None:
     with pytest.raises(HandError, match="candidates="):
@@ -167,7 +164,7 @@ def hand() -> HandModel:
     return load_hand("barrett_like", candidates=80)
 
 
-def test_the_report_counts_what_is_there(hand: HandModel) -> None:
+def test_the_report_counts_what_is_there_and_names_every_link_and_joint(hand: HandModel) -> None:
     found = report(hand)
     assert sum(link.candidates for link in found.links) == 80
     assert sum(len(link.solids) for link in found.links) == len(hand.primitives)
@@ -176,9 +173,6 @@ def test_the_report_counts_what_is_there(hand: HandModel) -> None:
     assert found.links[0].depth == 0
     assert all(link.depth > 0 for link in found.links[1:])
     assert found.pairs[0] < found.pairs[1]
-
-
-def test_the_text_names_every_link_and_joint(hand: HandModel) -> None:
     text = as_text(report(dataclasses.replace(hand, warnings=("something was mended",))))
     for name in (*hand.link_names, *hand.joint_names, *(mimic.name for mimic in hand.mimics)):
         assert name in text

@@ -1,4 +1,4 @@
-"""A method is added by one row; presets and ablations change what they name and nothing else."""
+"""A method is added by one row; presets, ablations and budgets change what they name; searches go on where few hold."""
 
 from __future__ import annotations
 
@@ -9,24 +9,31 @@ from types import ModuleType
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from graspd_bench.baselines.annealing import AnnealingConfig
-from graspd_bench.baselines.random_closure import RandomClosureConfig
 from graspd_bench.study import Request
 from graspd_bench.suites import main_suite
 from graspd_core.cli import build_parser
 from graspd_core.errors import ConfigError
-from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates, initial_poses_of, problem_of
+from graspd_core.hands.library import load_hand
+from graspd_core.optimize.candidates import (
+    PlannerInput,
+    PlannerOutput,
+    expected_to_hold,
+    find_candidates,
+    initial_poses_of,
+    problem_of,
+)
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
-from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, pack
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.plan_config import METHODS, Method, PlanConfig, load_preset, override, plan_config, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import Verdict
+from graspd_core.types import Grasp, Verdict
 
 
 @dataclass(frozen=True)
@@ -122,25 +129,6 @@ def test_baselines_have_a_preset_that_changes_the_method_alone(method: str):
     assert load_preset(method) == load_preset("balanced").with_method(method)
 
 
-SHORT = {
-    "closed_form": (replace(DEFAULT, explore_steps=1, refine_steps=1, polish_steps=1), 3),
-    "graspd2022": (Graspd2022Config(steps=4, level_set=LevelSetConfig(coarse_steps=1)), 4),
-    "annealing": (AnnealingConfig(steps=5), 5),
-    # Fingers close over twice the way from open to closed.
-    "random_closure": (RandomClosureConfig(close_steps=6), 12),
-}
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_each_method_takes_its_own_steps(hand, scenes, method: str):
-    settings, expected = SHORT[method]
-    steps: list[int] = []
-    hooks = Hooks(report=lambda _, of, __: steps.append(of), stop=lambda: bool(steps), interval=0.0)
-    config = PlanConfig(method=method, settings=settings)
-    find_candidates(scenes["sphere"], hand, count=1, seed=0, config=config, hooks=hooks)
-    assert steps[0] == expected
-
-
 def test_a_hard_contact_is_one_within_its_width_and_zero_beyond_without_gradient():
     distance = torch.tensor([[-0.005, -0.004, 0.0, 0.003, 0.0041]], dtype=DOUBLE, requires_grad=True)
     radius = torch.zeros(1, dtype=DOUBLE)
@@ -162,3 +150,82 @@ def test_the_hard_solver_looks_no_farther_than_the_end_width(hand, scenes, probl
     soft = ClosedForm(replace(config, activation="soft"), 2)
     assert hard.abs().max() == 0
     assert soft.value_and_gradient(problem, x, radius, config.delta_start, fine=False, sharp=False)[1].abs().max() > 0
+
+
+CONFIG = load_preset("balanced")
+
+
+def searched(scale: float, searches: int, hooks: Hooks | None = None) -> tuple[Grasp, ...]:
+    """Candidates for four grasps of a ball of 70 mm times that scale."""
+    config = replace(CONFIG, settings=replace(CONFIG.settings, searches=searches))
+    scene = load_scene("shape:sphere", scale=scale, resolution=config.resolution)
+    hand = load_hand("allegro_right", candidates=config.problem.fine_candidates)
+    return find_candidates(scene, hand, count=4, seed=0, config=config, hooks=hooks or Hooks()).grasps
+
+
+def scores(grasps: tuple[Grasp, ...]) -> list[float]:
+    return [grasp.score for grasp in grasps]
+
+
+def test_an_ordinary_object_is_searched_once():
+    once, thrice = searched(1.0, 1), searched(1.0, 3)
+    assert expected_to_hold(once[:4]) >= 3.6
+    assert scores(once) == scores(thrice)
+
+
+def test_a_small_one_is_searched_again_and_the_best_of_all_come_first():
+    once, twice = searched(0.25, 1), searched(0.25, 2)
+    assert expected_to_hold(once[:4]) < 3.6
+    assert set(scores(once)) < set(scores(twice))
+    assert scores(twice) == sorted(scores(twice), reverse=True)
+    assert expected_to_hold(twice[:4]) > expected_to_hold(once[:4])
+
+
+def test_a_search_that_is_cancelled_is_the_last():
+    steps: list[int] = []
+    once, stops = searched(0.25, 1), iter([True])
+
+    def stop() -> bool:
+        """Once, when a second search has begun."""
+        return len(steps) > 1 and steps[-1] < steps[-2] and next(stops, False)
+
+    found = searched(0.25, 3, Hooks(report=lambda step, of, loss: steps.append(step), stop=stop, interval=0.0))
+    assert steps.count(max(steps)) == 1
+    assert scores(found) == scores(once)
+
+
+@pytest.mark.parametrize("name", sorted(set(METHODS) - {"closed_form"}))
+def test_other_methods_search_once_as_published(name: str):
+    assert METHODS[name].searches(METHODS[name].config()) == 1
+
+
+def test_no_score_is_too_far_for_a_probability():
+    (grasp, *_) = searched(1.0, 1)
+    far = [expected_to_hold([replace(grasp, score=score)]) for score in (-1e5, -800.0, 0.0, 800.0, 1e5)]
+    assert far == [0.0, 0.0, 0.5, 1.0, 1.0]
+
+
+USUAL = PlanConfig()
+STEPS, STARTS = ("explore_steps", "refine_steps", "polish_steps"), ("starts_per_grasp", "keep_per_grasp")
+
+
+def figures(config: PlanConfig, names: tuple[str, ...]) -> list[float]:
+    return [getattr(config.settings, name) for name in names]
+
+
+def test_half_the_budget_is_half_the_steps_and_twice_is_twice_the_starts():
+    assert USUAL.at_budget(1.0) == USUAL
+    assert figures(USUAL.at_budget(0.5), STEPS) == [25, 40, 40]
+    assert figures(USUAL.at_budget(2.0), STARTS) == [16.0, 4.0]
+    # With less than the budget there is one search, and a stage without steps stays so.
+    assert [USUAL.at_budget(budget).settings.searches for budget in (0.9, 1.0, 2.0)] == [1, 3, 3]
+    without = replace(USUAL, settings=replace(USUAL.settings, polish_steps=0))
+    assert without.at_budget(0.3).settings.polish_steps == 0
+
+
+@given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
+def test_more_budget_is_never_less_of_anything(one: float, other: float):
+    small, large = (USUAL.at_budget(budget) for budget in sorted((one, other)))
+    for names in (STEPS, STARTS):
+        assert all(a <= b for a, b in zip(figures(small, names), figures(large, names), strict=True))
+    assert min(figures(small, STEPS)) >= 1

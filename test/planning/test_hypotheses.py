@@ -30,7 +30,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification
-from graspd_core.verify.hold_trial import STOPPED, hold_trial
+from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.robustness import (
     Hypotheses,
     Hypothesis,
@@ -66,6 +66,12 @@ def plan(scene: Scene, probability: float, rounds: int = 3) -> GraspResult:
     config = replace(load_preset("fast"), certainty=CertaintyConfig(probability))
     config = replace(config, rounds=replace(config.rounds, most=rounds))
     return plan_grasps(scene, load_hand("allegro_right"), count=3, preset=config, measure=False)
+
+
+@cache
+def planned(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GraspResult:
+    """As sure as presets ask for."""
+    return plan(seen_from(shift), SURE)
 
 
 def under(*stages: Sequence[bool | None]) -> Hypotheses:
@@ -107,20 +113,6 @@ def test_several_at_a_time_come_to_the_same(passed, threads):
     one = try_hypotheses(asked, GRASP, lambda: False)
     assert one == try_hypotheses(asked, GRASP, lambda: False, together)
     assert one[0].passed == all(held is not False for stage in passed for held in stage)
-
-
-def test_a_run_that_ends_ends_the_trials_of_several_at_a_time():
-    over = threading.Event()
-
-    def hold(grasp: Grasp, stop: StopHook) -> TrialResult:
-        over.set()
-        while not stop():
-            time.sleep(0.001)
-        return TrialResult("hold", True, 0.0, 0.0, "")
-
-    asked = Hypotheses((tuple(Hypothesis(f"number {k}", hold) for k in range(5)),), HELD[1])
-    result, likely = try_hypotheses(asked, GRASP, over.is_set, partial(verification._at_once, 2))
-    assert (result.passed, result.reason, likely) == (False, STOPPED, HELD_THOUGH_FAILED[0])
 
 
 def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
@@ -223,7 +215,7 @@ def test_no_more_is_in_doubt_than_the_probability_asks_for(probability, stages):
 
 
 def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
-    result = plan(seen_from(), SURE)
+    result = planned()
     verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
@@ -294,7 +286,7 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
 
 
 def test_far_from_the_origin_the_other_shapes_are_where_the_object_is():
-    near, far = plan(seen_from(), SURE), plan(seen_from((300.0, -200.0, 100.0)), SURE)
+    near, far = planned(), planned((300.0, -200.0, 100.0))
     assert sum(grasp.usable for grasp in far.grasps) == sum(grasp.usable for grasp in near.grasps) == 3
 
 

@@ -11,7 +11,7 @@ import torch
 
 from graspd_bench.studies.robust_ranking import correlation, orders
 from graspd_core import verify_grasps
-from graspd_core.config import RobustConfig, RoundsConfig
+from graspd_core.config import RobustConfig
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.io.grasps_json import result_document
@@ -51,13 +51,6 @@ def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_step
     assert rounds(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), -0.045))) == all_steps
     assert rounds(replace(scene, obstacles=(neighbour,))) == all_steps
     assert rounds(replace(scene, confidence=torch.ones(scene.sdf.field.shape[1:]))) == all_steps
-
-
-def test_rounds_are_a_setting(scene):
-    steady = PlanConfig(rounds=RoundsConfig(most=2, first_budget=1.0, growth=1.0))
-    assert rounds_of(scene, steady, "standard") == [steady, steady]
-    for name in ("fast", "accurate"):
-        assert rounds_of(scene, load_preset(name), "standard")[0] == load_preset(name)
 
 
 def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, monkeypatch):

@@ -52,18 +52,6 @@ def test_results_come_in_the_order_of_the_items(number):
     assert list(results_in_order(never, lambda item, stop: item, [], number)) == []
 
 
-def test_the_second_is_worked_on_while_the_first_is_unfinished():
-    second_done = threading.Event()
-
-    def work(item: int, stop: StopHook) -> int:
-        if item == 1:
-            second_done.set()
-        assert second_done.wait(60)
-        return item
-
-    assert list(results_in_order(never, work, [0, 1], 2)) == [0, 1]
-
-
 def test_all_that_is_needed_is_worked_on_while_the_first_is_unfinished():
     begun, last_needed = [], threading.Event()
 

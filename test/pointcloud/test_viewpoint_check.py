@@ -89,21 +89,11 @@ def test_what_is_almost_on_the_border_is_told_from_what_is(away: float):
     assert reaches_image_border(points, EYE, mine, WIDTH) is (away < 1)
 
 
-def test_what_makes_the_outline_alone_does_not():
-    points = picture()
-    out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
-    both = np.concatenate([points, out])
-    assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
-
-
 def test_what_stands_out_over_the_end_of_the_table_does_not():
     """The sides of the outline go from its top to the corners of the table, and there is nothing along them."""
     points = picture(rows=300)
     out = points[(np.abs(points[:, 0]) < 0.05) & (points[:, 1] > 0.15)] + [0.0, 0.1, 0.0]
     both = np.concatenate([points, out])
     assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
-
-
-def test_nothing_reaches_nothing():
     assert not reaches_image_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool), WIDTH)
     assert not reaches_image_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool), WIDTH)

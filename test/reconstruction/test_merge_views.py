@@ -146,13 +146,10 @@ def test_where_the_density_of_points_changes_the_surface_stays():
     assert 1000 * surface_distance(surface, surfels.points).max() < 0.5
 
 
-def test_normals_of_no_surface_are_refused():
+def test_normals_and_points_of_no_surface_are_refused():
     surfels = samples("sphere", 2000)
     with pytest.raises(CloudError, match="2000 points"):
         field_of(Surfels(surfels.points, np.zeros((2000, 3))), axes_about(surfels.points))
-
-
-def test_points_of_no_surface_are_refused_though_a_field_could_be_drawn_to_them():
     points = np.random.default_rng(0).normal(0, 0.02, (3000, 3))
     with pytest.raises(CloudError, match=r"no surface fits its 3000 points \(\d\d% do\)"):
         field_of(Surfels(points, points / np.linalg.norm(points, axis=1, keepdims=True)), axes_about(points))

@@ -97,13 +97,10 @@ def at(place, shape: str = "box") -> TriangleMesh:
     return TriangleMesh(mesh.vertices + np.asarray(place, dtype=float), mesh.faces)
 
 
-def test_far_is_a_hundred_times_the_size():
+def test_far_is_a_hundred_times_the_size_and_near_the_origin_nothing_is_moved():
     size = 0.09
     assert not far_centre(at((99 * size, 0, 0)).vertices).any()
     assert far_centre(at((0, 101 * size, 0)).vertices) == pytest.approx([0, 101 * size, 0])
-
-
-def test_near_the_origin_nothing_is_moved():
     scene = load_scene("shape:box", resolution=16)
     planned, far = planning_scene(scene, 16)
     assert planned is scene

@@ -82,16 +82,6 @@ def test_a_start_goes_the_same_way_alone_and_among_many(sound, starts, clean):
     assert torch.equal(pack(alone.poses)[0], clean[3])
 
 
-@pytest.mark.slow
-def test_two_threads_go_where_one_goes(sound, starts, clean):
-    torch.set_num_threads(2)
-    try:
-        solution = minimise(ClosedForm(SHORT, BATCH), sound, starts, Hooks())
-    finally:
-        torch.set_num_threads(1)
-    assert torch.equal(pack(solution.poses), clean)
-
-
 def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     rotation = rotation_from_quaternion(starts.quaternion)
     palm = starts.translation + rotation @ torch.as_tensor(hand.palm_center, dtype=torch.float32)
@@ -107,23 +97,18 @@ def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     assert len(assemble(sound, hand, poses, PLAN)) > BATCH // 2
 
 
-def assert_every_start_moves(problem: Problem, starts: Poses, delta: float) -> None:
+@pytest.mark.parametrize(
+    ("friction", "delta"), [(0.02, 0.01), (0.2, 0.01), (2.0, 0.01), (20.0, 0.01), (0.4, 1e-6), (0.4, 1e-3), (0.4, 1.0)]
+)
+def test_decades_of_friction_and_contact_width_give_finite_losses(sound, starts, friction: float, delta: float):
     """Where a loss or a slope is no number, the solver says infinity and zero, so that such a start stands still."""
     for polish in (False, True):
         solver, radius = ClosedForm(SHORT, BATCH), torch.zeros(BATCH)
-        loss, gradient = solver.value_and_gradient(problem, pack(starts), radius, delta, fine=polish, sharp=polish)
+        look = {"fine": polish, "sharp": polish}
+        slippery = replace(sound, friction=friction)
+        loss, gradient = solver.value_and_gradient(slippery, pack(starts), radius, delta, **look)
         assert torch.isfinite(loss).all()
         assert (gradient.norm(dim=-1) > 0).all()
-
-
-@pytest.mark.parametrize("friction", [0.02, 0.2, 2.0, 20.0])
-def test_friction_over_three_decades_gives_finite_losses(sound, starts, friction: float):
-    assert_every_start_moves(replace(sound, friction=friction), starts, 0.01)
-
-
-@pytest.mark.parametrize("delta", [1e-6, 1e-3, 1.0])
-def test_contact_widths_over_six_decades_give_finite_gradients(sound, starts, delta: float):
-    assert_every_start_moves(sound, starts, delta)
 
 
 def test_a_surface_that_is_zero_all_over_gives_no_nan(sound, starts):

@@ -150,11 +150,8 @@ def test_a_firm_squeeze_gives_no_more_than_its_springs(usual_world, closing):
     assert gravity_trial(usual_world, closing(0.015, 0.0249, (0.033, 0.033)), USUAL) < springs + 0.001
 
 
-def test_an_object_out_of_reach_is_lost(usual_world, closing):
+def test_an_object_out_of_reach_or_pushed_into_is_lost(usual_world, closing):
     assert gravity_trial(usual_world, closing(0.015, 0.025, (0.03, 0.03), height=-0.3), USUAL) == pytest.approx(LOST)
-
-
-def test_a_start_that_the_hold_trial_refuses_is_lost(usual_world, closing):
     assert gravity_trial(usual_world, closing(0.04, 0.04, (0.04, 0.04)), USUAL) == LOST
 
 

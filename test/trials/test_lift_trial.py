@@ -264,9 +264,6 @@ def test_a_pile_settles_on_the_table_the_same_way_every_time(block):
     # What rests goes on resting.
     again = settle([replace(body, pose=pose) for body, pose in zip(pile, rest, strict=True)])
     assert np.allclose(again, rest, atol=1e-3)
-
-
-def test_nothing_settles_to_nothing():
     assert settle([]) == ()
 
 

@@ -159,9 +159,14 @@ def test_every_link_is_placed_as_kinematics_say(coupled, coupled_world):
     assert abs(errors(coupled, coupled_world, data)).max() == 0.0
 
 
-def test_only_leaders_have_motors(coupled, coupled_world):
+def test_only_leaders_have_motors_and_setting_joints_sets_those_that_follow(coupled, coupled_world):
     assert coupled_world.model.nu == coupled.num_joints
     assert coupled_world.model.neq == len(coupled.mimics)
+    data = mujoco.MjData(coupled_world.model)
+    q = 0.5 * (coupled.lower + coupled.upper)
+    set_joints(coupled_world, data, q)
+    movable = [data.qpos[a] for a in sorted({*coupled_world.joint_addresses, *coupled_world.coupled_addresses})]
+    np.testing.assert_allclose(movable, all_joint_positions(coupled, q))
 
 
 def test_followers_keep_up_while_the_hand_moves(coupled, coupled_world):
@@ -221,11 +226,3 @@ def test_a_trial_closes_coupled_jaws_on_a_cube(cube):
     assert hold_trial(coupled_world, grasp, USUAL).passed
     limp = replace(grasp, squeeze=at(0.0199))
     assert not hold_trial(coupled_world, limp, USUAL).passed
-
-
-def test_setting_joints_sets_those_that_follow(coupled, coupled_world):
-    data = mujoco.MjData(coupled_world.model)
-    q = 0.5 * (coupled.lower + coupled.upper)
-    set_joints(coupled_world, data, q)
-    movable = [data.qpos[a] for a in sorted({*coupled_world.joint_addresses, *coupled_world.coupled_addresses})]
-    np.testing.assert_allclose(movable, all_joint_positions(coupled, q))

@@ -17,6 +17,111 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand, read_hand_file
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 
+WEDGE = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.03]])
+FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+DAE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><library_geometries>
+<geometry id="g"><mesh><source id="p"><float_array id="a" count="12">{numbers}</float_array></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>{indices}</p></triangles></mesh></geometry>
+</library_geometries></COLLADA>"""
+MJCF = """<mujoco model="tri"><compiler angle="degree" eulerseq="zyx"/>
+<default><geom type="capsule"/><default class="f"><joint axis="0 1 0" range="-10 90"/><geom size="0.01 0.02"/>
+<default class="v"><geom contype="0" conaffinity="0"/></default></default></default>
+<asset><mesh name="t" vertex="0 0 0 .02 0 0 0 .02 0 0 0 .03" scale="1 -1 1"/><mesh name="w" file="wedge.obj"/></asset>
+<worldbody><geom type="plane" size="1 1 .1"/>
+<body name="palm" pos="1 2 3" euler="10 20 30" childclass="f"><freejoint/><geom type="box" size=".04 .04 .01"/>
+  <body name="a" pos="0.04 0 0.01" euler="10 -20 30">
+    <joint name="j1" pos="0 0 .01" ref="15"/><joint name="j2" axis="1 0 1" range="-5 60"/>
+    <geom fromto="0 0 0 0 0 .05" size=".01"/>
+    <body name="a2" pos="0 0 .05" axisangle="1 1 0 30"><joint name="j3"/><geom pos="0 0 .02"/>
+      <geom class="v" type="mesh" mesh="t"/>
+      <body name="tip" pos="0 0 .04" zaxis="1 0 1"><inertial pos="0 0 0" mass=".01" diaginertia="1e-5 1e-5 1e-5"/>
+        <geom type="ellipsoid" size=".01 .02 .01"/></body></body></body>
+  <body name="b" pos="-0.04 0 0.01" xyaxes="0 1 0 -1 0 0">
+    <joint name="s1" type="slide" range="0 .05" ref=".01" axis="1 1 0"/><geom type="mesh" mesh="t"/>
+    <body name="b2" pos="0 0 .05" quat="1 2 0 0"><joint name="k" pos=".01 0 0" range="-80 100" ref="5"/>
+      <geom type="mesh" mesh="w" pos="0 0 .02"/></body></body>
+</body></worldbody>
+<equality><joint joint1="k" joint2="j3" polycoef="0.1 .5 0 0 0"/></equality>
+<actuator><position joint="j1" forcerange="-2 2" kp="1"/><motor joint="s1" ctrlrange="0 5" gear="3"/></actuator>
+</mujoco>"""
+GEOMETRIES = (
+    '<box size="0.02 0.03 0.04"/>',
+    '<sphere radius="0.012"/>',
+    '<cylinder radius="0.01" length="0.04"/>',
+    '<capsule radius="0.01" length="0.03"/>',
+    '<mesh filename="wedge.obj"/>',
+    '<mesh filename="package://zoo/wedge.stl" scale="-1 1 0.5"/>',
+    '<mesh filename="wedge.dae" scale="2 2 2"/>',
+)
+_numbers = st.floats(-0.08, 0.08).map(lambda x: round(x, 4))
+_angles = st.floats(-3.1, 3.1).map(lambda x: round(x, 3))
+
+
+def _triple(values: st.SearchStrategy[float]) -> st.SearchStrategy[str]:
+    return st.tuples(values, values, values).map(lambda t: " ".join(map(repr, t)))
+
+
+@st.composite
+def urdfs(draw: st.DrawFn) -> tuple[str, dict[str, tuple[str, float, float]]]:
+    """A URDF with at least one actuated joint, and its couplings by joint: leader, multiplier, offset."""
+    count = draw(st.integers(2, 7))
+    links = "".join(_link(draw, i) for i in range(count))
+    joints, moving, couplings = [], [], {}
+    for child in range(1, count):
+        kinds = ["revolute", "continuous", "prismatic"] + (["fixed"] if moving or child < count - 1 else [])
+        kind = draw(st.sampled_from(kinds))
+        name, extra = f"joint_{child}", ""
+        if kind != "fixed":
+            axis = draw(_triple(st.sampled_from([-1.0, 0.0, 0.5, 2.0])).filter(lambda text: text != "0.0 0.0 0.0"))
+            extra = f'<axis xyz="{axis}"/>'
+            if kind != "continuous":
+                lower, width = draw(_numbers), draw(st.floats(0.01, 1.0))
+                extra += f'<limit lower="{lower}" upper="{lower + width}" effort="{draw(st.sampled_from([0, 3]))}"/>'
+            if moving and draw(st.booleans()):
+                leader, factor = draw(st.sampled_from(moving)), draw(st.sampled_from([-1.0, 0.5, 1.3]))
+                couplings[name] = (leader, factor, draw(_numbers))
+                extra += f'<mimic joint="{leader}" multiplier="{factor}" offset="{couplings[name][2]}"/>'
+            moving.append(name)
+        parent = draw(st.integers(0, child - 1))
+        joints.append(
+            f'<joint name="{name}" type="{kind}"><parent link="link_{parent}"/><child link="link_{child}"/>'
+            f'<origin xyz="{draw(_triple(_numbers))}" rpy="{draw(_triple(_angles))}"/>{extra}</joint>'
+        )
+    if not moving:
+        joints[-1] = joints[-1].replace('type="fixed"', 'type="continuous"')
+    order = draw(st.permutations(joints))
+    return f'<robot name="zoo">{links}{"".join(order)}</robot>', couplings
+
+
+def _link(draw: st.DrawFn, number: int) -> str:
+    tag = draw(st.sampled_from(["collision", "visual", ""]))
+    shape = draw(st.sampled_from(GEOMETRIES))
+    origin = f'<origin xyz="{draw(_triple(_numbers))}" rpy="{draw(_triple(_angles))}"/>'
+    # The first link always has a shape, because a hand without any is refused.
+    tag = tag or ("collision" if number == 0 else "")
+    body = f"<{tag}>{origin}<geometry>{shape}</geometry></{tag}>" if tag else ""
+    return f'<link name="link_{number}">{body}</link>'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A package with the wedge as obj, stl and dae."""
+    folder = tmp_path_factory.mktemp("zoo")
+    (folder / "package.xml").write_text("<package><name>zoo</name></package>")
+    faces = "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in FACES)
+    (folder / "wedge.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in WEDGE) + faces)
+    loops = "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {} {} {}\n".format(*WEDGE[i]) for i in face)
+        + "endloop\nendfacet\n"
+        for face in FACES
+    )
+    (folder / "wedge.stl").write_text(f"solid wedge\n{loops}endsolid wedge\n")
+    numbers, indices = " ".join(map(str, WEDGE.ravel())), " ".join(str(i) for face in FACES for i in face)
+    (folder / "wedge.dae").write_text(DAE.format(numbers=numbers, indices=indices))
+    return folder
+
 
 def _read(folder: Path, text: str) -> HandModel:
     path = folder / "changed.xml"
@@ -24,8 +129,8 @@ def _read(folder: Path, text: str) -> HandModel:
     return read_hand_file(path)
 
 
-def test_geoms_limits_and_warnings(folder: Path, mjcf: str) -> None:
-    hand = _read(folder, mjcf)
+def test_geoms_limits_and_warnings(folder: Path) -> None:
+    hand = _read(folder, MJCF)
     kinds = {hand.link_names[p.link]: p.kind for p in hand.primitives}
     # The visual wedge on a2 does not count, because a capsule there collides.
     assert kinds == {"palm": "box", "a": "capsule", "a2": "capsule", "tip": "hull", "b": "hull", "b2": "hull"}
@@ -45,30 +150,30 @@ def test_geoms_limits_and_warnings(folder: Path, mjcf: str) -> None:
     ]
 
 
-def test_visual_geoms_stand_in_where_none_collides(folder: Path, mjcf: str) -> None:
-    hand = _read(folder, mjcf.replace('<geom pos="0 0 .02"/>', "", 1))
+def test_visual_geoms_stand_in_where_none_collides(folder: Path) -> None:
+    hand = _read(folder, MJCF.replace('<geom pos="0 0 .02"/>', "", 1))
     assert hand.primitives_of[hand.link_index["a2"]][0].kind == "hull"
     assert any("visual ones are taken: a2" in text for text in hand.warnings)
 
 
-def test_a_base_that_turns_hangs_in_the_world(folder: Path, mjcf: str) -> None:
-    hand = _read(folder, mjcf.replace("<freejoint/>", '<joint name="wrist"/>'))
+def test_a_base_that_turns_hangs_in_the_world(folder: Path) -> None:
+    hand = _read(folder, MJCF.replace("<freejoint/>", '<joint name="wrist"/>'))
     assert (hand.base_link, hand.joint_names[0]) == ("world", "wrist")
     np.testing.assert_allclose(link_poses(hand, np.zeros(5))[1][hand.link_index["palm"]], [1, 2, 3])
 
 
-def test_defaults_in_several_sections_and_for_other_actuators_hold(folder: Path, mjcf: str) -> None:
-    apart = mjcf.replace('<geom type="capsule"/>', '<geom type="capsule"/></default><default>', 1)
+def test_defaults_in_several_sections_and_for_other_actuators_hold(folder: Path) -> None:
+    apart = MJCF.replace('<geom type="capsule"/>', '<geom type="capsule"/></default><default>', 1)
     apart = apart.replace("</default>\n<asset>", '<general forcerange="-2 2"/></default>\n<asset>', 1)
     apart = apart.replace(' forcerange="-2 2" kp', " kp", 1)
-    whole, hand = _read(folder, mjcf), _read(folder, apart)
+    whole, hand = _read(folder, MJCF), _read(folder, apart)
     assert [p.kind for p in hand.primitives] == [p.kind for p in whole.primitives]
     assert hand.effort.tolist() == [2.0, np.inf, np.inf, 6.0]
     assert whole.effort.tolist() == [2.0, np.inf, np.inf, 15.0]
 
 
-def test_ranges_that_do_not_hold_limit_nothing(folder: Path, mjcf: str) -> None:
-    hand = _read(folder, mjcf.replace("forcerange", 'forcelimited="false" forcerange').replace('"-5 60"', '"3 3"'))
+def test_ranges_that_do_not_hold_limit_nothing(folder: Path) -> None:
+    hand = _read(folder, MJCF.replace("forcerange", 'forcelimited="false" forcerange').replace('"-5 60"', '"3 3"'))
     assert hand.effort.tolist() == [np.inf, np.inf, np.inf, 15.0]
     assert any("joint 'j2' turns without end" in text for text in hand.warnings)
 
@@ -106,10 +211,10 @@ def test_ranges_that_do_not_hold_limit_nothing(folder: Path, mjcf: str) -> None:
         ("</worldbody>", "<site><body/></site>" * 301 + "</worldbody>", "307 links; a hand has at most 300"),
     ],
 )
-def test_what_is_not_read_is_named(folder: Path, mjcf: str, old: str, new: str, message: str) -> None:
-    assert old in mjcf
+def test_what_is_not_read_is_named(folder: Path, old: str, new: str, message: str) -> None:
+    assert old in MJCF
     with pytest.raises(HandError, match=message) as caught:
-        _read(folder, mjcf.replace(old, new, 1))
+        _read(folder, MJCF.replace(old, new, 1))
     assert str(caught.value).startswith(str(folder / "changed.xml"))
     assert "\n" not in str(caught.value)
 
@@ -144,9 +249,9 @@ def _check_against_mujoco(
 
 @settings(max_examples=12, **DRAWS)
 @given(data=st.data(), seed=st.integers(0, 2**31))
-def test_any_tree_moves_as_in_mujoco(folder: Path, trees: st.SearchStrategy, data: st.DataObject, seed: int) -> None:
+def test_any_tree_moves_as_in_mujoco(folder: Path, data: st.DataObject, seed: int) -> None:
     mujoco: Any = importlib.import_module("mujoco")
-    text, couplings = data.draw(trees)
+    text, couplings = data.draw(urdfs())
     path = folder / "zoo.urdf"
     path.write_text(text)
     hand = read_hand_file(path)
@@ -170,10 +275,10 @@ def test_any_tree_moves_as_in_mujoco(folder: Path, trees: st.SearchStrategy, dat
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_mjcf_file_moves_as_in_mujoco(folder: Path, mjcf: str, seed: int) -> None:
+def test_an_mjcf_file_moves_as_in_mujoco(folder: Path, seed: int) -> None:
     mujoco: Any = importlib.import_module("mujoco")
     path = folder / "tri.xml"
-    path.write_text(mjcf)
+    path.write_text(MJCF)
     hand = read_hand_file(path)
     assert (hand.name, hand.base_link, hand.joint_names) == ("tri", "palm", ("j1", "j2", "j3", "s1"))
     np.testing.assert_allclose(hand.effort, [2, np.inf, np.inf, 15])
@@ -190,11 +295,9 @@ def test_an_mjcf_file_moves_as_in_mujoco(folder: Path, mjcf: str, seed: int) -> 
 @pytest.mark.slow
 @settings(max_examples=6, deadline=None, **DRAWS)
 @given(data=st.data())
-def test_any_tree_is_given_a_palm_postures_and_candidates(
-    folder: Path, trees: st.SearchStrategy, data: st.DataObject
-) -> None:
+def test_any_tree_is_given_a_palm_postures_and_candidates(folder: Path, data: st.DataObject) -> None:
     path = folder / "whole.urdf"
-    path.write_text(data.draw(trees)[0])
+    path.write_text(data.draw(urdfs())[0])
     hand = load_hand(path, candidates=60)
     for posture in (hand.open_posture, hand.closed_posture):
         assert ((hand.lower <= posture) & (posture <= hand.upper)).all()
