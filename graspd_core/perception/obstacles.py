@@ -25,6 +25,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
 from graspd_core.mesh.topology import voxel_keys
+from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
@@ -68,7 +69,7 @@ def make_obstacles(
     return tuple(found)
 
 
-def _obstacle(points: Float[np.ndarray, "n 3"], support: Plane | None, padding: float) -> Obstacle:
+def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle:
     mesh = padded_hull(points, support, padding)
     return Obstacle(mesh, build_sdf(mesh, resolution=GRID_RESOLUTION, padding=0.02))
 
@@ -79,7 +80,7 @@ def _swallows(neighbour: Obstacle, target: TriangleMesh, padding: float) -> bool
     return bool((sample_sdf(neighbour.sdf, at)[0] < -2 * padding).any())
 
 
-def _cells(points: Float[np.ndarray, "n 3"], support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
+def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
     """The points, parted by a grid of cubes, or of columns that stand on the support."""
     if support is None:
         local = points
@@ -91,7 +92,7 @@ def _cells(points: Float[np.ndarray, "n 3"], support: Plane | None, side: float)
     return [points[which == part] for part in range(which.max() + 1)]
 
 
-def padded_hull(points: Float[np.ndarray, "n 3"], support: Plane | None, padding: float) -> TriangleMesh:
+def padded_hull(points: Points, support: Plane | None, padding: float) -> TriangleMesh:
     """The closed convex surface about points, their projection onto the support, and a skin of `padding` [m]."""
     corners = points
     if support is not None:
@@ -143,7 +144,7 @@ def with_neighbours(
     return replace(scene, object=replace(scene.object, warnings=warnings), obstacles=(*scene.obstacles, *obstacles))
 
 
-def _meets(shape: TriangleMesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> bool:
+def _meets(shape: TriangleMesh, low: Vector, high: Vector) -> bool:
     return bool((shape.vertices.min(0) <= high).all() and (shape.vertices.max(0) >= low).all())
 
 
@@ -168,9 +169,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
     return points[np.unique([int((points @ ray).argmax()) for ray in rays])]
 
 
-def _points_within(
-    shape: TriangleMesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "_ 3"]:
+def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
     """Points whose hull is that of the shape within a box: of its surface and of the box's corners."""
     from trimesh.intersections import slice_faces_plane
 

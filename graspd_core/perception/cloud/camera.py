@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt16
 
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.free_space import view_frame
-from graspd_core.perception.cloud.point_cloud import PointCloud, longest_side, transform_cloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, longest_side, transform_cloud
 
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 
@@ -64,11 +64,7 @@ class PinholeCamera:
 
 
 def camera_from_calibration(
-    width: int,
-    height: int,
-    matrix: _Numbers,
-    distortion: _Numbers = (),
-    model: str = "plumb_bob",
+    width: int, height: int, matrix: _Numbers, distortion: _Numbers = (), model: str = "plumb_bob"
 ) -> PinholeCamera:
     """The camera of a CameraInfo's `width`, `height`, `k` (row by row), `d` and `distortion_model`.
 
@@ -175,7 +171,7 @@ HULL_POINTS = 2000
 
 
 def reaches_image_border(
-    points: Float[np.ndarray, "points 3"], eye: Float[np.ndarray, "3"], mine: Bool[np.ndarray, "points"], width: float
+    points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
     """Whether the points of an object lie on a side of the view's outline on which other points lie too.
 
@@ -249,13 +245,7 @@ def depth_in_metres(
 
 
 def depth_from_bytes(
-    data: memoryview,
-    *,
-    width: int,
-    height: int,
-    step: int,
-    encoding: str,
-    is_bigendian: bool = False,
+    data: memoryview, *, width: int, height: int, step: int, encoding: str, is_bigendian: bool = False
 ) -> Float[np.ndarray, "height width"]:
     """Depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
 

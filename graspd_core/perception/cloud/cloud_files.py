@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
-from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 
 # The most that a byte of LZF, the method of compressed pcd, can stand for: 264 bytes by three.
 _DENSEST = 88
@@ -41,7 +41,7 @@ class _Element:
     codes: list[str] = field(default_factory=list)
 
 
-def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
+def read_ply_points(path: Path) -> Points:
     """The vertices of a ply file, text or binary in either byte order; NaN is kept.
 
     Raises:
@@ -72,7 +72,7 @@ def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return _rows(body, _packed([order + element.codes[k] for k in places], places, sizes), element.count, start)
 
 
-def read_pcd_points(path: Path) -> Float[np.ndarray, "n 3"] | None:
+def read_pcd_points(path: Path) -> Points | None:
     """The points of a pcd file, text or binary; NaN is kept. None where its data is compressed.
 
     Raises:
@@ -326,7 +326,7 @@ def _ply_has_faces(path: Path) -> bool:
     return any(len(words) > 2 and words[2] != b"0" for words in faces)
 
 
-def _pcd_viewpoint(path: Path) -> Float[np.ndarray, "3"]:
+def _pcd_viewpoint(path: Path) -> Vector:
     """Where the sensor stood, by the header; the origin where it does not say."""
     with path.open("rb") as file:
         header = file.read(4096).split(b"\nDATA")[0]
@@ -340,7 +340,7 @@ def _pcd_viewpoint(path: Path) -> Float[np.ndarray, "3"]:
     return place
 
 
-def _read_points(path: Path, ending: str) -> Float[np.ndarray, "n 3"]:
+def _read_points(path: Path, ending: str) -> Points:
     points = None
     try:
         if ending == "ply":
@@ -355,7 +355,7 @@ def _read_points(path: Path, ending: str) -> Float[np.ndarray, "n 3"]:
     return points
 
 
-def _read_open3d(path: Path) -> Float[np.ndarray, "n 3"]:
+def _read_open3d(path: Path) -> Points:
     import open3d as o3d
 
     # Open3D prints its complaints and returns nothing; the error below says it once.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_core.config import ReconstructionConfig
-from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.se3 import perpendicular
 
 # Depth images of more cells than this across the object tell no more.
@@ -44,7 +44,7 @@ class ViewDepth:
         beside: cells between this one and the outline, 0 within it and where something hides what is behind.
     """
 
-    eye: Float[np.ndarray, "3"]
+    eye: Vector
     frame: Float[np.ndarray, "3 3"]
     low: Float[np.ndarray, "2"]
     cell: float
@@ -176,9 +176,7 @@ def on_seen(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Boo
     return found
 
 
-def facing(
-    free_space: FreeSpace, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n"]:
+def facing(free_space: FreeSpace, points: Points, normals: Points) -> Float[np.ndarray, "n"]:
     """Cosine between normals and the way to the camera that they face most."""
     most = np.full(len(points), -1.0)
     for view_depth in free_space.view_depths:

@@ -14,6 +14,10 @@ from jaxtyping import Bool, Float
 from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import voxel_keys
 
+# Positions or directions, and one of them.
+Points = Float[np.ndarray, "n 3"]
+Vector = Float[np.ndarray, "3"]
+
 MIN_POINTS = 50
 # Points this many times the cloud's size away from its middle are no part of it.
 MAX_DISTANCE_IN_SIZES = 1e3
@@ -32,8 +36,8 @@ class PointCloud:
     """
 
     points: Float[np.ndarray, "points 3"]
-    viewpoint: Float[np.ndarray, "3"]
-    forward: Float[np.ndarray, "3"] | None = None
+    viewpoint: Vector
+    forward: Vector | None = None
 
     def thinned(self, size: float) -> PointCloud:
         """The first point in every voxel of side `size` [m]."""
@@ -49,7 +53,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
     return PointCloud(points, rotation @ cloud.viewpoint + position, forward)
 
 
-def measured(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
+def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
     """Which points were measured: finite, and not what drivers fill gaps with: zeros, or the camera's place."""
     zero = near = finite = np.ones(len(points), dtype=bool)
     # Column by column: NumPy takes ten times as long for what all of a short row is.
@@ -65,7 +69,7 @@ def longest_side(points: Float[np.ndarray, "n k"]) -> float:
     return max(float(np.ptp(column)) for column in points.T)
 
 
-def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     """The unit axis along which points spread the least, of each symmetric matrix of squared spreads.
 
     In closed form (the eigenvalues are roots of a cubic, by its cosines), in a quarter of `eigh`'s time for thousands.
@@ -99,7 +103,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
     return found
 
 
-def clean_cloud(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> PointCloud:
+def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
     """Drop points that are not finite, thin to an even density, drop outliers.
 
     Raises:
@@ -173,7 +177,7 @@ class CloudLayout:
     data: memoryview
 
 
-def points_from_layout(layout: CloudLayout) -> Float[np.ndarray, "n 3"]:
+def points_from_layout(layout: CloudLayout) -> Points:
     """The finite points of a cloud, in row order, in the cloud's own frame and unit.
 
     Organised or not, padded points and rows, float32 or float64, either byte order, x, y and z at any offset.

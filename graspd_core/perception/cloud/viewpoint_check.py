@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError
-from graspd_core.perception.cloud.point_cloud import measured
+from graspd_core.perception.cloud.point_cloud import Points, Vector, measured
 from graspd_core.se3 import perpendicular
 
 # A share of points that lie behind others. In 48 clouds with a D415's faults, thinned and cut out or not, the true
@@ -39,11 +39,7 @@ MIN_CONDITION = 100.0
 
 
 def check_viewpoint(
-    points: Float[np.ndarray, "n 3"],
-    viewpoint: Float[np.ndarray, "3"],
-    *,
-    grid: Float[np.ndarray, "height width 3"] | None = None,
-    alone: bool = False,
+    points: Points, viewpoint: Vector, *, grid: Float[np.ndarray, "height width 3"] | None = None, alone: bool = False
 ) -> None:
     """Refuse a cloud that shows that its camera stood elsewhere.
 
@@ -69,14 +65,14 @@ def check_viewpoint(
         raise _refusal(viewpoint, "things stand on the far side of the table")
 
 
-def _refusal(viewpoint: Float[np.ndarray, "3"], reason: str) -> CloudError:
+def _refusal(viewpoint: Vector, reason: str) -> CloudError:
     x, y, z = viewpoint
     said = "the origin of its frame" if not np.any(viewpoint) else f"({x:g}, {y:g}, {z:g})"
     hint = "say where it stood: sensor_frame or view_point; several cameras are several views"
     return CloudError(f"cloud: its camera did not stand at {said}: {reason}; {hint}")
 
 
-def hidden_share(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> float:
+def hidden_share(points: Points, viewpoint: Vector) -> float:
     """Share of the points that have nearer ones all around them, seen from the viewpoint."""
     from scipy.spatial import KDTree
 
@@ -96,7 +92,7 @@ def hidden_share(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, 
     return float((hidden[beside].mean(1) >= AGREEING_SHARE).sum() / len(ray))
 
 
-def things_behind(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> bool:
+def things_behind(points: Points, viewpoint: Vector) -> bool:
     """Whether more stands on the far side of a table, over what is seen of it, than on the side of the viewpoint."""
     from scipy.spatial import Delaunay
 
@@ -123,20 +119,20 @@ def things_behind(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray,
     return bool(far.mean() > MAX_HIDDEN_SHARE and far.sum() > near.sum())
 
 
-def _flat(points: Float[np.ndarray, "n 3"]) -> bool:
+def _flat(points: Points) -> bool:
     """Whether points are of a plane, seen with a camera's noise, and not of a slice of something round."""
     offset = points - points.mean(0)
     return bool(np.linalg.svd(offset, compute_uv=False)[2] < PLANE_NOISE * np.sqrt(len(points)))
 
 
-def _some(points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3"]:
+def _some(points: Points, viewpoint: Vector) -> Float[np.ndarray, "m 3"]:
     """Measured points, no more than are needed; zeros and the camera's own place are what drivers fill gaps with."""
     # In any order: clouds are often sorted by place, and the first of them would be a part of the scene.
     points = points[np.random.default_rng(0).permutation(len(points))[: 2 * MOST_POINTS]]
     return points[measured(points, viewpoint)][:MOST_POINTS]
 
 
-def _surrounded(ray: Float[np.ndarray, "3"], others: Float[np.ndarray, "n 3"]) -> bool:
+def _surrounded(ray: Vector, others: Points) -> bool:
     """Whether no half of the view around a ray is free of the others."""
     first = perpendicular(ray)
     offset = others - ray
@@ -157,7 +153,7 @@ class _PinholeFit:
         return bool(self.misfit < MAX_MISFIT and square)
 
 
-def _pinhole_fit(grid: Float[np.ndarray, "height width 3"], viewpoint: Float[np.ndarray, "3"]) -> _PinholeFit | None:
+def _pinhole_fit(grid: Float[np.ndarray, "height width 3"], viewpoint: Vector) -> _PinholeFit | None:
     """How well a pinhole camera at the viewpoint explains the pixels; None where there are too few."""
     pixels, points = _pixels(grid)
     ray = points - viewpoint
@@ -180,7 +176,7 @@ def _pinhole_fit(grid: Float[np.ndarray, "height width 3"], viewpoint: Float[np.
     )
 
 
-def _pinhole_place(grid: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"] | None:
+def _pinhole_place(grid: Float[np.ndarray, "height width 3"]) -> Vector | None:
     """Where the camera stood whose pixels these are; None where no pinhole fits or the scene is too flat to tell."""
     pixels, points = _pixels(grid)
     points, pixels = points[points.any(1)], pixels[points.any(1)]
@@ -198,7 +194,7 @@ def _pinhole_place(grid: Float[np.ndarray, "height width 3"]) -> Float[np.ndarra
     return centre + size * np.linalg.solve(P[:, :3], -P[:, 3])
 
 
-def _pixels(grid: Float[np.ndarray, "height width 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def _pixels(grid: Float[np.ndarray, "height width 3"]) -> tuple[Points, Points]:
     """Homogeneous pixels, as shares of the image's larger side from its middle, and their points; some of them."""
     height, width = grid.shape[:2]
     step = max(1, int(np.sqrt(height * width / MOST_PIXELS)))
@@ -209,7 +205,7 @@ def _pixels(grid: Float[np.ndarray, "height width 3"]) -> tuple[Float[np.ndarray
     return np.c_[pixels, np.ones(len(pixels))], some[seen]
 
 
-def _cross_rows(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "rows columns"]:
+def _cross_rows(a: Points, b: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "rows columns"]:
     """Equations of the 3 x m matrix M, row by row, that a x (M b) = 0 asks for."""
     zero = np.zeros_like(b)
     first, second, third = (a[:, [k]] * b for k in range(3))

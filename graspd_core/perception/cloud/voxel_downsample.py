@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
-from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, longest_side, measured
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
 
 # Of more points than this, every second, or third, ... is taken.
 MAX_SCENE_POINTS = 5_000_000
@@ -134,7 +134,7 @@ def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
     return ""
 
 
-def _voxels(points: Float[np.ndarray, "n 3"], size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
+def _voxels(points: Points, size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
     """Which voxel each point lies in, counted without gaps, and the side it came to."""
     # Column by column: NumPy takes seven times as long for the least of short rows.
     low = np.array([column.min() for column in points.T])

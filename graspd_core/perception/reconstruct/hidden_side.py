@@ -14,6 +14,7 @@ from graspd_core.errors import GraspdError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import first_hits, make_surface, surface_distance
 from graspd_core.mesh.topology import moved_mesh
+from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.reconstruct.merge_views import thin
 from graspd_core.perception.reconstruct.poisson import grid_poisson_field
 from graspd_core.perception.reconstruct.reconstruct import closed_mesh
@@ -30,7 +31,7 @@ _FLAT = 0.2
 _NEAR = 0.98
 
 
-def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"] | None:
+def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np.ndarray, "4 4"] | None:
     """`T_views_camera` [m] (z forward, y down) of the view, as far from the object as the first, that shows most.
 
     Of places around the object, above its support where it stands on one: the one that sees most of the surface that
@@ -61,7 +62,7 @@ def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Float[np.ndarray, "
     return _looking(eyes[best] + shift, -ways[best], evidence.rotation[:, 2]) if shown[best] > 0 else None
 
 
-def _ways(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
+def _ways(rotation: Float[np.ndarray, "3 3"]) -> Points:
     """Unit directions from the object to cameras above it, in the frame of the views."""
     azimuth, elevation = np.meshgrid(2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS, _ELEVATIONS)
     level = np.cos(elevation)
@@ -69,18 +70,14 @@ def _ways(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
     return way @ rotation.T
 
 
-def _visible(
-    mesh: TriangleMesh, eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-) -> int:
+def _visible(mesh: TriangleMesh, eye: Vector, points: Points, normals: Points) -> int:
     """How many of the points a camera sees."""
     sight = points - eye
     faces = -(sight * normals).sum(1) > _FLAT * np.linalg.norm(sight, axis=1)
     return int((first_hits(moved_mesh(mesh, -eye), sight[faces])[0] > _NEAR).sum())
 
 
-def _looking(
-    eye: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def _looking(eye: Vector, forward: Vector, up: Vector) -> Float[np.ndarray, "4 4"]:
     right = np.cross(forward, up)
     right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-9 else perpendicular(forward)
     pose = np.eye(4)

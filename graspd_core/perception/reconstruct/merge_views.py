@@ -17,13 +17,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows, voxel_keys
 from graspd_core.perception.cloud.free_space import view_frame
-from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, clean_cloud, least_axes
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, clean_cloud, least_axes
 from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
@@ -38,8 +37,8 @@ class Surfels:
         points: [m].
     """
 
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
+    points: Points
+    normals: Points
 
 
 def join(*parts: Surfels) -> Surfels:
@@ -125,7 +124,7 @@ def thin(surfels: Surfels, step: float) -> Surfels:
     return Surfels(mean(surfels.points), normals)
 
 
-def _thin_by_sight(view: PointCloud, step: float) -> Float[np.ndarray, "n 3"]:
+def _thin_by_sight(view: PointCloud, step: float) -> Points:
     """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
     ray = view.points - view.viewpoint
     distance = np.linalg.norm(ray, axis=1)
@@ -194,7 +193,7 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     raise CloudError(f"cloud: no surface passes through its {len(points)} points; views with their cameras are needed")
 
 
-def _normals(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _normals(points: Points) -> Points:
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.errors import CloudError
 from graspd_core.mesh.surface_queries import closest_points, make_surface
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
+from graspd_core.perception.cloud.point_cloud import Points
 from graspd_core.perception.reconstruct.merge_views import Surfels
 from graspd_core.types import TriangleMesh
 
@@ -56,7 +57,7 @@ def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
 
 
 def _fit(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: int
+    points: Points, normals: Points, depth: int
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
     import open3d as o3d
 
@@ -125,7 +126,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
     return march(_one_solid(value, cell), axes)
 
 
-def _beneath_floors(surfels: Surfels, lowest: float) -> Float[np.ndarray, "n 3"]:
+def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
     """Points of the support, at z = 0, beneath level surface that is nearly as low as anything seen: a cup's floor.
 
     The hull of what was seen ends at that floor, and would cut away all but a sheet thinner than the grid's cells.
@@ -186,9 +187,7 @@ def _touched(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: f
     return np.asarray(binary_dilation(touched, np.ones((3, 3, 3)), iterations=BAND_CELLS), dtype=bool)
 
 
-def _outside_hull(
-    points: Float[np.ndarray, "n 3"], nodes: Float[np.ndarray, "m 3"], cell: float
-) -> Float[np.ndarray, "m"]:
+def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) -> Float[np.ndarray, "m"]:
     """How far nodes lie outside the convex hull of points [m], in which any surface through them may close."""
     from scipy.spatial import ConvexHull, QhullError
 

@@ -20,7 +20,7 @@ from graspd_core.mesh.mesh_files import check_mesh, simplify
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, make_view_depths
-from graspd_core.perception.cloud.point_cloud import PointCloud, clean_cloud, measured
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, clean_cloud, measured
 from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, stand
 from graspd_core.perception.reconstruct.merge_views import (
     Surfels,
@@ -119,7 +119,7 @@ def reconstruct(
     return Reconstruction(mesh, confidence, method, warnings, evidence)
 
 
-def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> PointCloud:
+def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:
     return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
 
 
@@ -189,16 +189,14 @@ def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[
     return result
 
 
-def _some(view: PointCloud, most: int) -> Float[np.ndarray, "n 3"]:
+def _some(view: PointCloud, most: int) -> Points:
     """A view's measured points, some `most` of them at most; where none is, all, for the message that says so."""
     points = view.points[:: 1 + len(view.points) // most].astype(float)
     good = measured(points, view.viewpoint)
     return points[good] if good.any() else points
 
 
-def _frame(
-    views: Sequence[PointCloud], support: Plane | None
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np.ndarray, "3 3"], Vector]:
     """Axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
     points = np.concatenate([view.points for view in views])
     centre = points.mean(0)
@@ -247,9 +245,7 @@ def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
     return slow if is_closed(slow) else mesh
 
 
-def _confidence(
-    mesh: TriangleMesh, seen: Float[np.ndarray, "n 3"], settings: ReconstructionConfig
-) -> Float[np.ndarray, "vertices"]:
+def _confidence(mesh: TriangleMesh, seen: Points, settings: ReconstructionConfig) -> Float[np.ndarray, "vertices"]:
     """1 near seen points, less the farther from them."""
     from scipy.spatial import KDTree
 

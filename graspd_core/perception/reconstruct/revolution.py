@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.free_space import FreeSpace, weigh
+from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.reconstruct.merge_views import Surfels
 from graspd_core.perception.reconstruct.symmetry import CONTRADICTION_WEIGHT, UP
 from graspd_core.se3 import perpendicular
@@ -32,11 +33,11 @@ GAUSS_NEWTON_STEPS, MIN_AXIS_POINTS, DAMPING = 6, 30, 1e-3
 class Axis:
     """A line: a point on it [m] and its unit direction."""
 
-    point: Float[np.ndarray, "3"]
-    direction: Float[np.ndarray, "3"]
+    point: Vector
+    direction: Vector
 
 
-def fit_axis(surfels: Surfels, direction: Float[np.ndarray, "3"]) -> Axis:
+def fit_axis(surfels: Surfels, direction: Vector) -> Axis:
     """The line of that direction that the normals pass nearest to, those that miss it by far left out."""
     centre = surfels.points.mean(0)
     points, normals = surfels.points - centre, surfels.normals
@@ -56,7 +57,7 @@ def fit_axis(surfels: Surfels, direction: Float[np.ndarray, "3"]) -> Axis:
     return Axis(centre + place, direction)
 
 
-def meeting_direction(surfels: Surfels) -> Float[np.ndarray, "3"]:
+def meeting_direction(surfels: Surfels) -> Vector:
     """The direction of the line that all normals meet best, by iterated weights."""
     centre = surfels.points.mean(0)
     size = float(np.abs(surfels.points - centre).max())
@@ -75,7 +76,7 @@ def meeting_direction(surfels: Surfels) -> Float[np.ndarray, "3"]:
     return direction
 
 
-def half_plane(surfels: Surfels, axis: Axis) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
+def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, "n 4"]]:
     """Points turned about the axis into one half-plane: the unit direction that each lies in, then its height along the
     axis and distance from it [m], and its normal's part along and away from it."""
     offset = surfels.points - axis.point
@@ -117,10 +118,7 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
 
 
 def _thinner(
-    rows: Float[np.ndarray, "n 4"],
-    rates: Float[np.ndarray, "4 n 2"],
-    step: float,
-    scale: float,
+    rows: Float[np.ndarray, "n 4"], rates: Float[np.ndarray, "4 n 2"], step: float, scale: float
 ) -> Float[np.ndarray, "4"]:
     """How far to go by each motion, given the rates at which points rise and move outwards by it.
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
+from graspd_core.perception.cloud.point_cloud import Vector
 from graspd_core.perception.reconstruct.extrusion import extrude, stand
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
 from graspd_core.perception.reconstruct.revolution import find_revolution
@@ -38,7 +39,7 @@ class Evidence:
     free_space: FreeSpace
     step: float
     rotation: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
+    origin: Vector
     chosen: str
     settings: ReconstructionConfig
     hidden: bool

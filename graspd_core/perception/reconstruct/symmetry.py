@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.perception.cloud.free_space import FreeSpace, on_seen, weigh
+from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.reconstruct.merge_views import Surfels
 from graspd_core.se3 import perpendicular
 
@@ -42,7 +43,7 @@ class Symmetry:
     """
 
     linear: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
+    shift: Vector
     agree: float
     wrong: float
     worth: float
@@ -53,7 +54,7 @@ class _Sample:
     """What candidates are judged on: points all over what was seen, and where it ends."""
 
     few: Surfels
-    rim: Float[np.ndarray, "n 3"]
+    rim: Points
 
 
 def image(symmetry: Symmetry, surfels: Surfels) -> Surfels:
@@ -113,7 +114,7 @@ def find_centre(surfels: Surfels, free_space: FreeSpace) -> Symmetry:
 
 def _best_plane(
     normals: Float[np.ndarray, "k 3"], sample: _Sample, free_space: FreeSpace, score: Score
-) -> tuple[Symmetry, Float[np.ndarray, "3"]]:
+) -> tuple[Symmetry, Vector]:
     pivot = sample.few.points.mean(0)
     reach = (sample.few.points - pivot) @ normals.T
     low, high = reach.min(0), reach.max(0)
@@ -155,7 +156,7 @@ def _pick(
     return which, Symmetry(linear[which], shift[which], float(agree[which]), float(wrong[which]), value)
 
 
-def _closes(linear: Float[np.ndarray, "k 3 3"], side: Float[np.ndarray, "3"], standing: bool) -> Shares:
+def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) -> Shares:
     """How much of the mean normal of what was seen its image cancels; what faces up is the support's to cancel."""
     side = side * np.array([1.0, 1.0, 0.0]) if standing else side
     length = max(float(np.linalg.norm(side)), 1e-9)
@@ -195,7 +196,7 @@ def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
     return np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
 
 
-def _around(normal: Float[np.ndarray, "3"], angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
+def _around(normal: Vector, angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
     """Directions within an angle [rad]; of a level one, level ones."""
     steps = angle * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
     side = np.cross(normal, UP) if standing else perpendicular(normal)

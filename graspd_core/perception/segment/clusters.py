@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import least_axes, longest_side
+from graspd_core.perception.cloud.point_cloud import Points, Vector, least_axes, longest_side
 from graspd_core.perception.segment.planes import FlatPart
 
 # Flying pixels, which are spread along their lines of sight between two surfaces, have less than this share of the
@@ -37,7 +37,7 @@ SPARSE_LINK_RATIO = 2.5
 SPACING_SAMPLES = 2000
 
 
-def link_length(points: Float[np.ndarray, "n 3"], settings: SegmentationConfig) -> float:
+def link_length(points: Points, settings: SegmentationConfig) -> float:
     """Points this near belong together [m]: less than the gap, unless the points are too sparse."""
     from scipy.spatial import KDTree
 
@@ -50,7 +50,7 @@ def link_length(points: Float[np.ndarray, "n 3"], settings: SegmentationConfig) 
 
 
 def link_points(
-    points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], link: float, neighbour_share: float
+    points: Points, weight: Float[np.ndarray, "n"], link: float, neighbour_share: float
 ) -> Int[np.ndarray, "n"]:
     """Clusters of evenly dense points, numbered from the largest; -1: a stray.
 
@@ -92,7 +92,7 @@ def link_points(
     return renumber(label)
 
 
-def extent(points: Float[np.ndarray, "n 3"]) -> float:
+def extent(points: Points) -> float:
     """Length along the longest principal axis [m], however the points are turned."""
     centred = points - points.mean(0)
     _, axes = np.linalg.eigh(centred.T @ centred)
@@ -127,11 +127,8 @@ _OUTLINE_NEIGHBOURS, _OUTLINE_SPACINGS, _OUTLINE_ANGLE = 16, 2.2, np.deg2rad(110
 
 
 def touching_things(
-    points: Float[np.ndarray, "n 3"],
-    eyes: Float[np.ndarray, "views 3"],
-    height: Float[np.ndarray, "n"],
-    spacing: float,
-) -> tuple[Float[np.ndarray, "3"], ...]:
+    points: Points, eyes: Float[np.ndarray, "views 3"], height: Float[np.ndarray, "n"], spacing: float
+) -> tuple[Vector, ...]:
     """Middles of the parts of a cluster that seams and waists set apart and that stand on their own; empty where there
     is one.
 
@@ -168,9 +165,7 @@ def touching_things(
     return ()
 
 
-def _normals(
-    points: Float[np.ndarray, "n 3"], near: Int[np.ndarray, "n near"], eyes: Float[np.ndarray, "views 3"]
-) -> Float[np.ndarray, "n 3"]:
+def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Float[np.ndarray, "views 3"]) -> Points:
     """Unit normals of planes through neighbours, towards the camera that sees each the least from the side."""
     spread = points[near] - points[near].mean(1, keepdims=True)
     normals = least_axes(spread.transpose(0, 2, 1) @ spread)
@@ -180,9 +175,7 @@ def _normals(
     return normals * np.where(best < 0, -1.0, 1.0)[:, None]
 
 
-def _outline(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], near: Int[np.ndarray, "n near"]
-) -> Bool[np.ndarray, "n"]:
+def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -> Bool[np.ndarray, "n"]:
     """Which points have a wide sector about them, in the surface, without any of their neighbours; -1 is none."""
     near = near[:, 1 : 1 + _OUTLINE_NEIGHBOURS]
     way = points[near] - points[:, None]
@@ -197,10 +190,7 @@ def _outline(
 
 
 def _bend(
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    one: Int[np.ndarray, "pairs"],
-    other: Int[np.ndarray, "pairs"],
+    points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
     """Mean curvature about each point [1/m], of pairs `_REACH_M` apart at most; negative where it is hollow."""
     way = points[other] - points[one]
@@ -241,7 +231,7 @@ OUTLINE_SHARE = 0.6
 
 
 def merge_occluded(
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     distance: Float[np.ndarray, "n"],
     label: Int[np.ndarray, "n"],
     viewpoints: Float[np.ndarray, "views 3"],
@@ -286,7 +276,7 @@ def merge_occluded(
 
 
 def _near(
-    a: Float[np.ndarray, "n 3"],
+    a: Points,
     b: Float[np.ndarray, "m 3"],
     hang: tuple[bool, bool],
     apart: float,
@@ -308,7 +298,7 @@ def _near(
 
 
 def _hangs(
-    piece: Float[np.ndarray, "n 3"],
+    piece: Points,
     distance: Float[np.ndarray, "n"],
     support: FlatPart,
     viewpoints: Float[np.ndarray, "views 3"],
@@ -327,7 +317,7 @@ def _hangs(
     return True
 
 
-def _may_stand(piece: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"], support: FlatPart) -> bool:
+def _may_stand(piece: Points, other: Float[np.ndarray, "m 3"], support: FlatPart) -> bool:
     """Whether a piece that ends above the support may be a thing of its own beside the other, its foot hidden."""
     height, top = support.height(piece), float(support.height(other).max())
     level = abs(float(height.max()) - top) <= LEVEL_TOPS_M
@@ -335,34 +325,30 @@ def _may_stand(piece: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"],
     return len(piece) >= OWN_SURFACE_SHARE * len(other) and bool(own)
 
 
-def _touch_in_image(
-    a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"], eye: Float[np.ndarray, "3"], gap: float
-) -> bool:
+def _touch_in_image(a: Points, b: Float[np.ndarray, "m 3"], eye: Vector, gap: float) -> bool:
     """Whether a camera there sees less than `gap` between them, at the distance of the nearer one [m]."""
     (one, near), (other, far) = _directions(a, eye), _directions(b, eye)
     return _apart(one, other) <= gap / min(float(np.median(near)), float(np.median(far)))
 
 
-def _directions(
-    points: Float[np.ndarray, "n 3"], eye: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+def _directions(points: Points, eye: Vector) -> tuple[Points, Float[np.ndarray, "n"]]:
     """Unit vectors from a camera to points, and how far they are [m]."""
     away = np.linalg.norm(points - eye, axis=1).clip(1e-6)
     return (points - eye) / away[:, None], away
 
 
-def _apart(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"]) -> float:
+def _apart(a: Points, b: Float[np.ndarray, "m 3"]) -> float:
     """Least distance between two sets of points."""
     return float(_tree(a).query(b)[0].min())
 
 
-def _tree(points: Float[np.ndarray, "n 3"]):
+def _tree(points: Points):
     from scipy.spatial import KDTree
 
     return KDTree(points)
 
 
-def _share_within(small: Float[np.ndarray, "n 3"], large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:
+def _share_within(small: Points, large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:
     """Share of a piece that is inside the other's convex outline on the support."""
     from scipy.spatial import ConvexHull, QhullError
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.topology import packed_rows
-from graspd_core.perception.cloud.point_cloud import longest_side
+from graspd_core.perception.cloud.point_cloud import Points, Vector, longest_side
 from graspd_core.types import Plane
 
 # So many points, evenly taken, show which plane has most of them.
@@ -61,7 +61,7 @@ class FlatPart:
     area: float
     filled: float
 
-    def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def height(self, points: Points) -> Float[np.ndarray, "n"]:
         """Above the plane, towards the cameras [m]."""
         return points @ self.plane.normal - self.plane.offset
 
@@ -69,14 +69,14 @@ class FlatPart:
         """How high a point may be and still belong to the plane, by its distance from the camera [m]."""
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
-    def beneath(self, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
+    def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:
         """Whether points lie over the seen part, or at most `margin` beside it [m]."""
         flat = points @ self.axes
         return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
 
 
 def find_planes(
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     distance: Float[np.ndarray, "n"],
     viewpoints: Float[np.ndarray, "views 3"],
     settings: SegmentationConfig,
@@ -116,11 +116,11 @@ def find_planes(
 
 
 def _refine(
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     distance: Float[np.ndarray, "n"],
     left: Int[np.ndarray, "left"],
     guess: Float[np.ndarray, "4"],
-    viewpoint: Float[np.ndarray, "3"],
+    viewpoint: Vector,
     gate: float,
     settings: SegmentationConfig,
 ) -> FlatPart | None:
@@ -159,11 +159,7 @@ def _refine(
 
 
 def _measure(
-    points: Float[np.ndarray, "n 3"],
-    inliers: Bool[np.ndarray, "n"],
-    plane: Plane,
-    noise: float,
-    settings: SegmentationConfig,
+    points: Points, inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, settings: SegmentationConfig
 ) -> FlatPart | None:
     """The largest connected part of the inliers, by a raster in the plane; the others are no inliers."""
     from scipy.ndimage import binary_dilation, label

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
+from graspd_core.perception.cloud.point_cloud import Points
 from graspd_core.perception.cloud.voxel_downsample import VoxelScene
 from graspd_core.perception.segment.clusters import extent, link_length, link_points
 from graspd_core.perception.segment.planes import FlatPart
@@ -140,7 +141,7 @@ def _standing(
 
 def stands_on(
     part: FlatPart,
-    thing: Float[np.ndarray, "n 3"],
+    thing: Points,
     distance: Float[np.ndarray, "n"],
     viewpoints: Float[np.ndarray, "views 3"],
     settings: SegmentationConfig,
@@ -158,13 +159,13 @@ def stands_on(
     return bool(over) and part.area >= settings.support_area_ratio * _outline_area(flat)
 
 
-def _upright(part: FlatPart, thing: Float[np.ndarray, "n 3"], viewpoints: Float[np.ndarray, "views 3"]) -> bool:
+def _upright(part: FlatPart, thing: Points, viewpoints: Float[np.ndarray, "views 3"]) -> bool:
     """Whether all cameras look straight down on a thing."""
     sight = viewpoints - thing.mean(0)
     return bool((sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all())
 
 
-def _clearance(part: FlatPart, thing: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, "n"]) -> float:
+def _clearance(part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"]) -> float:
     """Between the plane's noise and the lowest point that is seen of a thing [m]."""
     return float((part.height(thing) - part.tolerance(distance)).min())
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.voxel_downsample import VoxelScene
 
 # Errors list so many things.
@@ -27,8 +27,8 @@ class Target:
         mask: which points of the first view, as given, show it.
     """
 
-    point: Float[np.ndarray, "3"] | None = None
-    box: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
+    point: Vector | None = None
+    box: tuple[Vector, Vector] | None = None
     mask: Bool[np.ndarray, "points"] | None = None
 
 
@@ -106,9 +106,7 @@ def seen(scene: VoxelScene, label: Int[np.ndarray, "voxels"]) -> str:
     return f"{told} about {', '.join(places)} m"
 
 
-def _nearest(
-    scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, point: Float[np.ndarray, "3"], reach: float
-) -> int:
+def _nearest(scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, point: Vector, reach: float) -> int:
     away = np.linalg.norm(scene.mean - point, axis=1)
     away[label < 0] = np.inf
     nearest = int(away.argmin())
@@ -145,7 +143,7 @@ def _covered(
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 
 
-def _off_axis(thing: Float[np.ndarray, "n 3"], scene: VoxelScene, views: Sequence[PointCloud]) -> float:
+def _off_axis(thing: Points, scene: VoxelScene, views: Sequence[PointCloud]) -> float:
     """Angle between the axis of the first view that shows anything and a thing, to a twentieth of its points [rad]."""
     first = next(k for k, rows in enumerate(scene.rows) if len(rows))
     axis, viewpoint = views[first].forward, views[first].viewpoint
@@ -157,5 +155,5 @@ def _off_axis(thing: Float[np.ndarray, "n 3"], scene: VoxelScene, views: Sequenc
     return float(np.percentile(np.arctan2(across, along), 5))
 
 
-def _place(point: Float[np.ndarray, "3"]) -> str:
+def _place(point: Vector) -> str:
     return f"({', '.join(f'{value:.3f}' for value in point)})"
