@@ -1,11 +1,9 @@
-"""What stands around the object, from what was seen of it: hulls that the hand keeps out of.
+"""What stands around the object: hulls that the hand keeps out of, of what was seen, or of shapes known as a whole.
 
 The back of a neighbour is not seen. Each is taken for the convex hull of its points and of their shadow on the table
 (what is seen is carried straight down), so that what lies beneath overhangs counts as full, and what hides behind the
 seen face counts only as far as the hull spans it: thin, on purpose, because a guess that bulges would block free space.
 A thing that goes round the object, whose hull would hold it, is taken in parts.
-
-Things about the object whose whole shape is known, as a planning scene knows them, as obstacles of a scene.
 """
 
 from __future__ import annotations
@@ -34,6 +32,14 @@ GRID_RESOLUTION = 32
 # Parts across a thing whose hull would hold the object.
 MAX_PARTS_ACROSS = 8
 _TARGET_SAMPLES = 2000
+# From this share of what the hulls of a thing and of the object fill together, the thing is the object itself: a box
+# about a ball has half of it, a box a quarter too large every way still 0.5, things that only touch have nothing.
+_SAME = 0.3
+_OVERLAP_SAMPLES = 4000
+# Of what is seen of a shape near the object [m²]; and the least and most points of one.
+_AREA_OF_A_SAMPLE = 1e-4
+_FEWEST, _MOST = 200, 4000
+_CORNERS = 200
 
 
 def make_obstacles(
@@ -105,16 +111,6 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
     return hull_surface((corners[:, None] + skin).reshape(-1, 3))
 
 
-# From this share of what the hulls of a thing and of the object fill together, the thing is the object itself: a box
-# about a ball has half of it, a box a quarter too large every way still 0.5, things that only touch have nothing.
-_SAME = 0.3
-_OVERLAP_SAMPLES = 4000
-# Of what is seen of a shape near the object [m²]; and the least and most points of one.
-_AREA_OF_A_SAMPLE = 1e-4
-_FEWEST, _MOST = 200, 4000
-_CORNERS = 200
-
-
 def with_neighbours(
     scene: Scene, things: Mapping[str, Sequence[TriangleMesh]], settings: SceneConfig | None = None
 ) -> Scene:
@@ -133,7 +129,7 @@ def with_neighbours(
     low, high = mesh.vertices.min(0) - reach, mesh.vertices.max(0) + reach
     found, same = [], []
     for name, shapes in things.items():
-        near = [shape for shape in shapes if _meets(shape, low, high)]
+        near = [s for s in shapes if (s.vertices.min(0) <= high).all() and (s.vertices.max(0) >= low).all()]
         if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
             same.append(f"collision object {name!r} fills the object's own place: taken for the object, no obstacle")
             continue
@@ -142,10 +138,6 @@ def with_neighbours(
     obstacles = make_obstacles(found, None, mesh, reach, settings.obstacles) if found else ()
     warnings = (*scene.object.warnings, *same)
     return replace(scene, object=replace(scene.object, warnings=warnings), obstacles=(*scene.obstacles, *obstacles))
-
-
-def _meets(shape: TriangleMesh, low: Vector, high: Vector) -> bool:
-    return bool((shape.vertices.min(0) <= high).all() and (shape.vertices.max(0) >= low).all())
 
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt16
 
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.free_space import view_frame
-from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, longest_side, transform_cloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, convex_hull, longest_side, transform_cloud
 
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 
@@ -177,8 +177,6 @@ def reaches_image_border(
 
     Directions within `width` [rad] of the hull of all directions are on the outline.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     if not mine.any():
         return False
     local = (points - eye) @ view_frame(PointCloud(points, eye))
@@ -186,9 +184,8 @@ def reaches_image_border(
     plane, mine = local[ahead, :2] / local[ahead, 2:], mine[ahead]
     if _well_within(plane[mine], plane[:: 1 + len(plane) // HULL_POINTS], width):
         return False
-    try:
-        hull = ConvexHull(plane)
-    except (QhullError, ValueError):
+    hull = convex_hull(plane)
+    if hull is None:
         return False
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * longest_side(plane)
@@ -208,13 +205,8 @@ def reaches_image_border(
 
 def _well_within(own: Float[np.ndarray, "own 2"], some: Float[np.ndarray, "some 2"], width: float) -> bool:
     """Whether no point is within `width` of the hull of all, since none is of the hull of some, which lies within."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        sides = ConvexHull(some).equations
-    except (QhullError, ValueError):
-        return False
-    return all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in sides)
+    hull = convex_hull(some)
+    return hull is not None and all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in hull.equations)
 
 
 def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -67,6 +68,16 @@ def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
 def longest_side(points: Float[np.ndarray, "n k"]) -> float:
     """Of the bounding box along the axes; column by column, as above."""
     return max(float(np.ptp(column)) for column in points.T)
+
+
+def convex_hull(points: Float[np.ndarray, "n k"]) -> Any:
+    """Return SciPy's convex hull of points, or None where they are too few, flat, or not finite."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
 
 
 def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:

@@ -7,8 +7,6 @@ another: from a wrong place, points lie behind others on all sides of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
@@ -52,8 +50,8 @@ def check_viewpoint(
     Raises:
         CloudError: and where the camera stood, if the cloud's pixels tell.
     """
-    fit = None if grid is None or min(grid.shape[:2]) < 2 else _pinhole_fit(grid, viewpoint)
-    place = None if fit is None or grid is None or fit.fits else _pinhole_place(grid)
+    fits = None if grid is None or min(grid.shape[:2]) < 2 else _pinhole_fits(grid, viewpoint)
+    place = _pinhole_place(grid) if fits is False and grid is not None else None
     if place is not None:
         x, y, z = place
         raise _refusal(viewpoint, f"its pixels show it at ({x:.3f}, {y:.3f}, {z:.3f})")
@@ -61,7 +59,7 @@ def check_viewpoint(
     share = hidden_share(points, viewpoint)
     if share > MAX_HIDDEN_SHARE and not (alone and share > ALL_ROUND_SHARE):
         raise _refusal(viewpoint, f"{100 * share:.1f} % of its points are hidden from there by others")
-    if not (alone or (fit is not None and fit.fits)) and things_behind(points, viewpoint):
+    if not (alone or fits) and things_behind(points, viewpoint):
         raise _refusal(viewpoint, "things stand on the far side of the table")
 
 
@@ -141,20 +139,8 @@ def _surrounded(ray: Vector, others: Points) -> bool:
     return bool(gaps.max() < np.pi)
 
 
-@dataclass(frozen=True)
-class _PinholeFit:
-    misfit: float  # median, in pixels
-    skew: float
-    stretch: float
-
-    @property
-    def fits(self) -> bool:
-        square = 1 / MAX_STRETCH < self.stretch < MAX_STRETCH and abs(self.skew) < MAX_SKEW
-        return bool(self.misfit < MAX_MISFIT and square)
-
-
-def _pinhole_fit(grid: Float[np.ndarray, "height width 3"], viewpoint: Vector) -> _PinholeFit | None:
-    """How well a pinhole camera at the viewpoint explains the pixels; None where there are too few."""
+def _pinhole_fits(grid: Float[np.ndarray, "height width 3"], viewpoint: Vector) -> bool | None:
+    """Whether a pinhole camera at the viewpoint explains the pixels; None where there are too few."""
     pixels, points = _pixels(grid)
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
@@ -171,9 +157,9 @@ def _pinhole_fit(grid: Float[np.ndarray, "height width 3"], viewpoint: Vector) -
     widths = np.linalg.norm(square[:2, :2], axis=1)
     pixel_angle = np.linalg.norm(H[:, 0]) / np.linalg.norm(H[:, 2]) / size
     skew = square[0, 1] / np.sqrt(square[0, 0] * square[1, 1]) if widths.all() else 1.0
-    return _PinholeFit(
-        float(np.median(angle) / max(pixel_angle, 1e-12)), float(skew), float(square[0, 0] / square[1, 1])
-    )
+    stretch, misfit = square[0, 0] / square[1, 1], np.median(angle) / max(pixel_angle, 1e-12)
+    is_square = 1 / MAX_STRETCH < stretch < MAX_STRETCH and abs(skew) < MAX_SKEW
+    return bool(misfit < MAX_MISFIT and is_square)
 
 
 def _pinhole_place(grid: Float[np.ndarray, "height width 3"]) -> Vector | None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, facing
+from graspd_core.perception.cloud.point_cloud import Points, convex_hull
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
 
 # A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
@@ -54,9 +55,21 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     levels = np.arange(0.5 * step, max(float(height.max()), step), step)
     row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
     points = np.column_stack([place[row, :2], levels[level]])
-    wrong = empty_depth(free_space, points) > free_space.slack
-    bad = np.bincount(row, wrong, len(place)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(place))
+    bad = _contradicted(points, row, len(place), free_space)
     return take(Surfels(points, outward[row]), ~bad[row])
+
+
+def _contradicted(
+    points: Points, line: Int[np.ndarray, "n"], lines: int, free_space: FreeSpace
+) -> Bool[np.ndarray, "lines"]:
+    """Which upright lines of a wall the cameras speak against, from the points of each."""
+    wrong = empty_depth(free_space, points) > free_space.slack
+    return np.bincount(line, wrong, lines) > MAX_CONTRADICTED_WALL * np.bincount(line, minlength=lines)
+
+
+def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
+    """Return the surfels, and where the object stands what joins it to the support."""
+    return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
@@ -98,11 +111,10 @@ def _walls(
     surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
 ) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
     """Walls beneath the outline seen from above, down to the height `bottom` [m], and where they stand."""
-    from scipy.spatial import ConvexHull, KDTree, QhullError
+    from scipy.spatial import KDTree
 
-    try:
-        hull = ConvexHull(surfels.points[:, :2])
-    except QhullError:
+    hull = convex_hull(surfels.points[:, :2])
+    if hull is None:
         return nothing(), np.zeros((0, 2))
     corners = surfels.points[hull.vertices, :2]
     edges = np.roll(corners, -1, 0) - corners
@@ -116,18 +128,16 @@ def _walls(
     levels = np.arange(bottom + 0.5 * step, max(float(top.max()), bottom + step), step)
     row, level = np.nonzero(levels[None] < top[:, None] - 0.5 * step)
     points = np.column_stack([rim[row], levels[level]])
-    wrong = empty_depth(free_space, points) > free_space.slack
-    bad = np.bincount(row, wrong, len(rim)) > MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(rim))
+    bad = _contradicted(points, row, len(rim), free_space)
     return take(Surfels(points, outward[row]), ~bad[row]), rim[~bad]
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
     """The support within the feet's outline, facing down, where it is hidden."""
-    from scipy.spatial import ConvexHull, KDTree, QhullError
+    from scipy.spatial import KDTree
 
-    try:
-        hull = ConvexHull(feet)
-    except QhullError:
+    hull = convex_hull(feet)
+    if hull is None:
         return nothing()
     corners = feet[hull.vertices]
     along = np.linspace(0, 1, 40, endpoint=False)[:, None, None]

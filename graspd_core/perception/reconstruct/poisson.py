@@ -17,12 +17,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from graspd_core.errors import CloudError
 from graspd_core.mesh.surface_queries import closest_points, make_surface
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
-from graspd_core.perception.cloud.point_cloud import Points
+from graspd_core.perception.cloud.point_cloud import Points, convex_hull
 from graspd_core.perception.reconstruct.merge_views import Surfels
 from graspd_core.types import TriangleMesh
 
@@ -41,31 +41,6 @@ _NODES_AT_ONCE = 1000
 
 # Signed distance near a surface through surfels [m], at the nodes of a grid of cubes of that width [m].
 Field = Callable[[Surfels, Float[np.ndarray, "x y z 3"], float], Float[np.ndarray, "x y z"]]
-
-
-def fit_poisson(surfels: Surfels, finest: float) -> TriangleMesh:
-    """The Poisson surface of oriented points, open where it leaves the cube of 1.2 times their size.
-
-    Its finest cells are about as wide as `finest` [m]: its grid halves from level to level.
-    """
-    size = float(np.ptp(surfels.points, axis=0).max())
-    depth = int(np.clip(np.round(np.log2(1.2 * size / finest)), 5, 7))
-    vertices, faces = _fit(surfels.points, surfels.normals, depth)
-    if len(faces) == 0:
-        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
-    return TriangleMesh(vertices, faces)
-
-
-def _fit(
-    points: Points, normals: Points, depth: int
-) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.normals = o3d.utility.Vector3dVector(normals)
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth, scale=1.2, n_threads=1)
-    return np.array(surface.vertices), np.array(surface.triangles, dtype=np.int64)
 
 
 def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
@@ -95,8 +70,26 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
 def poisson_field(
     surfels: Surfels, nodes: Float[np.ndarray, "x y z 3"], cell: float, finest: float
 ) -> Float[np.ndarray, "x y z"]:
-    """Signed distance to the Poisson surface [m] at the nodes of a grid of cubes, as `_signed`; `finest` as above."""
-    return _signed(fit_poisson(surfels, finest), nodes, cell)
+    """Return the signed distance [m] to Open3D's Poisson surface at the nodes of a grid of cubes, `cell` apart [m].
+
+    The surface is open where it leaves the cube of 1.2 times the points' size. Its finest cells are about as wide as
+    `finest` [m]: its grid halves from level to level.
+
+    Raises:
+        CloudError: no surface fits the points.
+    """
+    import open3d as o3d
+
+    size = float(np.ptp(surfels.points, axis=0).max())
+    depth = int(np.clip(np.round(np.log2(1.2 * size / finest)), 5, 7))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surfels.points))
+    cloud.normals = o3d.utility.Vector3dVector(surfels.normals)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth, scale=1.2, n_threads=1)
+    faces = np.array(surface.triangles, dtype=np.int64)
+    if len(faces) == 0:
+        raise CloudError(f"cloud: no surface fits its {len(surfels.points)} points; more views are needed")
+    return _signed(TriangleMesh(np.array(surface.vertices), faces), nodes, cell)
 
 
 def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: float) -> TriangleMesh:
@@ -189,11 +182,8 @@ def _touched(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: f
 
 def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) -> Float[np.ndarray, "m"]:
     """How far nodes lie outside the convex hull of points [m], in which any surface through them may close."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        hull = ConvexHull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
-    except QhullError:
+    hull = convex_hull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
+    if hull is None:
         return np.zeros(len(nodes))
     # In parts that stay in the cache: all nodes by all facets would take half a gigabyte, and eight times as long.
     parts = np.array_split(np.vstack([nodes.T, np.ones(len(nodes))]), 1 + len(nodes) // _NODES_AT_ONCE, axis=1)

@@ -21,7 +21,7 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, make_view_depths
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, clean_cloud, measured
-from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, stand
+from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, with_foot
 from graspd_core.perception.reconstruct.merge_views import (
     Surfels,
     is_unposed,
@@ -155,8 +155,7 @@ def closed_mesh(
     Raises:
         CloudError: none fits what was seen.
     """
-    known = join(seen, guess)
-    known = join(known, stand(known, free_space, step)) if free_space.standing else known
+    known = with_foot(join(seen, guess), free_space, step)
     known = part_walls(known, grid_cell(known, settings.min_cell, cells))
     cell = grid_cell(known, settings.min_cell, cells)
     return _finished(close_surface(known, field, free_space, cell), seen, settings)

@@ -1,11 +1,9 @@
-"""The axis of a body of revolution: first from the normals of what was seen of it, then from the points.
+"""Bodies of revolution: the seen profile turned about its axis, and what closes it.
 
-The normals of such a body all meet its axis: with p and n a point and its normal, the axis through c along a obeys
-n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001).
-Normals are noisy where depth is, so that the axis is then settled by the points: turned into one half-plane, those of
-one place of the profile must coincide.
-
-Bodies of revolution: the seen profile turned about the axis, and what closes it.
+The axis comes first from the normals of what was seen, then from the points. The normals of such a body all meet its
+axis: with p and n a point and its normal, the axis through c along a obeys n·(c × a) + (p × n)·a = 0, which is linear
+in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001). Normals are noisy where depth is, so that the
+axis is then settled by the points: turned into one half-plane, those of one place of the profile must coincide.
 """
 
 from __future__ import annotations
@@ -27,6 +25,15 @@ MAX_SKEW = 0.3
 # Gauss-Newton steps to settle an axis, points that it takes, and the share of the identity that holds what they leave
 # free: a ball any direction.
 GAUSS_NEWTON_STEPS, MIN_AXIS_POINTS, DAMPING = 6, 30, 1e-3
+# Places around the axis that each ring of the profile is judged at, and the share of them that may contradict it.
+RING_SAMPLES, MAX_CONTRADICTED_SHARE = 24, 0.15
+# Cosine of the tilt below which a body that stands is upright.
+UPRIGHT_COSINE = 0.985
+# Without a support the first camera looks down on things: up is towards it.
+ACROSS_VIEW = np.array([1.0, 0.0, 0.0])
+
+# Height along the axis and distance from it [m], then the normal's part along and away from it.
+Rows = Float[np.ndarray, "_ 4"]
 
 
 @dataclass(frozen=True)
@@ -117,9 +124,7 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     return axis
 
 
-def _thinner(
-    rows: Float[np.ndarray, "n 4"], rates: Float[np.ndarray, "4 n 2"], step: float, scale: float
-) -> Float[np.ndarray, "4"]:
+def _thinner(rows: Rows, rates: Float[np.ndarray, "4 n 2"], step: float, scale: float) -> Float[np.ndarray, "4"]:
     """How far to go by each motion, given the rates at which points rise and move outwards by it.
 
     A point's residual is how far it is from the others of its cell of the profile, along that cell's normal; so is its
@@ -153,18 +158,6 @@ def _mean(
     return (np.bincount(cell, weight * value) / total)[cell]
 
 
-# Places around the axis that each ring of the profile is judged at, and the share of them that may contradict it.
-RING_SAMPLES, MAX_CONTRADICTED_SHARE = 24, 0.15
-# Cosine of the tilt below which a body that stands is upright.
-UPRIGHT_COSINE = 0.985
-# Without a support the first camera looks down on things: up is towards it.
-ACROSS_VIEW = np.array([1.0, 0.0, 0.0])
-
-
-# Height along the axis and distance from it [m], then the normal's part along and away from it.
-Rows = Float[np.ndarray, "_ 4"]
-
-
 @dataclass(frozen=True)
 class Revolution:
     """The surface that turning what was seen about an axis gives.
@@ -190,17 +183,15 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
     # What nearly stands upright does: the support is known better than any axis.
     if not free_space.standing or abs(met @ UP) < UPRIGHT_COSINE:
         axes.append(settle_axis(surfels, fit_axis(surfels, met), step))
-    found = [revolve(surfels, free_space, axis, step) for axis in axes]
-    good = [f for f in found if f is not None]
-    return (
-        max(good, key=lambda f: f.share + 4 * f.agree * (1 - f.agree) - CONTRADICTION_WEIGHT * f.wrong)
-        if good
-        else None
-    )
+    good = [found for axis in axes if (found := revolve(surfels, free_space, axis, step)) is not None]
+    worth = lambda f: f.share + 4 * f.agree * (1 - f.agree) - CONTRADICTION_WEIGHT * f.wrong  # noqa: E731
+    return max(good, key=worth, default=None)
 
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
     """The seen profile turned about the axis; rings that the cameras contradict are left out."""
+    from scipy.spatial import KDTree
+
     _, rows = half_plane(surfels, axis)
     fits = turned(rows, step)
     if fits.sum() < MIN_AXIS_POINTS:
@@ -208,16 +199,15 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
     profile = _profile(rows[fits], step)
     right = perpendicular(axis.direction)
     up = np.cross(axis.direction, right)
-    scored = _ring(profile, axis, right, up, np.full(len(profile), RING_SAMPLES))
     row = np.repeat(np.arange(len(profile)), RING_SAMPLES)
-    confirmed, wrong = weigh(free_space, scored.points, scored.normals)
+    confirmed, wrong = _judged(profile, axis, right, up, free_space)
     good = np.bincount(row, wrong) / RING_SAMPLES < MAX_CONTRADICTED_SHARE
     if good.sum() < 5:
         return None
     weight = profile[:, 1] / profile[good, 1].sum()
     kept = good[row]
     mean = lambda x: float((x * weight[row] / RING_SAMPLES)[kept].sum())  # noqa: E731
-    explained = _explained(profile[good], rows[:, :2], step)
+    explained = float((KDTree(profile[good, :2]).query(rows[:, :2])[0] < 2 * step).mean())
     closed = np.vstack([profile[good], *_ends(profile[good], axis, right, up, free_space, step)])
     counts = np.maximum(np.ceil(2 * np.pi * closed[:, 1] / step), 3).astype(int)
     return Revolution(axis, _ring(closed, axis, right, up, counts), mean(confirmed), mean(wrong), explained)
@@ -245,15 +235,9 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
             patch = np.column_stack([np.full((n := int(rim[1] / step)), way * end), np.linspace(0.3 * step, rim[1], n)])
             patch = np.column_stack([patch, np.full(n, way), np.zeros(n)])
             beyond = patch[-1:] + np.array([[0.008 * way, 0, 0, 0]])
-            if (
-                weigh(free_space, *_both(_ring(beyond, axis, right, up, np.full(1, RING_SAMPLES))))[1] > 0.1
-            ).mean() < 0.2:
+            if (_judged(beyond, axis, right, up, free_space)[1] > 0.1).mean() < 0.2:
                 continue
-        if (
-            len(patch)
-            and weigh(free_space, *_both(_ring(patch, axis, right, up, np.full(len(patch), RING_SAMPLES))))[1].mean()
-            < 0.1
-        ):
+        if len(patch) and _judged(patch, axis, right, up, free_space)[1].mean() < 0.1:
             found.append(patch)
     return found
 
@@ -277,8 +261,10 @@ def _foot(rim, way: float, ground: float, step: float) -> Rows:
     return np.column_stack([way * (ground - z), r, -way * slope[:, 0], -slope[:, 1]])
 
 
-def _both(surfels: Surfels):
-    return surfels.points, surfels.normals
+def _judged(rows: Rows, axis: Axis, right, up, free_space: FreeSpace) -> tuple[np.ndarray, np.ndarray]:
+    """What the cameras confirm of, and how much they speak against, `RING_SAMPLES` places of each row, turned."""
+    ring = _ring(rows, axis, right, up, np.full(len(rows), RING_SAMPLES))
+    return weigh(free_space, ring.points, ring.normals)
 
 
 def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "m 4"]:
@@ -302,11 +288,3 @@ def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
     points = axis.point + height[:, None] * axis.direction + radius[:, None] * outward
     normals = along[:, None] * axis.direction + across[:, None] * outward
     return Surfels(points, normals)
-
-
-def _explained(profile: Rows, places: Float[np.ndarray, "n 2"], step: float) -> float:
-    """Share of points that lie on the profile."""
-    from scipy.spatial import KDTree
-
-    distance, _ = KDTree(profile[:, :2]).query(places)
-    return float((distance < 2 * step).mean())

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
 from graspd_core.perception.cloud.point_cloud import Vector
-from graspd_core.perception.reconstruct.extrusion import extrude, stand
+from graspd_core.perception.reconstruct.extrusion import extrude, with_foot
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
 from graspd_core.perception.reconstruct.revolution import find_revolution
 from graspd_core.perception.reconstruct.symmetry import Symmetry, find_centre, find_mirrors, image
@@ -74,8 +74,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: 
     """The guess that the evidence favours: of rules that explain what was seen, the one that says most."""
     from scipy.spatial import KDTree
 
-    known = join(seen, stand(seen, free_space, step)) if free_space.standing else seen
-    missing = openness(known, step)
+    missing = openness(with_foot(seen, free_space, step), step)
     turned = find_revolution(seen, free_space, step)
     if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > settings.revolution_share:
         guess = plausible(turned.surfels, seen, free_space, step)
@@ -88,10 +87,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: 
         guess = plausible(extrude(seen, free_space, step), seen, free_space, step)
         methods = [EXTRUSION] if _counts(guess, seen) else []
     known = join(seen, guess)
-    if (
-        openness(join(known, stand(known, free_space, step)) if free_space.standing else known, step)
-        > settings.open_share
-    ):
+    if openness(with_foot(known, free_space, step), step) > settings.open_share:
         name, raw = _symmetric(seen, free_space, settings.symmetry_worth)
         images = plausible(raw, known, free_space, step)
         if len(guess.points):

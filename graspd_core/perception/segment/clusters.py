@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import Points, Vector, least_axes, longest_side
+from graspd_core.perception.cloud.point_cloud import Points, Vector, convex_hull, least_axes, longest_side
 from graspd_core.perception.segment.planes import FlatPart
 
 # Flying pixels, which are spread along their lines of sight between two surfaces, have less than this share of the
@@ -350,10 +350,8 @@ def _tree(points: Points):
 
 def _share_within(small: Points, large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:
     """Share of a piece that is inside the other's convex outline on the support."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        edges = ConvexHull(large @ support.axes).equations
-    except (QhullError, ValueError):
+    hull = convex_hull(large @ support.axes)
+    if hull is None:
         return 0.0
+    edges = hull.equations
     return float(((small @ support.axes) @ edges[:, :2].T + edges[:, 2] <= 0).all(1).mean())

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.topology import packed_rows
-from graspd_core.perception.cloud.point_cloud import Points, Vector, longest_side
+from graspd_core.perception.cloud.point_cloud import Points, Vector, convex_hull, longest_side
 from graspd_core.types import Plane
 
 # So many points, evenly taken, show which plane has most of them.
@@ -163,7 +163,6 @@ def _measure(
 ) -> FlatPart | None:
     """The largest connected part of the inliers, by a raster in the plane; the others are no inliers."""
     from scipy.ndimage import binary_dilation, label
-    from scipy.spatial import ConvexHull, QhullError
 
     axes = np.linalg.svd(plane.normal[None])[2][1:].T
     rows = np.flatnonzero(inliers)
@@ -177,9 +176,8 @@ def _measure(
     name = names[tuple(cell.T)]
     largest = name == np.bincount(name)[1:].argmax() + 1
     flat = flat[largest]
-    try:
-        hull = ConvexHull(flat)
-    except QhullError:
+    hull = convex_hull(flat)
+    if hull is None:
         return None
     kept = np.zeros(len(points), dtype=bool)
     kept[rows[largest]] = True

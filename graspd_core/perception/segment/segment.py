@@ -22,7 +22,7 @@ from graspd_core.perception.segment.clusters import (
     touching_things,
 )
 from graspd_core.perception.segment.planes import find_planes
-from graspd_core.perception.segment.support_plane import Ground, find_ground, stands_on, voxels_of
+from graspd_core.perception.segment.support_plane import Ground, find_ground, stands_on
 from graspd_core.perception.segment.target_selection import Target, check_target, seen, select_target
 from graspd_core.types import Plane
 
@@ -63,72 +63,72 @@ def segment(
         NoObjectError: the scene is seen, and what was asked for is not in it.
     """
     settings, target = settings or SegmentationConfig(), target or Target()
-    scene = voxel_downsample(views, settings)
-    check_target(target, views)
-    eyes, ground, label = _parted(scene, views, settings)
-    free = _candidates(scene, eyes, label, ground, settings)
+    parted = _parted(views, settings, target)
+    scene, ground, label = parted.scene, parted.ground, parted.label
+    free = _candidates(parted)
     marked = target.box is not None or target.mask is not None
     if not free and not (marked and label.max(initial=-1) >= 0):
-        raise NoObjectError(_nothing(scene, label, ground, settings))
+        raise NoObjectError(_nothing(parted))
     chosen = select_target(scene, label, free, target, views, settings)
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found)
     if total < MIN_POINTS:
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
+    obstacles = _obstacles(parted, chosen)
+    doubts = _doubts(parted, chosen, bool(obstacles))
     support = None if ground.support is None else ground.support.plane
-    obstacles = _obstacles(scene, label, chosen, ground, settings)
-    doubts = _doubts(scene, eyes, chosen, ground, bool(obstacles), settings)
-    return Segmentation(
-        found, support, obstacles, doubts if marked else (*doubts, *_touching(scene, eyes, chosen, ground))
-    )
+    return Segmentation(found, support, obstacles, doubts if marked else (*doubts, *_touching(parted, chosen)))
 
 
 def find_things(
     views: Sequence[PointCloud], settings: SegmentationConfig | None = None
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """The points of each thing that `segment` would choose from without a target [m].
+    """Return the points [m] of each thing that `segment` would choose from without a target.
 
     One of them as a target's point means the thing it is of. There may be none.
 
     Raises:
         CloudError: empty, all NaN, or too few points.
     """
-    settings = settings or SegmentationConfig()
+    parted = _parted(views, settings or SegmentationConfig())
+    of_points = parted.label[parted.scene.voxel]
+    return tuple(parted.scene.points[of_points == k] for k in _candidates(parted))
+
+
+@dataclass(frozen=True)
+class _Parted:
+    """A scene, where its cameras stood [m], what things stand on, and the thing that each voxel is part of.
+
+    Things are numbered from the largest; -1 is background or noise.
+    """
+
+    scene: VoxelScene
+    eyes: Float[np.ndarray, "views 3"]
+    ground: Ground
+    label: Int[np.ndarray, "voxels"]
+    settings: SegmentationConfig
+
+
+def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: Target | None = None) -> _Parted:
     scene = voxel_downsample(views, settings)
-    eyes, ground, label = _parted(scene, views, settings)
-    of_points = label[scene.voxel]
-    return tuple(scene.points[of_points == k] for k in _candidates(scene, eyes, label, ground, settings))
-
-
-def _parted(
-    scene: VoxelScene, views: Sequence[PointCloud], settings: SegmentationConfig
-) -> tuple[Float[np.ndarray, "views 3"], Ground, Int[np.ndarray, "voxels"]]:
-    """Where the cameras stood, what things stand on, and the thing that each voxel is part of."""
+    if target is not None:
+        check_target(target, views)
     eyes = np.array([view.viewpoint for view in views], dtype=float)
     parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
     ground = find_ground(scene, parts, eyes, settings)
-    return eyes, ground, _things(scene, ground, eyes, settings)
+    return _Parted(scene, eyes, ground, _things(scene, ground, eyes, settings), settings)
 
 
 def _things(
     scene: VoxelScene, ground: Ground, eyes: Float[np.ndarray, "views 3"], settings: SegmentationConfig
 ) -> Int[np.ndarray, "voxels"]:
-    """The thing that each voxel is part of, numbered from the largest; -1: background or noise."""
-    points = scene.mean[ground.left]
+    points, distance = scene.mean[ground.left], scene.mean_distance[ground.left]
     link = link_length(points, settings)
-    label = link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
-    label = merge_occluded(
-        points,
-        scene.mean_distance[ground.left],
-        label,
-        eyes,
-        link=link,
-        settings=settings,
-        support=ground.support,
-    )
-    label = voxels_of(label, ground.left)
-    many = int(label.max(initial=-1)) + 1
-    for k in range(many):
+    found = link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
+    found = merge_occluded(points, distance, found, eyes, link=link, settings=settings, support=ground.support)
+    label = np.full(len(ground.left), -1)
+    label[ground.left] = found
+    for k in range(int(label.max(initial=-1)) + 1):
         rows = np.flatnonzero(label == k)
         if scene.count[rows].sum() < settings.min_points or _tiny(scene, rows, ground, settings):
             label[rows] = -1
@@ -143,20 +143,15 @@ def _tiny(scene: VoxelScene, rows: Int[np.ndarray, "rows"], ground: Ground, sett
     return ground.support is not None and float(ground.support.height(points).max()) < settings.smallest_object
 
 
-def _candidates(
-    scene: VoxelScene,
-    eyes: Float[np.ndarray, "views 3"],
-    label: Int[np.ndarray, "voxels"],
-    ground: Ground,
-    settings: SegmentationConfig,
-) -> list[int]:
+def _candidates(parted: _Parted) -> list[int]:
     """Things of a size to be grasped: those that stand on the support, else all."""
-    things = range(int(label.max(initial=-1)) + 1)
-    fits = [k for k in things if extent(scene.mean[label == k]) <= settings.largest_object]
-    if ground.support is None:
+    scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.ground.support
+    things = {k: label == k for k in range(int(label.max(initial=-1)) + 1)}
+    fits = [k for k, mine in things.items() if extent(scene.mean[mine]) <= settings.largest_object]
+    if part is None:
         return fits
-    part, distance = ground.support, scene.mean_distance
-    standing = [k for k in fits if stands_on(part, scene.mean[label == k], distance[label == k], eyes, settings)]
+    distance = scene.mean_distance
+    standing = [k for k in fits if stands_on(part, scene.mean[things[k]], distance[things[k]], parted.eyes, settings)]
     return standing or fits
 
 
@@ -177,31 +172,20 @@ def _cut_out(
     return tuple(found)
 
 
-def _obstacles(
-    scene: VoxelScene,
-    label: Int[np.ndarray, "voxels"],
-    chosen: Bool[np.ndarray, "voxels"],
-    ground: Ground,
-    settings: SegmentationConfig,
-) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+def _obstacles(parted: _Parted, chosen: Bool[np.ndarray, "voxels"]) -> tuple[Float[np.ndarray, "_ 3"], ...]:
     """Other things and large flat parts, as far as they are within reach of the object's bounding box."""
-    mine = scene.mean[chosen]
-    low, high = mine.min(0) - settings.obstacle_range, mine.max(0) + settings.obstacle_range
-    near = ((scene.mean >= low) & (scene.mean <= high)).all(1) & ~chosen
+    mean, label, reach = parted.scene.mean, parted.label, parted.settings.obstacle_range
+    mine = mean[chosen]
+    low, high = mine.min(0) - reach, mine.max(0) + reach
+    near = ((mean >= low) & (mean <= high)).all(1) & ~chosen
     masks = [near & (label == k) for k in range(int(label.max()) + 1)]
-    masks += [near & part.inliers & (label < 0) for part in ground.background]
-    return tuple(scene.mean[mask] for mask in masks if mask.any())
+    masks += [near & part.inliers & (label < 0) for part in parted.ground.background]
+    return tuple(mean[mask] for mask in masks if mask.any())
 
 
-def _doubts(
-    scene: VoxelScene,
-    eyes: Float[np.ndarray, "views 3"],
-    chosen: Bool[np.ndarray, "voxels"],
-    ground: Ground,
-    crowded: bool,
-    settings: SegmentationConfig,
-) -> tuple[str, ...]:
+def _doubts(parted: _Parted, chosen: Bool[np.ndarray, "voxels"], crowded: bool) -> tuple[str, ...]:
     """What the user should know of how the object was found."""
+    scene, ground, settings = parted.scene, parted.ground, parted.settings
     doubts = []
     if scene.size > 0.5 * settings.gap:
         doubts.append(
@@ -216,21 +200,20 @@ def _doubts(
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
         part = scene.of_view(k)
-        if reaches_image_border(scene.points[part], eyes[k], chosen[scene.voxel[part]], settings.border_width):
+        if reaches_image_border(scene.points[part], parted.eyes[k], chosen[scene.voxel[part]], settings.border_width):
             doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
     return tuple(doubts)
 
 
-def _touching(
-    scene: VoxelScene, eyes: Float[np.ndarray, "views 3"], chosen: Bool[np.ndarray, "voxels"], ground: Ground
-) -> tuple[str, ...]:
+def _touching(parted: _Parted, chosen: Bool[np.ndarray, "voxels"]) -> tuple[str, ...]:
     """That what was taken for one thing on a support may be several, if a seam parts it."""
-    if ground.support is None:
+    scene, support = parted.scene, parted.ground.support
+    if support is None:
         return ()
     points = scene.mean[chosen]
-    middles = touching_things(points, eyes, ground.support.height(points), scene.size)
+    middles = touching_things(points, parted.eyes, support.height(points), scene.size)
     if not middles:
         return ()
     places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*middle) for middle in middles)
@@ -250,23 +233,23 @@ def _cut_off(scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], settings: Se
     return cut
 
 
-def _nothing(scene: VoxelScene, label: Int[np.ndarray, "voxels"], ground: Ground, settings: SegmentationConfig) -> str:
+def _nothing(parted: _Parted) -> str:
     """What was seen instead of an object."""
+    scene, label, ground, settings = parted.scene, parted.label, parted.ground, parted.settings
+    told = f"cloud: no object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:
         sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
-        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
         each = f"{sizes[0]:.2f} m long:" if len(sizes) == 1 else f"the shortest {min(sizes):.2f} m long: each is"
         limit = f"larger than largest_object={settings.largest_object:g} m"
-        return f"{told}, {each} {limit}; a box or a mask as target says what part is meant"
+        return f"{told} {seen(scene, label)}, {each} {limit}; a box or a mask as target says what part is meant"
     flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
     if not flat:
         near = float(np.median(scene.mean_distance))
-        told = f"cloud: no object among {len(scene.points)} points: {seen(scene, label)}"
         unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
-        return told + unit if near < MIN_SCENE_DISTANCE_M else told
+        return f"{told} {seen(scene, label)}{unit if near < MIN_SCENE_DISTANCE_M else ''}"
     part = flat[0]
     away = float(np.median(scene.mean_distance[part.inliers]))
     return (
-        f"cloud: no object among {len(scene.points)} points: a plane of {part.sides[0]:.2f} by {part.sides[1]:.2f} m "
+        f"{told} a plane of {part.sides[0]:.2f} by {part.sides[1]:.2f} m "
         f"at {away:.2f} m from the camera, and nothing on it that is higher than {1e3 * part.least:.0f} mm"
     )

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import Points
+from graspd_core.perception.cloud.point_cloud import Points, convex_hull
 from graspd_core.perception.cloud.voxel_downsample import VoxelScene
 from graspd_core.perception.segment.clusters import extent, link_length, link_points
 from graspd_core.perception.segment.planes import FlatPart
@@ -171,18 +171,5 @@ def _clearance(part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"]) 
 
 
 def _outline_area(flat: Float[np.ndarray, "n 2"]) -> float:
-    from scipy.spatial import ConvexHull, QhullError
-
-    if len(flat) < 3:
-        return 0.0
-    try:
-        return float(ConvexHull(flat).volume)
-    except QhullError:
-        return 0.0
-
-
-def voxels_of(label: Int[np.ndarray, "left"], left: Bool[np.ndarray, "voxels"]) -> Int[np.ndarray, "voxels"]:
-    """Labels of all voxels from those of the voxels left; -1 for the others."""
-    everywhere = np.full(len(left), -1)
-    everywhere[left] = label
-    return everywhere
+    hull = convex_hull(flat)
+    return 0.0 if hull is None else float(hull.volume)
