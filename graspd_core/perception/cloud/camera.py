@@ -1,11 +1,10 @@
-"""Pinhole cameras and the lens distortion of CameraInfo: where each pixel looks, and where a point appears.
+"""Pinhole cameras, the lens distortion of CameraInfo, and depth images: where pixels look, and where points appear.
 
 Camera frames follow the optical convention: z forward, x right, y down. Distortion is that of OpenCV's camera model
 (Brown and Conrady), which ROS calls plumb_bob (k1, k2, p1, p2, k3) and rational_polynomial (k4, k5, k6 after those).
 
-Where a camera's picture ends: what reaches there may go on, and nobody saw that it does not.
-
-Depth images to points: their encodings, their bytes as a camera sends them, and the cloud they show.
+Depth images become points here: their encodings, their bytes as a camera sends them, and the cloud they show. Where a
+camera's picture ends is told too: what reaches there may go on, and nobody saw that it does not.
 """
 
 from __future__ import annotations
@@ -30,6 +29,18 @@ _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-10
 # Of a focal length and of any other number of a calibration [pixels]: beyond them rays are no longer numbers.
 _MIN_FOCAL_PX, _MAX_CALIBRATION_PX = 1e-2, 1e7
+# So many points on one side of the hull, of the object and of other things each: an object that stands out alone
+# against nothing makes a hull of its own.
+MIN_BORDER_POINTS = 8
+# Shorter sides than this share of the outline's size are no border of a picture.
+MIN_SIDE_SHARE = 0.1
+# A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
+# of a thing to the corner of the table behind it has none between.
+SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
+# Most objects are far from the outline, which the hull of so many points shows as well as that of all.
+HULL_POINTS = 2000
+# Encoding: type of a pixel, and metres per unit of it.
+ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 
 
 @dataclass(frozen=True)
@@ -158,18 +169,6 @@ def _lens(
     return image, np.stack([a, b, d], -1)
 
 
-# So many points on one side of the hull, of the object and of other things each: an object that stands out alone
-# against nothing makes a hull of its own.
-MIN_BORDER_POINTS = 8
-# Shorter sides than this share of the outline's size are no border of a picture.
-MIN_SIDE_SHARE = 0.1
-# A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
-# of a thing to the corner of the table behind it has none between.
-SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
-# Most objects are far from the outline, which the hull of so many points shows as well as that of all.
-HULL_POINTS = 2000
-
-
 def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
@@ -210,14 +209,9 @@ def _well_within(own: Float[np.ndarray, "own 2"], some: Float[np.ndarray, "some 
 
 
 def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
-    """Share of a side's parts in which points lie."""
     side = end - start
     part = np.floor(SIDE_PARTS * ((near - start) @ side) / (side @ side))
     return len(np.unique(part[(part >= 0) & (part < SIDE_PARTS)])) / SIDE_PARTS
-
-
-# Encoding: type of a pixel, and metres per unit of it.
-ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 
 
 def depth_in_metres(

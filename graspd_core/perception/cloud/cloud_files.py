@@ -1,10 +1,8 @@
-"""Points of ply files and of pcd files, text or binary.
+"""Clouds from files: point formats, arrays, and depth images with the camera that took them.
 
-Read here and not by Open3D, which makes room for as many points as a header promises, and where the file ends before
-them hands out what happened to lie in that memory. Formats: "The PLY Polygon File Format" (Turk, 1994); "The PCD file
-format", version 0.7 (Point Cloud Library).
-
-Clouds from files: point formats, arrays, and depth images with the camera that took them.
+Files of ply and of pcd, text or binary, are not read by Open3D, which makes room for as many points as a header
+promises, and where the file ends before them hands out what happened to lie in that memory. Formats: "The PLY Polygon
+File Format" (Turk, 1994); "The PCD file format", version 0.7 (Point Cloud Library).
 """
 
 from __future__ import annotations
@@ -29,6 +27,11 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
+CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
+
+_ROTATION_TOLERANCE = 1e-4
+# What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
+_MAX_UNPACKED_BYTES = 2**31
 
 
 @dataclass
@@ -64,11 +67,10 @@ def read_ply_points(path: Path) -> Points:
     missing = [name for name in "xyz" if name not in element.names]
     if missing:
         raise ValueError(f"its vertices have no {missing[0]!r}")
-    if not order:
-        columns = [element.names.index(name) for name in "xyz"]
-        return _numbers_of_text(body, start, element.count, len(element.names))[:, columns]
-    sizes = [np.dtype(code).itemsize for code in element.codes]
     places = [element.names.index(name) for name in "xyz"]
+    if not order:
+        return _numbers_of_text(body, start, element.count, len(element.names))[:, places]
+    sizes = [np.dtype(code).itemsize for code in element.codes]
     return _rows(body, _packed([order + element.codes[k] for k in places], places, sizes), element.count, start)
 
 
@@ -173,13 +175,6 @@ def _numbers_of_text(body: bytes, start: int, rows: int, width: int) -> Float[np
     return np.array(words[start : start + rows * width], dtype=float).reshape(rows, width)
 
 
-CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
-
-_ROTATION_TOLERANCE = 1e-4
-# What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
-_MAX_UNPACKED_BYTES = 2**31
-
-
 def is_cloud_file(path: str | Path) -> bool:
     """Whether a path names a cloud by its ending; a ply counts when its header declares no faces."""
     path = Path(path)
@@ -224,12 +219,9 @@ def load_views(path: str | Path) -> tuple[PointCloud, ...]:
 def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
     if "points" not in arrays:
         raise CloudError(f"holds no array called 'points', 'depth' or 'depths'; it has: {', '.join(arrays) or 'none'}")
-    points, viewpoint = _numbers(arrays, "points"), np.zeros(3)
-    forward = None
-    if "viewpoint" in arrays:
-        viewpoint = _numbers(arrays, "viewpoint")
-    if "forward" in arrays:
-        forward = _numbers(arrays, "forward")
+    points = _numbers(arrays, "points")
+    viewpoint = _numbers(arrays, "viewpoint") if "viewpoint" in arrays else np.zeros(3)
+    forward = _numbers(arrays, "forward") if "forward" in arrays else None
     if points.ndim == 3 and points.shape[2] == 3:
         points = points.reshape(-1, 3)
     if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):

@@ -1,7 +1,4 @@
-"""Point clouds: what one camera saw, moved to other frames and cleaned. Metres.
-
-The bytes of a PointCloud2 to an array of points, whatever their layout.
-"""
+"""Point clouds [m]: what one camera saw, moved to other frames and cleaned, and the points in a PointCloud2's bytes."""
 
 from __future__ import annotations
 

@@ -150,7 +150,6 @@ def _voxels(points: Points, size: float, most: int) -> tuple[Int[np.ndarray, "n"
 
 
 def _distinct(cells: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, "n"]]:
-    """The distinct rows, and which of them each row is."""
     keys, which = np.unique(packed_rows(cells), return_inverse=True)
     example = np.empty(len(keys), dtype=np.int64)
     example[which] = np.arange(len(cells))

@@ -1,6 +1,6 @@
-"""Where one more view would show most of what is hidden.
+"""An object's hidden side: where one more view would show most of it, and what other shapes it may have.
 
-Other shapes that what was seen allows: its hidden side guessed by the rules that were not chosen.
+Other shapes are guessed by the rules that the reconstruction did not choose.
 """
 
 from __future__ import annotations
@@ -24,11 +24,16 @@ from graspd_core.types import TriangleMesh
 
 # Heights above the support that a camera may look from, and directions around the object.
 _ELEVATIONS, _AZIMUTHS = np.deg2rad([25.0, 50.0, 75.0]), 12
+# Places on a surface that is looked at or compared.
 _SAMPLES = 1500
 # Surface that a camera sees flatter than this [cosine] it hardly sees.
 _FLAT = 0.2
 # A ray meets the sample's own face within this share of its length.
 _NEAR = 0.98
+# A trial feels no finer detail: spacing of points, cells along the longest side, faces.
+_STEP_M, _CELLS, _FACES = 0.003, 40, 4000
+# Two shapes nearer to each other than this are one [m].
+_SAME_M = 5e-4
 
 
 def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np.ndarray, "4 4"] | None:
@@ -71,7 +76,6 @@ def _ways(rotation: Float[np.ndarray, "3 3"]) -> Points:
 
 
 def _visible(mesh: TriangleMesh, eye: Vector, points: Points, normals: Points) -> int:
-    """How many of the points a camera sees."""
     sight = points - eye
     faces = -(sight * normals).sum(1) > _FLAT * np.linalg.norm(sight, axis=1)
     return int((first_hits(moved_mesh(mesh, -eye), sight[faces])[0] > _NEAR).sum())
@@ -83,13 +87,6 @@ def _looking(eye: Vector, forward: Vector, up: Vector) -> Float[np.ndarray, "4 4
     pose = np.eye(4)
     pose[:3] = np.column_stack([right, np.cross(forward, right), forward, eye])
     return pose
-
-
-# A trial feels no finer detail: spacing of points, cells along the longest side, faces.
-_STEP_M, _CELLS, _FACES = 0.003, 40, 4000
-# Two shapes nearer to each other than this are one [m].
-_SAME_M = 5e-4
-_SAMPLES = 1500
 
 
 def other_rules(evidence: Evidence) -> tuple[str, ...]:

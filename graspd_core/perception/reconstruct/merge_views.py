@@ -1,4 +1,4 @@
-"""Several views become one set of oriented points.
+"""Views become one set of oriented points: several views, or a cloud that shows an object from all round.
 
 Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours, and its
 normal turned to the camera that saw it. Both keep thin walls apart, which no orientation by neighbourhood does.
@@ -6,8 +6,6 @@ normal turned to the camera that saw it. Both keep thin walls apart, which no or
 Points and not truncated signed distances (Curless and Levoy 1996), because those wear thin walls and edges away: of 15
 rendered views, Open3D's on a grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of
 0.92, in 0.30 s instead of 0.53.
-
-Clouds that show an object from all round without saying which camera saw what.
 """
 
 from __future__ import annotations
@@ -27,6 +25,16 @@ from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
 MIN_VIEW_COSINE = 0.1
+# A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
+# this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
+# looked it takes more: from above, a third of the lines may run along the sides of a cup.
+MAX_RISE_CELLS = 4.0
+LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
+
+# Neighbours for a normal, and for passing its sense on.
+NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
+# Points that are too regular for that are moved by up to this many steps.
+JITTER_STEPS = 0.02
 
 
 @dataclass(frozen=True)
@@ -137,18 +145,6 @@ def _thin_by_sight(view: PointCloud, step: float) -> Points:
     order = np.lexsort([distance, which])
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     return view.points[order[first + (count - 1) // 2]]
-
-
-# A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
-# this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
-# looked it takes more: from above, a third of the lines may run along the sides of a cup.
-MAX_RISE_CELLS = 4.0
-LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
-
-# Neighbours for a normal, and for passing its sense on.
-NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
-# Points that are too regular for that are moved by up to this many steps.
-JITTER_STEPS = 0.02
 
 
 def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:

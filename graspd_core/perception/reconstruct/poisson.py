@@ -3,11 +3,10 @@
 Where points are missing Poisson's surface balloons or runs off. It is sampled on a grid, cut by the space that was seen
 to be empty and by the support, and surfaced again, which closes it whatever it was.
 
-Poisson's field of oriented points on a regular grid, by Fourier transforms (Kazhdan 2005).
-
-On grids of few nodes it takes a sixth of the time of Open3D's adaptive one, and spares finding the distance to a mesh.
-As in screened Poisson (Kazhdan and Hoppe 2013), the field is then drawn to zero at the points. Points that are of no
-surface, as noise, are so fitted too: whether they are of one is asked before.
+The field is found on a regular grid, by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive one. On grids of
+few nodes the first takes a sixth of the second's time, and spares finding the distance to a mesh. As in screened
+Poisson, the field is then drawn to zero at the points. Points that are of no surface, as noise, are so fitted too:
+whether they are of one is asked before.
 """
 
 from __future__ import annotations
@@ -38,6 +37,17 @@ BAND_CELLS = 2
 MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 # Nodes whose distances to the facets of a hull are looked at together: these stay in the cache.
 _NODES_AT_ONCE = 1000
+# Standard deviations, in cells: of the blur of the field, and of the one that the points' density is read from.
+_BLUR, _DENSITY_BLUR = 1.0, 2.0
+# Points count for no more than where they are this much sparser than the median.
+_SPARSEST = 0.2
+# Of the points at least this share lies within a cell of the surface before it is drawn to them: of 120 views of shapes
+# and scans 0.82 and more, of noise 0.48 and less.
+_MIN_NEAR = 0.7
+# Steps that draw the field to zero at the points, and how far each reaches, in cells.
+_STEPS, _REACH = 3, 2.0
+# The transforms are of what repeats: so many cells lie between the object and its next image.
+_MARGIN = 16
 
 # Signed distance near a surface through surfels [m], at the nodes of a grid of cubes of that width [m].
 Field = Callable[[Surfels, Float[np.ndarray, "x y z 3"], float], Float[np.ndarray, "x y z"]]
@@ -205,19 +215,6 @@ def _one_solid(value: Float[np.ndarray, "x y z"], cell: float) -> Float[np.ndarr
     value = np.where((part > 0) & (part != 1 + size[1:].argmax()), 0.5 * cell, value)
     bubbles: Any = label(value >= 0)
     return np.where((value >= 0) & (bubbles[0] != bubbles[0][0, 0, 0]), -0.5 * cell, value)
-
-
-# Standard deviations, in cells: of the blur of the field, and of the one that the points' density is read from.
-_BLUR, _DENSITY_BLUR = 1.0, 2.0
-# Points count for no more than where they are this much sparser than the median.
-_SPARSEST = 0.2
-# Of the points at least this share lies within a cell of the surface before it is drawn to them: of 120 views of shapes
-# and scans 0.82 and more, of noise 0.48 and less.
-_MIN_NEAR = 0.7
-# Steps that draw the field to zero at the points, and how far each reaches, in cells.
-_STEPS, _REACH = 3, 2.0
-# The transforms are of what repeats: so many cells lie between the object and its next image.
-_MARGIN = 16
 
 
 def grid_poisson_field(

@@ -8,6 +8,7 @@ what the cameras saw to be empty is cut away.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -126,15 +127,13 @@ def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vect
 def _closed(
     seen: Surfels, guess: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig
 ) -> TriangleMesh:
-    """The closed surface by Poisson on a grid, or by Open3D's where that is asked for or the grid's does not fit."""
+    """The closed surface by Poisson on a grid. By Open3D's if `settings` ask for it, or if the grid's does not fit."""
     adaptive = partial(poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
-    if small or settings.poisson == "open3d":
-        return closed_mesh(seen, guess, free_space, step, settings, adaptive)
-    try:
-        return closed_mesh(seen, guess, free_space, step, settings, grid_poisson_field)
-    except CloudError:
-        return closed_mesh(seen, guess, free_space, step, settings, adaptive)
+    if settings.poisson == "grid" and not small:
+        with suppress(CloudError):
+            return closed_mesh(seen, guess, free_space, step, settings, grid_poisson_field)
+    return closed_mesh(seen, guess, free_space, step, settings, adaptive)
 
 
 def closed_mesh(

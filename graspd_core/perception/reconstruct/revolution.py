@@ -124,7 +124,9 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     return axis
 
 
-def _thinner(rows: Rows, rates: Float[np.ndarray, "4 n 2"], step: float, scale: float) -> Float[np.ndarray, "4"]:
+def _thinner(
+    rows: Float[np.ndarray, "n 4"], rates: Float[np.ndarray, "4 n 2"], step: float, scale: float
+) -> Float[np.ndarray, "4"]:
     """How far to go by each motion, given the rates at which points rise and move outwards by it.
 
     A point's residual is how far it is from the others of its cell of the profile, along that cell's normal; so is its
@@ -153,7 +155,6 @@ def _thinner(rows: Rows, rates: Float[np.ndarray, "4 n 2"], step: float, scale: 
 def _mean(
     value: Float[np.ndarray, "n"], cell: Int[np.ndarray, "n"], weight: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    """Each point's cell's weighted mean."""
     total = np.maximum(np.bincount(cell, weight), 1e-12)
     return (np.bincount(cell, weight * value) / total)[cell]
 

@@ -1,6 +1,4 @@
-"""What the guesses of an object's hidden side are made of.
-
-The unseen side of an object, guessed by whichever rule the evidence favours.
+"""The unseen side of an object, guessed by whichever rule the evidence favours.
 
 Guesses: a body of revolution, one or two mirror planes, a centre of symmetry; beside each, the outline seen from above
 extruded to the support. A guessed point that lies in seen empty space, in the support, or where the surface itself was

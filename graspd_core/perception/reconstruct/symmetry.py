@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from graspd_core.perception.cloud.free_space import FreeSpace, on_seen, weigh
 from graspd_core.perception.cloud.point_cloud import Points, Vector
-from graspd_core.perception.reconstruct.merge_views import Surfels
+from graspd_core.perception.reconstruct.merge_views import Surfels, take
 from graspd_core.se3 import perpendicular
 
 # Points that a candidate is judged on, closely and at first.
@@ -180,9 +180,7 @@ def _rough(sample: _Sample) -> _Sample:
 
 
 def _some(surfels: Surfels, count: int) -> Surfels:
-    """A fixed choice of the points."""
-    chosen = np.random.default_rng(0).permutation(len(surfels.points))[:count]
-    return Surfels(surfels.points[chosen], surfels.normals[chosen])
+    return take(surfels, np.random.default_rng(0).permutation(len(surfels.points))[:count])
 
 
 def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:

@@ -1,16 +1,14 @@
-"""Things in a scene: points linked to their neighbours, and pieces of one thing that occlusion set apart.
+"""Things in a scene: points linked to their neighbours, and which of these clusters are one thing, or two.
 
-Things that touch: one cluster of points, and a seam or a narrow waist in it that parts two which both stand.
+Pieces of one thing that occlusion set apart, as the far wall of a cup behind the near one or a rim over its bottom, are
+joined. Two pieces are one thing only if they touch in some camera's image, for the edge between them is then an
+occlusion, and if they are near enough, or one stands within the other's outline on the support. A piece that ends above
+the support hangs on the nearest that stands, unless it may be a thing that stands behind what hides its foot.
 
-A surface that turns towards itself over a finger's breadth is a seam; things of one height that touch along a line are
-joined by a bridge of points across their tops, far narrower than either. One thing may have such places as well, where
-a leg meets a body. So this is a doubt, never a cut. Two boxes that stand flush are one to a camera.
-
-Pieces of one thing that occlusion set apart: the far wall of a cup behind the near one, a rim over its bottom.
-
-Two pieces are one thing only if they touch in some camera's image, for the edge between them is then an occlusion, and
-if they are near enough, or one stands within the other's outline on the support. A piece that ends above the support
-hangs on the nearest that stands, unless it may be a thing that stands behind what hides its foot.
+Things that touch are one cluster of points, and a seam or a narrow waist in it parts two which both stand. A surface
+that turns towards itself over a finger's breadth is a seam. Things of one height that touch along a line are joined by
+a bridge of points across their tops, far narrower than either. One thing may have such places as well, where a leg
+meets a body. So this is a doubt, never a cut. Two boxes that stand flush are one to a camera.
 """
 
 from __future__ import annotations
@@ -35,6 +33,34 @@ DENSE_SPACING_RATIO = 1.6
 # their points far apart along the line of sight.
 SPARSE_LINK_RATIO = 2.5
 SPACING_SAMPLES = 2000
+# Points so far apart tell how a surface bends [m], and how much bend inwards is a seam [1/m]: a bowl's inside, of a
+# radius over 5 cm, is none, nor is a camera's noise.
+_REACH_M, _SEAM_BEND = 0.013, 20.0
+# Points on one side of a seam are linked over this many spacings.
+_LINK_SPACINGS = 1.7
+# A waist is no wider than this share of what is on either side of it; half the widths that are looked for [m].
+_WAIST, _WAISTS_M = 0.3, (0.0, 0.003, 0.005, 0.007, 0.009, 0.012)
+# Each of two things has this share of the points at least, and some of its seen surface so near to the support [m];
+# the inside of a bowl is none, which is hollow.
+_MIN_SHARE, _FOOT_M = 0.12, 0.03
+_NEIGHBOURS = 24
+# A point is on the outline of what is seen if, of as many neighbours as lie within so many spacings, none is in a
+# sector of this angle about it.
+_OUTLINE_NEIGHBOURS, _OUTLINE_SPACINGS, _OUTLINE_ANGLE = 16, 2.2, np.deg2rad(110.0)
+# Beyond so many pieces the rest is noise.
+MAX_PIECES = 40
+# What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
+FLOATING_LINKS, HIDDEN_FOOT_SHARE = 0.5, 0.5
+# What ends above the support may stand there by itself, its foot hidden, if it has this share of the other's surface,
+# and if it is seen over this share of its height or ends at another height than the other [m]. Handles fall short of
+# the first, walls of cups of both others.
+OWN_SURFACE_SHARE, SEEN_HEIGHT_SHARE, LEVEL_TOPS_M = 0.12, 0.5, 0.01
+# It is part of the other nevertheless if it is so many link lengths from it.
+NEAR_LINKS = 1.5
+# Outlines this many link lengths apart touch in an image: pixels at edges are lost.
+IMAGE_GAP_LINKS = 1.5
+# Share of a piece that lies within another's outline.
+OUTLINE_SHARE = 0.6
 
 
 def link_length(points: Points, settings: SegmentationConfig) -> float:
@@ -62,8 +88,6 @@ def link_points(
         link: points this near are neighbours [m].
         neighbour_share: points with a smaller share of the median number of neighbours are strays.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
     label = np.full(len(points), -1)
@@ -81,10 +105,7 @@ def link_points(
     core &= seen
     if not core.any():
         return label
-    both = pairs[core[pairs].all(1)]
-    graph = coo_matrix((np.ones(len(both), dtype=bool), tuple(both.T)), shape=(len(points), len(points)))
-    _, component = connected_components(graph, directed=False)
-    label[core] = component[core]
+    label = _linked(core, pairs)
     edge = ~core & seen
     near, nearest = KDTree(points[core]).query(points[edge], distance_upper_bound=link)
     joins = np.flatnonzero(edge)[np.isfinite(near)]
@@ -108,22 +129,6 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
     answer[known] = np.take(rank, label[known])
     return answer
-
-
-# Points so far apart tell how a surface bends [m], and how much bend inwards is a seam [1/m]: a bowl's inside, of a
-# radius over 5 cm, is none, nor is a camera's noise.
-_REACH_M, _SEAM_BEND = 0.013, 20.0
-# Points on one side of a seam are linked over this many spacings.
-_LINK_SPACINGS = 1.7
-# A waist is no wider than this share of what is on either side of it; half the widths that are looked for [m].
-_WAIST, _WAISTS_M = 0.3, (0.0, 0.003, 0.005, 0.007, 0.009, 0.012)
-# Each of two things has this share of the points at least, and some of its seen surface so near to the support [m];
-# the inside of a bowl is none, which is hollow.
-_MIN_SHARE, _FOOT_M = 0.12, 0.03
-_NEIGHBOURS = 24
-# A point is on the outline of what is seen if, of as many neighbours as lie within so many spacings, none is in a
-# sector of this angle about it.
-_OUTLINE_NEIGHBOURS, _OUTLINE_SPACINGS, _OUTLINE_ANGLE = 16, 2.2, np.deg2rad(110.0)
 
 
 def touching_things(
@@ -212,22 +217,6 @@ def _linked(kept: Bool[np.ndarray, "n"], links: Int[np.ndarray, "links 2"]) -> I
     one, other = links[kept[links].all(1)].T
     graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(kept), len(kept)))
     return np.where(kept, connected_components(graph, directed=False)[1], -1)
-
-
-# Beyond so many pieces the rest is noise.
-MAX_PIECES = 40
-# What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
-FLOATING_LINKS, HIDDEN_FOOT_SHARE = 0.5, 0.5
-# What ends above the support may stand there by itself, its foot hidden, if it has this share of the other's surface,
-# and if it is seen over this share of its height or ends at another height than the other [m]. Handles fall short of
-# the first, walls of cups of both others.
-OWN_SURFACE_SHARE, SEEN_HEIGHT_SHARE, LEVEL_TOPS_M = 0.12, 0.5, 0.01
-# It is part of the other nevertheless if it is so many link lengths from it.
-NEAR_LINKS = 1.5
-# Outlines this many link lengths apart touch in an image: pixels at edges are lost.
-IMAGE_GAP_LINKS = 1.5
-# Share of a piece that lies within another's outline.
-OUTLINE_SHARE = 0.6
 
 
 def merge_occluded(
@@ -338,7 +327,6 @@ def _directions(points: Points, eye: Vector) -> tuple[Points, Float[np.ndarray, 
 
 
 def _apart(a: Points, b: Float[np.ndarray, "m 3"]) -> float:
-    """Least distance between two sets of points."""
     return float(_tree(a).query(b)[0].min())
 
 
