@@ -23,6 +23,9 @@ from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, convex_
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 
 _Numbers = Sequence[float | int]
+# Places on the plane of unit depth, or in an image [pixels].
+_Places = Float[np.ndarray, "*batch 2"]
+DepthImage = Float[np.ndarray, "height width"]
 
 # Newton's method on a smooth lens doubles its digits each round: five suffice, extreme lenses take a few more.
 _NEWTON_STEPS = 20
@@ -110,18 +113,18 @@ def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
     return rays
 
 
-def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> Float[np.ndarray, "*batch 2"]:
+def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> _Places:
     """Pixel coordinates (column, row) at which points in front of the camera appear; camera frame [m]."""
     seen = distort(points[..., :2] / points[..., 2:], camera.distortion)
     return seen * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
-def distort(ideal: Float[np.ndarray, "*batch 2"], coefficients: _Numbers) -> Float[np.ndarray, "*batch 2"]:
+def distort(ideal: _Places, coefficients: _Numbers) -> _Places:
     """Where the lens puts what an ideal one would put at `ideal`; both on the plane of unit depth."""
     return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
 
 
-def undistort(seen: Float[np.ndarray, "*batch 2"], coefficients: _Numbers) -> Float[np.ndarray, "*batch 2"]:
+def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
     """The inverse of `distort` on the part of the image where it has one; NaN elsewhere."""
     if not any(coefficients):
         return np.array(seen, dtype=float)
@@ -145,9 +148,7 @@ def undistort(seen: Float[np.ndarray, "*batch 2"], coefficients: _Numbers) -> Fl
     return np.where(found[..., None], ideal, np.nan)
 
 
-def _lens(
-    ideal: Float[np.ndarray, "*batch 2"], coefficients: _Numbers
-) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 3"]]:
+def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "*batch 3"]]:
     """Distorted positions, and a, b, d of their derivative, the symmetric matrix [[a, b], [b, d]]."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     x, y = ideal[..., 0], ideal[..., 1]
@@ -214,9 +215,7 @@ def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], en
     return len(np.unique(part[(part >= 0) & (part < SIDE_PARTS)])) / SIDE_PARTS
 
 
-def depth_in_metres(
-    image: UInt16[np.ndarray, "height width"] | Float[np.ndarray, "height width"], encoding: str
-) -> Float[np.ndarray, "height width"]:
+def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, encoding: str) -> DepthImage:
     """Depth along the optical axis [m], 0 where the image has none: zero, negative, NaN or infinite.
 
     Raises:
@@ -232,7 +231,7 @@ def depth_in_metres(
 
 def depth_from_bytes(
     data: memoryview, *, width: int, height: int, step: int, encoding: str, is_bigendian: bool = False
-) -> Float[np.ndarray, "height width"]:
+) -> DepthImage:
     """Depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
 
     Raises:
@@ -254,9 +253,7 @@ def depth_from_bytes(
 
 
 def cloud_from_depth(
-    depth: Float[np.ndarray, "height width"],
-    camera: PinholeCamera,
-    T_frame_camera: Float[np.ndarray, "4 4"] | None = None,
+    depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
     """What a camera saw, in its own frame or, where its pose is given, in that frame; pixels without depth give none.
 

@@ -16,6 +16,10 @@ from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.se3 import perpendicular
 
+# Positions or normals, and a depth [m] or share of each.
+Places = Float[np.ndarray, "*batch 3"]
+Depths = Float[np.ndarray, "*batch"]
+
 # Depth images of more cells than this across the object tell no more.
 MAX_IMAGE_CELLS = 160
 # Points, itself among them, that a point's spacing is taken from.
@@ -153,20 +157,18 @@ def _occluders(
     return np.where(binary_closing(known, np.ones((3, 3)), iterations=2), before[tuple(at)], np.inf)
 
 
-def empty_depth(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
     """How deep points lie in the support, or in space that a camera saw to be empty [m]; 0: nothing is against them."""
     return _classify(free_space, points, None)[1]
 
 
-def weigh(
-    free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"]
-) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
     """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
 
-def on_seen(free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
+def on_seen(free_space: FreeSpace, points: Places) -> Bool[np.ndarray, "*batch"]:
     """Whether points lie on, or a finger's breadth of noise off, a surface that was seen."""
     found = np.zeros(points.shape[:-1], dtype=bool)
     for view_depth in free_space.view_depths:
@@ -186,8 +188,8 @@ def facing(free_space: FreeSpace, points: Points, normals: Points) -> Float[np.n
 
 
 def _classify(
-    free_space: FreeSpace, points: Float[np.ndarray, "*batch 3"], normals: Float[np.ndarray, "*batch 3"] | None
-) -> tuple[Bool[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    free_space: FreeSpace, points: Places, normals: Places | None
+) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
     confirmed = np.zeros(points.shape[:-1], dtype=bool)
     deepest = np.zeros(points.shape[:-1])
     for view_depth in free_space.view_depths:
@@ -201,9 +203,7 @@ def _classify(
     return confirmed, np.maximum(deepest, 0.0)
 
 
-def _look(
-    view_depth: ViewDepth, points: Float[np.ndarray, "*batch 3"]
-) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
     """How deep points lie in empty space [m], and how far behind the seen surface (infinite beside the outline)."""
     local = (points - view_depth.eye) @ view_depth.frame
     forward = np.maximum(local[..., 2], 1e-6)

@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float
 from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import voxel_keys
 
-# Positions or directions, and one of them.
+# Positions or directions, one of them, and where the cameras of several views stood.
 Points = Float[np.ndarray, "n 3"]
 Vector = Float[np.ndarray, "3"]
+Eyes = Float[np.ndarray, "views 3"]
 
 MIN_POINTS = 50
 # Points this many times the cloud's size away from its middle are no part of it.

@@ -14,6 +14,9 @@ from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import Points, Vector, measured
 from graspd_core.se3 import perpendicular
 
+# An organised cloud, NaN where nothing was seen.
+Pixels = Float[np.ndarray, "height width 3"]
+
 # A share of points that lie behind others. In 48 clouds with a D415's faults, thinned and cut out or not, the true
 # place gives 0.0012 at most, nine in ten wrong places 0.005 at least.
 MAX_HIDDEN_SHARE = 0.002
@@ -36,9 +39,7 @@ PLANE_NOISE = 0.004
 MIN_CONDITION = 100.0
 
 
-def check_viewpoint(
-    points: Points, viewpoint: Vector, *, grid: Float[np.ndarray, "height width 3"] | None = None, alone: bool = False
-) -> None:
+def check_viewpoint(points: Points, viewpoint: Vector, *, grid: Pixels | None = None, alone: bool = False) -> None:
     """Refuse a cloud that shows that its camera stood elsewhere.
 
     Args:
@@ -139,7 +140,7 @@ def _surrounded(ray: Vector, others: Points) -> bool:
     return bool(gaps.max() < np.pi)
 
 
-def _pinhole_fits(grid: Float[np.ndarray, "height width 3"], viewpoint: Vector) -> bool | None:
+def _pinhole_fits(grid: Pixels, viewpoint: Vector) -> bool | None:
     """Whether a pinhole camera at the viewpoint explains the pixels; None where there are too few."""
     pixels, points = _pixels(grid)
     ray = points - viewpoint
@@ -162,7 +163,7 @@ def _pinhole_fits(grid: Float[np.ndarray, "height width 3"], viewpoint: Vector) 
     return bool(misfit < MAX_MISFIT and is_square)
 
 
-def _pinhole_place(grid: Float[np.ndarray, "height width 3"]) -> Vector | None:
+def _pinhole_place(grid: Pixels) -> Vector | None:
     """Where the camera stood whose pixels these are; None where no pinhole fits or the scene is too flat to tell."""
     pixels, points = _pixels(grid)
     points, pixels = points[points.any(1)], pixels[points.any(1)]
@@ -180,7 +181,7 @@ def _pinhole_place(grid: Float[np.ndarray, "height width 3"]) -> Vector | None:
     return centre + size * np.linalg.solve(P[:, :3], -P[:, 3])
 
 
-def _pixels(grid: Float[np.ndarray, "height width 3"]) -> tuple[Points, Points]:
+def _pixels(grid: Pixels) -> tuple[Points, Points]:
     """Homogeneous pixels, as shares of the image's larger side from its middle, and their points; some of them."""
     height, width = grid.shape[:2]
     step = max(1, int(np.sqrt(height * width / MOST_PIXELS)))

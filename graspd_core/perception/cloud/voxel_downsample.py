@@ -16,6 +16,10 @@ from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
 
+# Which voxels of a scene, and the thing that each is part of, numbered from the largest; -1: none.
+Mask = Bool[np.ndarray, "voxels"]
+Labels = Int[np.ndarray, "voxels"]
+
 # Of more points than this, every second, or third, ... is taken.
 MAX_SCENE_POINTS = 5_000_000
 # Units that clouds come in by mistake, how many of them a metre has, and the least distance that is told from them [m].

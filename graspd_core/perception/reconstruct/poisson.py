@@ -49,8 +49,11 @@ _STEPS, _REACH = 3, 2.0
 # The transforms are of what repeats: so many cells lie between the object and its next image.
 _MARGIN = 16
 
+# The nodes of a grid of cubes [m], and values at them.
+Nodes = Float[np.ndarray, "x y z 3"]
+Grid = Float[np.ndarray, "x y z"]
 # Signed distance near a surface through surfels [m], at the nodes of a grid of cubes of that width [m].
-Field = Callable[[Surfels, Float[np.ndarray, "x y z 3"], float], Float[np.ndarray, "x y z"]]
+Field = Callable[[Surfels, Nodes, float], Grid]
 
 
 def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
@@ -77,9 +80,7 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
     return Surfels(points + np.where(wall, (thinnest - thickness) / 2, 0.0)[:, None] * normals, normals)
 
 
-def poisson_field(
-    surfels: Surfels, nodes: Float[np.ndarray, "x y z 3"], cell: float, finest: float
-) -> Float[np.ndarray, "x y z"]:
+def poisson_field(surfels: Surfels, nodes: Nodes, cell: float, finest: float) -> Grid:
     """Return the signed distance [m] to Open3D's Poisson surface at the nodes of a grid of cubes, `cell` apart [m].
 
     The surface is open where it leaves the cube of 1.2 times the points' size. Its finest cells are about as wide as
@@ -138,7 +139,7 @@ def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 
 
-def march(value: Float[np.ndarray, "x y z"], axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
+def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
     """The zero surface of a field on a grid of cubes, outwards where it grows."""
     import igl
 
@@ -156,7 +157,7 @@ def march(value: Float[np.ndarray, "x y z"], axes: Sequence[Float[np.ndarray, "_
     return TriangleMesh(np.asarray(vertices), np.asarray(faces, dtype=np.int64))
 
 
-def _signed(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Float[np.ndarray, "x y z"]:
+def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
     """Signed distance at the nodes near the surface, and a signed `BAND_CELLS` of cells elsewhere.
 
     The surface has no border within the grid, so it parts it into regions; those away from it take the side that most
@@ -178,7 +179,7 @@ def _signed(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: fl
     return value * np.where(region > 0, np.where(votes[region] < 0, -1.0, 1.0), signs)
 
 
-def _touched(surface: TriangleMesh, nodes: Float[np.ndarray, "x y z 3"], cell: float) -> Bool[np.ndarray, "x y z"]:
+def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarray, "x y z"]:
     """Nodes within some two cells of the surface, whose faces are smaller than a cell or two."""
     from scipy.ndimage import binary_dilation
 
@@ -200,7 +201,7 @@ def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) 
     return np.maximum(np.concatenate([(hull.equations @ part).max(0) for part in parts]), 0.0)
 
 
-def _one_solid(value: Float[np.ndarray, "x y z"], cell: float) -> Float[np.ndarray, "x y z"]:
+def _one_solid(value: Grid, cell: float) -> Grid:
     """The largest part alone, without bubbles, free of the grid's border."""
     from scipy.ndimage import label
 
@@ -217,9 +218,7 @@ def _one_solid(value: Float[np.ndarray, "x y z"], cell: float) -> Float[np.ndarr
     return np.where((value >= 0) & (bubbles[0] != bubbles[0][0, 0, 0]), -0.5 * cell, value)
 
 
-def grid_poisson_field(
-    surfels: Surfels, nodes: Float[np.ndarray, "x y z 3"], cell: float
-) -> Float[np.ndarray, "x y z"]:
+def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     """Signed distance near the points' surface [m] at the nodes of a grid of cubes, outside positive, at most a band.
 
     Args:
@@ -294,7 +293,7 @@ def _waves(shape: tuple[int, ...]) -> list[np.ndarray]:
     return list(np.meshgrid(*waves, indexing="ij", sparse=True))
 
 
-def _slope(field: Float[np.ndarray, "x y z"], at: Any, normals: Float[np.ndarray, "points 3"]) -> float:
+def _slope(field: Grid, at: Any, normals: Float[np.ndarray, "points 3"]) -> float:
     """How much a field grows from cell to cell along the normals: the median over the points."""
     gradient = np.stack([at @ part.ravel() for part in np.gradient(field)], -1)
     return float(np.median((gradient * normals).sum(1)))

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import Points, Vector, convex_hull, least_axes, longest_side
+from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, least_axes, longest_side
 from graspd_core.perception.segment.planes import FlatPart
 
 # Flying pixels, which are spread along their lines of sight between two surfaces, have less than this share of the
@@ -131,9 +131,7 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     return answer
 
 
-def touching_things(
-    points: Points, eyes: Float[np.ndarray, "views 3"], height: Float[np.ndarray, "n"], spacing: float
-) -> tuple[Vector, ...]:
+def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], spacing: float) -> tuple[Vector, ...]:
     """Middles of the parts of a cluster that seams and waists set apart and that stand on their own; empty where there
     is one.
 
@@ -170,7 +168,7 @@ def touching_things(
     return ()
 
 
-def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Float[np.ndarray, "views 3"]) -> Points:
+def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Points:
     """Unit normals of planes through neighbours, towards the camera that sees each the least from the side."""
     spread = points[near] - points[near].mean(1, keepdims=True)
     normals = least_axes(spread.transpose(0, 2, 1) @ spread)
@@ -223,7 +221,7 @@ def merge_occluded(
     points: Points,
     distance: Float[np.ndarray, "n"],
     label: Int[np.ndarray, "n"],
-    viewpoints: Float[np.ndarray, "views 3"],
+    viewpoints: Eyes,
     *,
     link: float,
     settings: SegmentationConfig,
@@ -286,13 +284,7 @@ def _near(
     return apart <= max(reach, default=0.0)
 
 
-def _hangs(
-    piece: Points,
-    distance: Float[np.ndarray, "n"],
-    support: FlatPart,
-    viewpoints: Float[np.ndarray, "views 3"],
-    link: float,
-) -> bool:
+def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, viewpoints: Eyes, link: float) -> bool:
     """Whether a piece ends above the support and does not itself hide, from all cameras, what it might stand on."""
     height = support.height(piece)
     if (height - support.tolerance(distance)).min() <= FLOATING_LINKS * link:

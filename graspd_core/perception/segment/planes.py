@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.topology import packed_rows
-from graspd_core.perception.cloud.point_cloud import Points, Vector, convex_hull, longest_side
+from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, longest_side
 from graspd_core.types import Plane
 
 # So many points, evenly taken, show which plane has most of them.
@@ -76,10 +76,7 @@ class FlatPart:
 
 
 def find_planes(
-    points: Points,
-    distance: Float[np.ndarray, "n"],
-    viewpoints: Float[np.ndarray, "views 3"],
-    settings: SegmentationConfig,
+    points: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> list[FlatPart]:
     """Flat parts in order of their number of points, each point in at most one.
 

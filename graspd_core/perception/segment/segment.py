@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.perception.cloud.camera import reaches_image_border
-from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud
-from graspd_core.perception.cloud.voxel_downsample import VoxelScene, voxel_downsample
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud
+from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, voxel_downsample
 from graspd_core.perception.segment.clusters import (
     extent,
     link_length,
@@ -103,9 +103,9 @@ class _Parted:
     """
 
     scene: VoxelScene
-    eyes: Float[np.ndarray, "views 3"]
+    eyes: Eyes
     ground: Ground
-    label: Int[np.ndarray, "voxels"]
+    label: Labels
     settings: SegmentationConfig
 
 
@@ -119,9 +119,7 @@ def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: T
     return _Parted(scene, eyes, ground, _things(scene, ground, eyes, settings), settings)
 
 
-def _things(
-    scene: VoxelScene, ground: Ground, eyes: Float[np.ndarray, "views 3"], settings: SegmentationConfig
-) -> Int[np.ndarray, "voxels"]:
+def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: SegmentationConfig) -> Labels:
     points, distance = scene.mean[ground.left], scene.mean_distance[ground.left]
     link = link_length(points, settings)
     found = link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
@@ -155,9 +153,7 @@ def _candidates(parted: _Parted) -> list[int]:
     return standing or fits
 
 
-def _cut_out(
-    views: Sequence[PointCloud], scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], ground: Ground
-) -> tuple[PointCloud, ...]:
+def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, ground: Ground) -> tuple[PointCloud, ...]:
     """The object's points of every view that shows it."""
     wanted = chosen[scene.voxel]
     if ground.support is not None:
@@ -172,7 +168,7 @@ def _cut_out(
     return tuple(found)
 
 
-def _obstacles(parted: _Parted, chosen: Bool[np.ndarray, "voxels"]) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"], ...]:
     """Other things and large flat parts, as far as they are within reach of the object's bounding box."""
     mean, label, reach = parted.scene.mean, parted.label, parted.settings.obstacle_range
     mine = mean[chosen]
@@ -183,7 +179,7 @@ def _obstacles(parted: _Parted, chosen: Bool[np.ndarray, "voxels"]) -> tuple[Flo
     return tuple(mean[mask] for mask in masks if mask.any())
 
 
-def _doubts(parted: _Parted, chosen: Bool[np.ndarray, "voxels"], crowded: bool) -> tuple[str, ...]:
+def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
     """What the user should know of how the object was found."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
     doubts = []
@@ -207,7 +203,7 @@ def _doubts(parted: _Parted, chosen: Bool[np.ndarray, "voxels"], crowded: bool) 
     return tuple(doubts)
 
 
-def _touching(parted: _Parted, chosen: Bool[np.ndarray, "voxels"]) -> tuple[str, ...]:
+def _touching(parted: _Parted, chosen: Mask) -> tuple[str, ...]:
     """That what was taken for one thing on a support may be several, if a seam parts it."""
     scene, support = parted.scene, parted.ground.support
     if support is None:
@@ -223,7 +219,7 @@ def _touching(parted: _Parted, chosen: Bool[np.ndarray, "voxels"]) -> tuple[str,
     )
 
 
-def _cut_off(scene: VoxelScene, chosen: Bool[np.ndarray, "voxels"], settings: SegmentationConfig) -> bool:
+def _cut_off(scene: VoxelScene, chosen: Mask, settings: SegmentationConfig) -> bool:
     mine = scene.mean[chosen]
     cut = bool((scene.mean_distance[chosen] > settings.max_range - 2 * scene.size).any())
     if settings.roi_low is not None:

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import Points, convex_hull
-from graspd_core.perception.cloud.voxel_downsample import VoxelScene
+from graspd_core.perception.cloud.point_cloud import Eyes, Points, convex_hull
+from graspd_core.perception.cloud.voxel_downsample import Mask, VoxelScene
 from graspd_core.perception.segment.clusters import extent, link_length, link_points
 from graspd_core.perception.segment.planes import FlatPart
 
@@ -48,20 +48,18 @@ class Ground:
 
     support: FlatPart | None
     background: tuple[FlatPart, ...]
-    left: Bool[np.ndarray, "voxels"]
+    left: Mask
 
 
-def find_ground(
-    scene: VoxelScene, parts: list[FlatPart], viewpoints: Float[np.ndarray, "views 3"], settings: SegmentationConfig
-) -> Ground:
+def find_ground(scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, settings: SegmentationConfig) -> Ground:
     """Sort the flat parts."""
     margin = settings.support_margin
     parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
     # As they are asked for: of a table alone in view, which is the support, never.
-    known: dict[int, Bool[np.ndarray, "voxels"]] = {}
+    known: dict[int, Mask] = {}
 
-    def covered(others: Sequence[FlatPart]) -> list[Bool[np.ndarray, "voxels"]]:
+    def covered(others: Sequence[FlatPart]) -> list[Mask]:
         known.update({id(part): _covered(scene, part, margin) for part in others if id(part) not in known})
         return [known[id(part)] for part in others]
 
@@ -77,9 +75,7 @@ def find_ground(
     return Ground(best, background, _left(scene, best, covered(background)))
 
 
-def _left(
-    scene: VoxelScene, support: FlatPart | None, background: Sequence[Bool[np.ndarray, "voxels"]]
-) -> Bool[np.ndarray, "voxels"]:
+def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask]) -> Mask:
     """What is above the support and not part of the background."""
     left = np.ones(len(scene.mean), dtype=bool)
     if support is not None:
@@ -89,7 +85,7 @@ def _left(
     return left
 
 
-def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Bool[np.ndarray, "voxels"]:
+def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
     """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
     from scipy.spatial import KDTree
 
@@ -121,11 +117,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 
 
 def _standing(
-    scene: VoxelScene,
-    part: FlatPart,
-    left: Bool[np.ndarray, "voxels"],
-    viewpoints: Float[np.ndarray, "views 3"],
-    settings: SegmentationConfig,
+    scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
     """How many voxels belong to things that touch that part, and to things that may stand on it."""
     points, distance = scene.mean[left], scene.mean_distance[left]
@@ -140,11 +132,7 @@ def _standing(
 
 
 def stands_on(
-    part: FlatPart,
-    thing: Points,
-    distance: Float[np.ndarray, "n"],
-    viewpoints: Float[np.ndarray, "views 3"],
-    settings: SegmentationConfig,
+    part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> bool:
     """Whether a cluster of voxels is a thing on that support."""
     if not settings.smallest_object <= extent(thing) <= settings.largest_object:
@@ -159,7 +147,7 @@ def stands_on(
     return bool(over) and part.area >= settings.support_area_ratio * _outline_area(flat)
 
 
-def _upright(part: FlatPart, thing: Points, viewpoints: Float[np.ndarray, "views 3"]) -> bool:
+def _upright(part: FlatPart, thing: Points, viewpoints: Eyes) -> bool:
     """Whether all cameras look straight down on a thing."""
     sight = viewpoints - thing.mean(0)
     return bool((sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all())

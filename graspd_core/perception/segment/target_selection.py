@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
-from graspd_core.perception.cloud.voxel_downsample import VoxelScene
+from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene
 
 # Errors list so many things.
 MAX_LISTED_THINGS = 4
@@ -60,12 +60,12 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
 
 def select_target(
     scene: VoxelScene,
-    label: Int[np.ndarray, "voxels"],
+    label: Labels,
     free: Sequence[int],
     target: Target,
     views: Sequence[PointCloud],
     settings: SegmentationConfig,
-) -> Bool[np.ndarray, "voxels"]:
+) -> Mask:
     """The voxels of the object.
 
     Args:
@@ -96,7 +96,7 @@ def select_target(
     return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
 
 
-def seen(scene: VoxelScene, label: Int[np.ndarray, "voxels"]) -> str:
+def seen(scene: VoxelScene, label: Labels) -> str:
     """Where there are things, for errors: the centres of the largest."""
     many = int(label.max(initial=-1)) + 1
     if many == 0:
@@ -106,7 +106,7 @@ def seen(scene: VoxelScene, label: Int[np.ndarray, "voxels"]) -> str:
     return f"{told} about {', '.join(places)} m"
 
 
-def _nearest(scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, point: Vector, reach: float) -> int:
+def _nearest(scene: VoxelScene, label: Labels, many: int, point: Vector, reach: float) -> int:
     away = np.linalg.norm(scene.mean - point, axis=1)
     away[label < 0] = np.inf
     nearest = int(away.argmin())
@@ -115,9 +115,7 @@ def _nearest(scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, poi
     return int(label[nearest])
 
 
-def _masked(
-    scene: VoxelScene, label: Int[np.ndarray, "voxels"], many: int, mask: Bool[np.ndarray, "points"], least: float
-) -> Bool[np.ndarray, "voxels"]:
+def _masked(scene: VoxelScene, label: Labels, many: int, mask: Bool[np.ndarray, "points"], least: float) -> Mask:
     """A mask may cover several things, pieces of one that others hide in part; a few points of it may miss."""
     of_first = scene.voxel[scene.of_view(0)]
     masked = of_first[mask[scene.rows[0]]]
@@ -131,13 +129,7 @@ def _masked(
     return _covered(label, meant, [main, *(k for k in range(many) if k != main and share[k] >= 0.5)], share, least)
 
 
-def _covered(
-    label: Int[np.ndarray, "voxels"],
-    meant: Bool[np.ndarray, "voxels"],
-    things: list[int],
-    share: Float[np.ndarray, "things"],
-    least: float,
-) -> Bool[np.ndarray, "voxels"]:
+def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndarray, "things"], least: float) -> Mask:
     """Things of which at least that share is covered, and the covered part of the others."""
     whole = [k for k in things if share[k] >= least]
     return np.isin(label, whole) | (np.isin(label, things) & meant)
