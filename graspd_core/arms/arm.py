@@ -1,11 +1,10 @@
-"""Capsules: the solids that an arm and its hand are held against each other, the support and the obstacles as.
+"""Arms by name, from an arm description: the YAML file beside a URDF (docs/arms.md).
 
-A capsule is all that is nearer to a segment than its radius, so that every distance is one of segments: exact between
-capsules and to a plane. Any other solid gets a capsule about it, which is larger than the solid.
+An arm is a frozen chain of links from its base to the tip that carries the hand. Its URDF is read and refused by our
+reader. Forward kinematics and Jacobians are those of pytorch-kinematics, which is imported when an arm is used.
 
-What an arm is: a frozen chain of links from its base to the tip that carries the hand.
-
-Arms by name, from an arm description: the YAML file beside a URDF (docs/arms.md).
+Solids become capsules: all that is nearer to a segment than a radius. Every distance is then one of segments: exact
+between capsules and to a plane. Any other solid gets a capsule about it, which is larger than the solid.
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,12 +23,14 @@ from torch import Tensor
 
 from graspd_core.config.mapping import from_mapping, read_yaml
 from graspd_core.errors import ConfigError, shown
-from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel, Mount, Primitive
 from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.hands.readers.xml_io import parse_xml, read_xml
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3, rotation_from_quaternion
+
+if TYPE_CHECKING:
+    from pytorch_kinematics.chain import Chain
 
 # A squared length below this is a point's [m²].
 _POINT = 1e-12
@@ -173,9 +174,38 @@ def tip_hand(arm: Arm, hand: HandModel) -> SE3:
     return SE3(rotation, torch.tensor(mount.position, dtype=torch.float64))
 
 
+# Arms are hashed by identity.
+@lru_cache(maxsize=8)
+def kinematic_chain(arm: Arm) -> Chain:
+    """Build pytorch-kinematics' chain of all links of an arm, in float64. Its own URDF reader keeps float32."""
+    from pytorch_kinematics.chain import Chain
+    from pytorch_kinematics.frame import Frame, Joint, Link
+    from pytorch_kinematics.transforms import Transform3d
+
+    model = arm.chain
+    frames: list[Frame] = []
+    for link, name in enumerate(model.link_names):
+        offset = Transform3d(
+            rot=torch.as_tensor(model.link_offset_rotation[link]).double(),
+            pos=torch.as_tensor(model.link_offset_translation[link]).double(),
+            dtype=torch.float64,
+        )
+        joint = Joint(offset=offset, dtype=torch.float64)
+        if model.link_joint[link] >= 0:
+            joint_name, axis = model.joint_names[model.link_joint[link]], torch.as_tensor(model.joint_axis[link])
+            joint = Joint(joint_name, offset, model.joint_kind[link], axis, dtype=torch.float64)
+        frames.append(Frame(name, Link(name), joint))
+        if model.link_parent[link] >= 0:
+            frames[model.link_parent[link]].add_child(frames[link])
+    return Chain(frames[0], dtype=torch.float64)
+
+
 def arm_links(arm: Arm, q: Float[Tensor, "batch joints"]) -> SE3:
-    """`T_base_link` of every link at joint values q [rad] or [m]: a batch of arms by links."""
-    return forward(make_kinematics(arm.chain, dtype=q.dtype), q)
+    """Return `T_base_link` of every link at joint values q [rad] or [m]: a batch of arms by links."""
+    chain = kinematic_chain(arm)
+    poses = chain.forward_kinematics_tensor(q.double())[chain.get_frame_indices(*arm.chain.link_names)]
+    poses = poses.transpose(0, 1).to(q)
+    return SE3(poses[..., :3, :3], poses[..., :3, 3])
 
 
 ROBOT_DESCRIPTION = "robot_description"
