@@ -12,8 +12,13 @@ docs/api.md lists the names by purpose.
 from __future__ import annotations
 
 import importlib
+import sys
 import warnings
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from graspd_core.arms.arm import Arm as Arm
@@ -127,3 +132,47 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+class _MovedModules:
+    """Refuse the module paths of version 0.1 with their new names. The last finder sees only imports that fail."""
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        if not fullname.startswith(f"{__name__}."):
+            return None
+        moved = _moved_modules()
+        if fullname in moved:
+            raise ImportError(_moved_to(fullname, moved[fullname]), name=fullname)
+        if not any(old.startswith(f"{fullname}.") for old in moved):
+            return None
+        # A folder that is gone: an empty package, since Python imports a parent before it asks for the module.
+        return ModuleSpec(fullname, cast(Any, self), is_package=True)
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """Leave it to Python."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        def __getattr__(name: str) -> Any:
+            moved, old = _moved_modules(), f"{module.__name__}.{name}"
+            if old in moved:
+                raise ImportError(_moved_to(old, moved[old]), name=old)
+            inside = sorted({new for old, new in moved.items() if old.startswith(f"{module.__name__}.")})
+            raise AttributeError(_moved_to(module.__name__, ", ".join(inside)))
+
+        module.__dict__["__getattr__"] = __getattr__
+
+
+def _moved_to(old: str, new: str) -> str:
+    return f"{old} is {new} since version 0.2"
+
+
+@cache
+def _moved_modules() -> dict[str, str]:
+    """Return the new name of each module path of version 0.1."""
+    import json
+
+    rows = json.loads(Path(__file__).with_name("moved.json").read_text())
+    return {f"{__name__}.{old}": new for new, olds in rows.items() for old in olds.split()}
+
+
+sys.meta_path.append(_MovedModules())

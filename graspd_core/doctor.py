@@ -26,6 +26,7 @@ _LIBRARIES = {
     "open3d": "open3d",
     "libigl": "igl",
     "fast-simplification": "fast_simplification",
+    "pytorch-kinematics": "pytorch_kinematics",
     "pyyaml": "yaml",
     "matplotlib": "matplotlib",
 }

@@ -144,3 +144,22 @@ def test_the_doctor_reports_what_is_missing_and_what_dies():
 
 def test_the_launch_file_compiles():
     assert compileall.compile_dir(ROOT / "graspd_ros" / "launch", quiet=1, force=True)
+
+
+# What a plan on a mesh by a shipped hand has no need of.
+OPTIONAL = ["graspd_core.arms", "graspd_core.library", "graspd_core.hands.mano"]
+OPTIONAL += ["graspd_bench", "graspd_dataset", "graspd_viewer"]
+REFUSE = f"""
+import sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if any(name == part or name.startswith(part + ".") for part in {OPTIONAL!r}):
+            raise ImportError(name + " is asked for, though nobody asked for it")
+sys.meta_path.insert(0, Refuse())
+"""
+
+
+@pytest.mark.parametrize("program", [LIBRARY, COMMAND], ids=["library", "command"])
+def test_a_plan_on_a_mesh_needs_no_optional_part(program):
+    run = subprocess.run([sys.executable, "-c", REFUSE + program], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr

@@ -6,9 +6,9 @@ singular postures, none at the end, where steps are Newton's. A joint at its lim
 held there and the step is found without it. The loop is ours: it is eight times faster than the library's solver, since
 it starts near and drops poses as they are reached (docs/arms.md).
 
-Starts are the postures of a table whose tips are nearest. No pose is in reach whose tip, or a point fixed to the tip, is
-nearer to the shoulder or farther from it than in any posture of the table. Of hands drawn around objects at 0.3 to 0.95
-m this keeps 99.3 and 99.7 % of those that the shipped arms reach, and 18 and 4 % of the others.
+Starts are the postures of a table whose tips are nearest. No pose is in reach whose tip, or a point fixed to the tip,
+is nearer to the shoulder or farther from it than in any posture of the table. Of hands drawn around objects at 0.3 to
+0.95 m this keeps 99.3 and 99.7 % of those that the shipped arms reach, and 18 and 4 % of the others.
 
 A pose out of reach has a reason: the joint whose limit is in the way, or that no posture gets there at all.
 """

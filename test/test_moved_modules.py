@@ -1,0 +1,60 @@
+"""Module paths of version 0.1: each is refused with the name that it has now."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import graspd_core
+
+MOVED = {
+    f"graspd_core.{old}": new
+    for new, olds in json.loads(Path(graspd_core.__file__).with_name("moved.json").read_text()).items()
+    for old in olds.split()
+}
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("graspd_core.methods.losses", "graspd_core.optimize.losses"),
+        ("graspd_core.methods.stages.squeeze", "graspd_core.optimize.grasp_postures"),
+        ("graspd_core.bench.study_registry", "graspd_bench.study_registry"),
+        ("graspd_core.dataset.ray_engine", "graspd_dataset.ray_engine"),
+        ("graspd_core.viewer.server", "graspd_viewer.server"),
+        ("graspd_core.cli.bench_command", "graspd_bench.bench_command"),
+    ],
+)
+def test_an_old_path_is_refused_with_the_new_name(old: str, new: str):
+    told = f"^{old} is {new} since version 0.2$"
+    with pytest.raises(ImportError, match=told):
+        importlib.import_module(old)
+    folder, _, module = old.rpartition(".")
+    with pytest.raises(ImportError, match=told):
+        exec(f"from {folder} import {module}")
+
+
+def test_every_new_name_exists_and_no_old_one():
+    assert [new for new in sorted(set(MOVED.values())) if importlib.util.find_spec(new) is None] == []
+    # Python itself refuses what would lie inside a module: `planning.steering` was a folder.
+    inside = "graspd_core.planning.steering."
+    for old in MOVED:
+        if not old.startswith(inside):
+            with pytest.raises(ImportError, match=r"since version 0\.2"):
+                importlib.import_module(old)
+
+
+def test_a_name_of_a_folder_that_is_gone_is_no_name():
+    with pytest.raises(ImportError, match=r"graspd_core\.methods"):
+        exec("from graspd_core.methods import METHODS")
+
+
+def test_what_never_was_is_told_by_python():
+    with pytest.raises(ModuleNotFoundError, match=r"No module named 'graspd_core.nothing'"):
+        importlib.import_module("graspd_core.nothing")
+    assert type(sys.meta_path[-1]).__module__ == "graspd_core"
