@@ -28,7 +28,7 @@ from jaxtyping import Float
 
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
-from graspd_core.perception.scene import ObjectModel, moved_grasp
+from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh
 from graspd_core.verify.early_stop import CHECK_EVERY, CREEPING, ObjectState
@@ -148,7 +148,6 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
     """
     import mujoco
 
-    grasp = moved_grasp(grasp, -world.origin)
     with trial_data(world) as data:
         if close_hand(world, data, grasp, protocol, np.zeros(2)):
             return LOST
@@ -250,7 +249,7 @@ def settle(
     add_plane(spec, _FLOOR, Plane(np.eye(3)[2], 0.0), protocol.friction)
     for index, normal in enumerate(np.vstack([np.eye(3)[:2], -np.eye(3)[:2]]) if wall is not None else ()):
         add_plane(spec, f"{_WALL} {index}", Plane(normal, -float(wall or 0.0)), protocol.friction)
-    names = add_others(spec, bodies, protocol.friction, np.zeros(3))
+    names = add_others(spec, bodies, protocol.friction)
     model = spec.compile()
     data = mujoco.MjData(model)
     _damp(model, names, *(_RESTING if wall is None else _FALLING))
@@ -301,13 +300,11 @@ class _Watch:
         self.end: tuple[Pose, list[Pose], Posture] | None = None
 
     def __call__(self, data: Any) -> None:
-        world, up = self._world, self._world.origin - data.mocap_pos[1]
+        world, up = self._world, -data.mocap_pos[1]
         body = int(world.model.body(OBJECT).id)
         object_pose, rest = _pose(data, body), [_pose(data, other) for other in world.others]
         for pose in (object_pose, *rest):
             pose[:3, 3] += up
-        # The object's parts are where it lay, in a frame about the world's origin.
-        object_pose[:3, 3] -= object_pose[:3, :3] @ world.origin
         posture = Posture(data.mocap_pos[0] + up, data.mocap_quat[0].copy(), data.qpos[world.joint_addresses])
         self.end = object_pose, rest, posture
 

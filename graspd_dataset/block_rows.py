@@ -16,7 +16,7 @@ from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positi
 from graspd_core.io.grasps_json import grasp_figures
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import ObjectModel, Scene, object_parts, object_sharp_points
+from graspd_core.perception.scene import ObjectModel, Scene, near_scene, object_parts, object_sharp_points
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
 from graspd_core.runtime.records import code_version, forget_peak, peak_mb
@@ -51,8 +51,9 @@ def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) 
             Path(source).write_bytes(content)
         scene = load_scene(source, resolution=config.resolution, **options)
     scene = replace(scene, object=replace(scene.object, source=thing.source))
-    object_parts(scene.object)
-    object_sharp_points(scene.object, 2 * config.problem.features)
+    near, _ = near_scene(scene)
+    object_parts(near.object)
+    object_sharp_points(near.object, 2 * config.problem.features)
     shared = pickle.dumps((scene, disk_cache.contents()), pickle.HIGHEST_PROTOCOL)
     return ReadyObject(scene.object.sha256, _object_file(scene.object), shared)
 

@@ -22,8 +22,9 @@ import yaml
 
 from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import save_text
+from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import object_parts
+from graspd_core.perception.scene import moved_object, object_parts
 from graspd_core.runtime.disk_cache import save_bytes
 from graspd_core.types import TriangleMesh
 from graspd_dataset.dataset_store import DatasetStore, read_parquet
@@ -138,8 +139,9 @@ def write_dexgraspbench(rows: Sequence[dict[str, Any]], mesh: TriangleMesh, out:
     told["gravity_center"] = model.center_of_mass.tolist()
     save_text(folder / "info" / "simplified.json", json.dumps(told, indent=1) + "\n")
     save_text(folder / "mesh" / "simplified.obj", obj_text(mesh))
-    for number, part in enumerate(object_parts(model)):
-        save_text(folder / "urdf" / "meshes" / f"convex_piece_{number:03d}.obj", obj_text(part))
+    far = far_centre(model.mesh.vertices)
+    for number, part in enumerate(object_parts(moved_object(model, -far))):
+        save_text(folder / "urdf" / "meshes" / f"convex_piece_{number:03d}.obj", obj_text(moved_mesh(part, far)))
 
 
 def qpos(row: dict[str, Any], stage: str) -> np.ndarray:

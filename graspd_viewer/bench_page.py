@@ -31,12 +31,12 @@ from graspd_core.optimize.candidates import find_candidates
 from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import method_row, plan_config
 from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
-from graspd_core.perception.scene import object_parts
+from graspd_core.perception.scene import near_scene
 from graspd_core.types import StopHook, Verdict
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
-from graspd_core.verify.trial_registry import build_worlds, grasp_trials
-from graspd_core.verify.world import PROTOCOLS
+from graspd_core.verify.trial_registry import grasp_trials
+from graspd_core.verify.verification import trial_context
 from graspd_viewer.server import may_connect
 from graspd_viewer.session import Session, make_session
 
@@ -120,13 +120,13 @@ def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop
     """
     config = plan_config(record["settings"], f"settings of {record['name']}")
     hand = load_hand(record["hand"], candidates=config.problem.fine_candidates)
-    scene = load_scene(_source(record), resolution=config.resolution)
+    scene, _ = near_scene(load_scene(_source(record), resolution=config.resolution))
     title = f"{record['name']}, {record['object']}, seed {record['seed']}"
     session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
     show(session)
     count, hooks = record["count"], Hooks(lambda step, of, _: tell(f"searching {step} of {of}", step / of), stop)
     found = find_candidates(scene, hand, count=count, seed=record["seed"], config=config, hooks=hooks).grasps[:count]
-    worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
+    worlds = trial_context(scene, hand, "standard")
     context, grasps = make_metrics_context(scene.object, hand), []
     for grasp in found:
         if stop():

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import ConfigError, GraspdError, shown
-from graspd_core.perception.scene import object_parts
 from graspd_core.types import Grasp, TrialResult
 from graspd_core.verify.hold_trial import axis_name
 from graspd_core.verify.lift_trial import LiftSettings
-from graspd_core.verify.trial_registry import TRIALS, TrialContext, build_worlds
-from graspd_core.verify.world import PROTOCOLS, Protocol, World, at_friction
+from graspd_core.verify.trial_registry import TRIALS, TrialContext
+from graspd_core.verify.verification import trial_context
+from graspd_core.verify.world import PROTOCOLS, Protocol, World
 from graspd_viewer.drawing import force_parts
 from graspd_viewer.grasp_list import BLOCK
 from graspd_viewer.scene_nodes import SceneNodes
@@ -106,7 +106,7 @@ class _Recorder:
 
     def _frame(self, data: Any) -> Frame:
         # What is beside the hand sinks in a lift (lift_trial.py); seen from there, hand and object rise.
-        origin = self._world.origin - (data.mocap_pos[1] if len(data.mocap_pos) > 1 else 0.0)
+        origin = -data.mocap_pos[1] if len(data.mocap_pos) > 1 else np.zeros(3)
         contacts, forces = _contact_forces(self._world, data)
         return Frame(
             _lift_stage(data, self._protocol) if self._lifts else _hold_stage(self._world, data, self._protocol),
@@ -217,8 +217,7 @@ class TrialControls:
         name = self._protocol.value if self._protocol.value in PROTOCOLS else "standard"
         if name not in self._contexts:
             scene = self._session.scene
-            protocol = at_friction(PROTOCOLS[name], scene.object.friction)
-            self._contexts[name] = build_worlds(scene, self._session.hand, object_parts(scene.object), protocol)
+            self._contexts[name] = trial_context(scene, self._session.hand, name)
         return self._contexts[name]
 
     def _play_from(self, index: int) -> None:

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from graspd_core.errors import GraspdError
-from graspd_core.perception.scene import ObjectModel, Scene, object_parts
+from graspd_core.mesh.topology import far_centre
+from graspd_core.perception.scene import ObjectModel, Scene, moved_grasp, moved_object, object_parts
 from graspd_core.runtime.records import peak_mb
 from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
 
@@ -179,9 +180,10 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
     from graspd_core.verify.hold_trial import hold_trial
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
-    protocol = at_friction(PROTOCOLS["standard"], target.friction)
+    protocol, far = at_friction(PROTOCOLS["standard"], target.friction), far_centre(target.mesh.vertices)
+    target = moved_object(target, -far)
     world = build_world(hand, target, object_parts(target), protocol)
-    return sum(hold_trial(world, grasp, protocol).passed for grasp in grasps)
+    return sum(hold_trial(world, moved_grasp(grasp, -far), protocol).passed for grasp in grasps)
 
 
 def _finite(result: GraspResult) -> bool:

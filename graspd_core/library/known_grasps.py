@@ -36,11 +36,11 @@ from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.obstacle_distance import gap_on_the_way, make_obstacle_tensors
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
-from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.perception.scene import Scene, moved_grasp, near_scene
 from graspd_core.planning.plan_grasps import check_request, plan_grasps
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, StopHook, Timing, Verdict
-from graspd_core.verify.trial_registry import build_worlds, grasp_trials
-from graspd_core.verify.world import PROTOCOLS, at_friction
+from graspd_core.verify.trial_registry import grasp_trials
+from graspd_core.verify.verification import trial_context
 
 _MOST_NAMED = 8
 
@@ -298,9 +298,10 @@ def _held(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], verify: str, stop: StopHook
 ) -> Iterable[tuple[Grasp, str]]:
     """Each grasp, tried again where something stands near, and why it is none here; one at a time."""
-    gaps = clearance(scene, hand, grasps)
+    scene, far = near_scene(scene)
+    near = [moved_grasp(grasp, -far) for grasp in grasps]
+    gaps = clearance(scene, hand, near)
     gaps = np.minimum(gaps, NEAR / 2) if _hemmed_in(scene) else gaps
-    worlds = None
     # Those that need no trial come first.
     for index in np.argsort(gaps < NEAR, kind="stable"):
         grasp, gap = grasps[index], gaps[index]
@@ -311,10 +312,8 @@ def _held(
         else:
             if stop():
                 return
-            if worlds is None:
-                protocol = at_friction(PROTOCOLS["standard" if verify == "none" else verify], scene.object.friction)
-                worlds = build_worlds(scene, hand, object_parts(scene.object), protocol)
-            tried = replace(grasp, trials=grasp_trials(worlds, grasp, stop))
+            worlds = trial_context(scene, hand, "standard" if verify == "none" else verify)
+            tried = replace(grasp, trials=grasp_trials(worlds, near[index], stop))
             yield tried, "" if tried.verdict is Verdict.VERIFIED else "that did not hold beside what stands near"
 
 

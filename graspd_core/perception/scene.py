@@ -1,8 +1,10 @@
-"""Things far from the origin, as in the coordinates of a map: float32 would round them, so they are moved near.
+"""The frozen scene: the object's mesh, its mass and its signed distance, and what stands around it.
 
-How far the object's surface is known, as a grid beside its signed distance: 1 where it was seen, 0 where guessed.
+A scene keeps the coordinates of its file. Float32 would round an object far from the origin, as in the coordinates of a
+map: `near_scene` moves a whole scene about its object, and `moved_grasp` brings grasps back.
 
-The frozen scene: the object's mesh, its mass and its signed distance, and what stands around it.
+Confidence says how far the object's surface is known, as a grid beside its signed distance: 1 where it was seen, 0
+where it was guessed.
 """
 
 from __future__ import annotations
@@ -34,16 +36,14 @@ from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh
 
 
 def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:
-    """The signed distance elsewhere; itself where the offset is zero."""
-    if not offset.any():
-        return sdf
+    """The signed distance elsewhere."""
     origin = sdf.origin.double() + torch.as_tensor(offset, device=sdf.origin.device)
     return GridSDF(sdf.field, origin.to(sdf.origin), sdf.spacing, sdf.half)
 
 
 def moved_plane(plane: Plane, offset: Float[np.ndarray, "3"]) -> Plane:
-    """The plane elsewhere; itself where the offset is zero."""
-    return Plane(plane.normal, plane.offset + float(plane.normal @ offset)) if offset.any() else plane
+    """The plane elsewhere."""
+    return Plane(plane.normal, plane.offset + float(plane.normal @ offset))
 
 
 def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
@@ -213,7 +213,9 @@ def build_scene(
     if ahead is not None:
         ahead(model)
     loaded = time.perf_counter()
-    sdf = object_sdf(model, resolution)
+    far = far_centre(clean.vertices)
+    sdf = object_sdf(moved_object(model, -far), resolution)
+    sdf = moved_sdf(sdf, far) if far.any() else sdf
     if not is_solid(sdf):
         cell = float(sdf.spacing) * 1000
         note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; it counts as a sheet"
@@ -225,40 +227,41 @@ def build_scene(
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
-    """The object's signed distance (float32, CPU) on at most `resolution`³ nodes, remembered by content."""
-    near, far = near_object(model)
+    """The signed distance of an object near the origin (float32, CPU) on at most `resolution`³ nodes.
+
+    Remembered by content.
+    """
 
     def build() -> cache.Arrays:
-        sdf = build_sdf(near.mesh, resolution=resolution)
+        sdf = build_sdf(model.mesh, resolution=resolution)
         return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
 
     def valid(arrays: cache.Arrays) -> bool:
         shapes = {
-            "field": (4, *grid_layout(near.mesh, resolution).counts),
+            "field": (4, *grid_layout(model.mesh, resolution).counts),
             "origin": (3,),
             "spacing": (),
             "half": (3,),
         }
         return {name: array.shape for name, array in arrays.items()} == shapes
 
-    arrays = cache.remember(f"sdf-{near.sha256}-{resolution}", build, valid)
-    return moved_sdf(GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()}), far)
+    arrays = cache.remember(f"sdf-{model.sha256}-{resolution}", build, valid)
+    return GridSDF(**{name: torch.as_tensor(array) for name, array in arrays.items()})
 
 
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
     """The object's sharp points [m] and its share of thin surface (`sharp_points`), remembered by content."""
-    near, far = near_object(model)
-    coarse = {"pool": _COARSE_POOL} if near.reconstructed else {}
+    coarse = {"pool": _COARSE_POOL} if model.reconstructed else {}
 
     def build() -> cache.Arrays:
-        points, thin_share = sharp_points(near.mesh, count, **coarse)
+        points, thin_share = sharp_points(model.mesh, count, **coarse)
         return {"points": points, "thin_share": np.array(thin_share)}
 
     def valid(arrays: cache.Arrays) -> bool:
         return set(arrays) == {"points", "thin_share"} and arrays["points"].shape[1:] == (3,)
 
-    arrays = cache.remember(f"sharp-{near.sha256}-{count}{'-coarse' if coarse else ''}", build, valid)
-    return arrays["points"] + far, float(arrays["thin_share"])
+    arrays = cache.remember(f"sharp-{model.sha256}-{count}{'-coarse' if coarse else ''}", build, valid)
+    return arrays["points"], float(arrays["thin_share"])
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
@@ -266,31 +269,47 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
 
     Those of a reconstructed object are coarser: cameras do not see it finer than that.
     """
-    near, far = near_object(model)
-    cuts = COARSE_CUTS if near.reconstructed else {}
+    cuts = COARSE_CUTS if model.reconstructed else {}
 
     def build() -> cache.Arrays:
         # Some tenths of a second of Python's own work, beside the optimiser.
-        parts = run_isolated(convex_parts, near.mesh, object_sdf(near), **cuts)
+        parts = run_isolated(convex_parts, model.mesh, object_sdf(model), **cuts)
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
     def valid(arrays: cache.Arrays) -> bool:
         names = {f"{kind}{i}" for i in range(len(arrays) // 2) for kind in ("vertices", "faces")}
         return bool(names) and set(arrays) == names and all(a.shape[1:] == (3,) for a in arrays.values())
 
-    arrays = cache.remember(f"parts-{near.sha256}{'-coarse' if cuts else ''}", build, valid)
-    parts = (TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
-    return tuple(moved_mesh(part, far) for part in parts)
+    arrays = cache.remember(f"parts-{model.sha256}{'-coarse' if cuts else ''}", build, valid)
+    return tuple(TriangleMesh(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(arrays) // 2))
 
 
-def near_object(model: ObjectModel) -> tuple[ObjectModel, Float[np.ndarray, "3"]]:
-    """An object far from the origin about its centre, and that centre [m]; else the object itself, and zero."""
-    far = far_centre(model.mesh.vertices)
+def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
+    """Return a scene about its object, and where its origin lies in the scene given [m].
+
+    The origin moves for an object farther from it than a hundred times its size: float32 could not tell a contact there
+    from a gap, and MuJoCo finds none. Otherwise this is the scene itself, and zero.
+    """
+    far = far_centre(scene.object.mesh.vertices)
     if not far.any():
-        return model, far
-    mesh = moved_mesh(model.mesh, -far)
-    near = replace(model, mesh=mesh, sha256=content_hash(mesh), center_of_mass=model.center_of_mass - far)
+        return scene, far
+    near = replace(
+        scene,
+        object=moved_object(scene.object, -far),
+        sdf=moved_sdf(scene.sdf, -far),
+        support=scene.support and moved_plane(scene.support, -far),
+        obstacles=tuple(moved_obstacle(obstacle, -far) for obstacle in scene.obstacles),
+        evidence=scene.evidence and replace(scene.evidence, origin=scene.evidence.origin - far),
+    )
     return near, far
+
+
+def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectModel:
+    """The object elsewhere; itself where the offset is zero."""
+    if not offset.any():
+        return model
+    mesh = moved_mesh(model.mesh, offset)
+    return replace(model, mesh=mesh, sha256=content_hash(mesh), center_of_mass=model.center_of_mass + offset)
 
 
 def moved_obstacle(neighbour: Obstacle, offset: Float[np.ndarray, "3"]) -> Obstacle:

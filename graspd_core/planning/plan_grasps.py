@@ -28,10 +28,7 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import (
     Scene,
     moved_grasp,
-    moved_obstacle,
-    moved_plane,
-    moved_sdf,
-    near_object,
+    near_scene,
     object_sdf,
     sample_confidence,
 )
@@ -44,30 +41,24 @@ from graspd_core.verify.verification import rank_by_robustness, trials_ahead
 
 
 def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
-    """The scene as it is planned on, and where its origin lies in the scene given [m].
+    """The scene as it is planned on (`near_scene`), and where its origin lies in the scene given [m].
 
-    The origin is another one for an object farther from it than a hundred times its size: float32 could not tell a
-    contact there from a gap. A distance grid of another resolution is built anew. Where neither is so, this is the
-    scene itself.
+    A distance grid of another resolution, or of a far object, whose nodes float32 rounded, is built anew.
 
     Raises:
         ConfigError: no such resolution.
     """
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
-    model, far = near_object(scene.object)
-    as_asked = tuple(scene.sdf.field.shape[1:]) == grid_layout(model.mesh, resolution).counts
+    scene, far = near_scene(scene)
+    as_asked = tuple(scene.sdf.field.shape[1:]) == grid_layout(scene.object.mesh, resolution).counts
     if as_asked and not far.any():
         return scene, far
-    sdf = object_sdf(model, resolution).to(scene.sdf.field.device, scene.sdf.field.dtype)
+    sdf = object_sdf(scene.object, resolution).to(scene.sdf.field.device, scene.sdf.field.dtype)
     confidence = scene.confidence
     if confidence is not None and not as_asked:
-        confidence = sample_confidence(confidence, moved_sdf(scene.sdf, -far), _nodes(sdf)).reshape(sdf.field.shape[1:])
-    support = scene.support and moved_plane(scene.support, -far)
-    obstacles = tuple(moved_obstacle(obstacle, -far) for obstacle in scene.obstacles)
-    evidence = scene.evidence and replace(scene.evidence, origin=scene.evidence.origin - far)
-    changed = {"support": support, "obstacles": obstacles, "confidence": confidence, "evidence": evidence}
-    return replace(scene, object=model, sdf=sdf, **changed), far
+        confidence = sample_confidence(confidence, scene.sdf, _nodes(sdf)).reshape(sdf.field.shape[1:])
+    return replace(scene, sdf=sdf, confidence=confidence), far
 
 
 def _nodes(sdf: GridSDF) -> Float[Tensor, "x yz 3"]:

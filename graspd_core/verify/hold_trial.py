@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_core.perception.scene import moved_grasp
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_axis_angle, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TrialResult
 from graspd_core.verify.early_stop import CHECK_EVERY, LOOK_EVERY, ObjectState, answer_known, stop_rule
@@ -46,7 +45,6 @@ def hold_trial(
     """
     import mujoco
 
-    grasp = moved_grasp(grasp, -world.origin)
     worst = np.zeros(2)
     try:
         return _result(worst, _hold(world, grasp, protocol, worst, stop))
@@ -282,7 +280,7 @@ def noisy_holds(
     The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same
     errors. A start that the error pushes too deep into the object counts as not held.
     """
-    moved = [displaced(grasp, *error, world.center_of_mass + world.origin) for error in pose_errors(seed, TRIALS)]
+    moved = [displaced(grasp, *error, world.center_of_mass) for error in pose_errors(seed, TRIALS)]
     return tuple(hold_trial(world, g, protocol, stop=stop) for g in moved)
 
 
@@ -298,9 +296,9 @@ def noisy_share(
 
     None where `stop` ended one of them, or there is none.
     """
-    held, center = 0, world.center_of_mass + world.origin
+    held = 0
     for error in errors:
-        held += hold_trial(world, displaced(grasp, *error, center), protocol, stop=stop).passed
+        held += hold_trial(world, displaced(grasp, *error, world.center_of_mass), protocol, stop=stop).passed
         if stop():
             return None
     return held / len(errors) if errors else None

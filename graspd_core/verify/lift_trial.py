@@ -84,7 +84,6 @@ def lift_trial(
     """
     import mujoco
 
-    grasp = moved_grasp(grasp, -world.origin)
     try:
         return _lift(world, hand, grasp, protocol, settings, stop)
     except mujoco.FatalError as error:

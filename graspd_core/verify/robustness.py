@@ -241,8 +241,7 @@ def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:
-    center = trials.alone.center_of_mass + trials.alone.origin
-    return hold_trial(trials.alone, displaced(grasp, *error, center), trials.protocol, stop=stop)
+    return hold_trial(trials.alone, displaced(grasp, *error, trials.alone.center_of_mass), trials.protocol, stop=stop)
 
 
 @lru_cache(maxsize=4)

@@ -20,7 +20,7 @@ import torch
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
-from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
 from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
 from graspd_core.verify import metrics
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
@@ -40,7 +40,7 @@ from graspd_core.verify.robustness import (
 )
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, audited_trials, build_worlds, grasp_trials
-from graspd_core.verify.world import PROTOCOLS, Protocol, World, at_friction
+from graspd_core.verify.world import PROTOCOLS, World, at_friction
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
@@ -88,7 +88,7 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
 
     def build() -> TrialContext | None:
         with _CUTTING:
-            return None if run.known_over() else _worlds(scene, hand, protocol)
+            return None if run.known_over() else trial_context(scene, hand, verify)
 
     worlds = begin_in_thread("graspd-parts", build)
     return TrialsAhead(worlds, begin_other_world(run, scene, hand, protocol, certainty.probability))
@@ -108,7 +108,9 @@ def make_trial_context(
 
 # Kept for the last few scenes and hands, which are hashed by identity.
 @lru_cache(maxsize=4)
-def _worlds(scene: Scene, hand: HandModel, protocol: Protocol) -> TrialContext:
+def trial_context(scene: Scene, hand: HandModel, verify: str) -> TrialContext:
+    """The worlds that `verify` trials of a scene's grasps take place in, at its object's friction."""
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     return build_worlds(scene, hand, object_parts(scene.object), protocol)
 
 
@@ -305,15 +307,16 @@ def verify_grasps(
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")
     for index, grasp in enumerate(grasps):
         _refuse_posture(grasp, hand, f"grasp {index}")
-    verified = tuple(replace(grasp, metrics=None, trials=()) for grasp in grasps)
+    scene, far = near_scene(scene)
+    verified = tuple(replace(moved_grasp(grasp, -far), metrics=None, trials=()) for grasp in grasps)
     if verify != "none":
-        protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-        worlds = build_worlds(scene, hand, object_parts(scene.object), protocol)
+        worlds = trial_context(scene, hand, verify)
         verified = tuple(replace(grasp, trials=grasp_trials(worlds, grasp)) for grasp in verified)
     if measure:
-        context = make_metrics_context(scene.object, hand)
+        context = _metrics_context(scene, hand)
         verified = tuple(replace(grasp, metrics=metrics.measure(context, grasp.grasp)) for grasp in verified)
-    return verified
+    tried = zip(grasps, verified, strict=True)
+    return tuple(replace(given, metrics=found.metrics, trials=found.trials) for given, found in tried)
 
 
 def _refuse_posture(grasp: Grasp, hand: HandModel, name: str) -> None:

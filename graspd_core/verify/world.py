@@ -24,8 +24,7 @@ from jaxtyping import Float
 from graspd_core.hands.model import HandModel, Mimic, Primitive
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.mesh.topology import moved_mesh
-from graspd_core.perception.scene import ObjectModel, Obstacle, moved_obstacle, moved_plane, near_object
+from graspd_core.perception.scene import ObjectModel, Obstacle
 from graspd_core.se3 import quaternion_between, quaternion_from_rotation
 from graspd_core.types import Plane, TriangleMesh
 
@@ -113,14 +112,11 @@ def add_object(
         )
 
 
-def add_others(
-    spec: Any, others: Sequence[FreeBody], friction: Friction, origin: Float[np.ndarray, "3"]
-) -> tuple[str, ...]:
-    """Things that lie about, each free, in a world about `origin`; returns the names of their bodies."""
+def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tuple[str, ...]:
+    """Things that lie about, each free; returns the names of their bodies."""
     names = tuple(f"other {index + 1}" for index in range(len(others)))
     for name, other in zip(names, others, strict=True):
         add_object(spec, other.model, other.parts, friction, name=name, pose=other.pose)
-        spec.body(name).pos = other.pose[:3, 3] - origin
     return names
 
 
@@ -267,7 +263,6 @@ class World:
         object_velocity: index into `qvel` of its free joint.
         object_body: body id of the object.
         center_of_mass: of the object [m].
-        origin: of the world, in the object's frame: zero, but for an object far from its own [m].
         hand_geoms: ids of the hand's geoms.
         obstacles: id and name of the geom of every obstacle to the hand.
         up: unit direction against gravity; None where there is none.
@@ -285,7 +280,6 @@ class World:
     object_velocity: int
     object_body: int
     center_of_mass: Float[np.ndarray, "3"]
-    origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     hand_geoms: tuple[int, ...] = ()
     obstacles: tuple[tuple[int, str], ...] = ()
     up: Float[np.ndarray, "3"] | None = None
@@ -341,7 +335,7 @@ def build_world(
 
     Args:
         hand: any loaded hand.
-        target: gives mass, centre of mass and inertia.
+        target: gives mass, centre of mass and inertia. It lies near the origin (`near_scene`).
         parts: convex collision parts of the object, object frame [m].
         protocol: physics settings.
         support: a table, with gravity onto it. The hand meets it where it is; the object rests on a plane of its own
@@ -351,11 +345,6 @@ def build_world(
     """
     import mujoco
 
-    # MuJoCo keeps vertices as float32, and finds no contacts a million metres away.
-    target, far = near_object(target)
-    parts = [moved_mesh(part, -far) for part in parts]
-    support = support and moved_plane(support, -far)
-    obstacles = [moved_obstacle(obstacle, -far) for obstacle in obstacles]
     # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
     mujoco.set_mju_user_warning(lambda message: None)
     spec = mujoco.MjSpec()
@@ -371,8 +360,8 @@ def build_world(
     for index, obstacle in enumerate(obstacles):
         fixed.append(f"neighbour {index + 1}")
         add_obstacle(spec, fixed[-1], obstacle, target, protocol.friction)
-    free = add_others(spec, others or (), protocol.friction, far)
-    world = _world_of(spec.compile(), hand, target, far, fixed, None if support is None else support.normal)
+    free = add_others(spec, others or (), protocol.friction)
+    world = _world_of(spec.compile(), hand, target, fixed, None if support is None else support.normal)
     return replace(world, others=tuple(int(world.model.body(name).id) for name in free))
 
 
@@ -380,7 +369,6 @@ def _world_of(
     model: Any,
     hand: HandModel,
     target: ObjectModel,
-    origin: Float[np.ndarray, "3"],
     fixed: Sequence[str],
     up: Float[np.ndarray, "3"] | None,
 ) -> World:
@@ -392,7 +380,6 @@ def _world_of(
         object_velocity=int(model.joint(OBJECT).dofadr[0]),
         object_body=int(model.body(OBJECT).id),
         center_of_mass=target.center_of_mass,
-        origin=origin,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
         obstacles=tuple((int(model.geom(name).id), name) for name in fixed),
         up=up,

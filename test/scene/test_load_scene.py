@@ -114,9 +114,9 @@ def test_a_far_object_is_measured_like_a_near_one():
     assert far.volume == pytest.approx(shape_volume("box"), rel=1e-6)
     assert far.center_of_mass - MAP == pytest.approx(near.center_of_mass, abs=1e-8)
     assert far.inertia == pytest.approx(near.inertia, rel=1e-5)
-    ours, theirs = object_parts(far), object_parts(near)
+    ours, theirs = object_parts(moved_object(far, -MAP)), object_parts(near)
     assert sum(len(p.vertices) for p in ours) == sum(len(p.vertices) for p in theirs)
-    assert np.concatenate([p.vertices for p in ours]).min(0) - MAP == pytest.approx(near.mesh.vertices.min(0), abs=1e-3)
+    assert np.concatenate([p.vertices for p in ours]).min(0) == pytest.approx(near.mesh.vertices.min(0), abs=1e-3)
 
 
 def test_a_far_scene_is_planned_about_its_object():
@@ -143,15 +143,14 @@ def test_grasps_of_a_far_object_hold_there(hand, tmp_path):
     save_result(tmp_path / "grasps.json", result, scene.object, hand, load_preset("fast"))
     kept = [g for g in grasps_of(load_document(tmp_path / "grasps.json")) if g.verdict is Verdict.VERIFIED]
     assert len(kept) == 2
-    protocol = PROTOCOLS["standard"]
-    world = build_world(hand, scene.object, object_parts(scene.object), protocol)
+    again = verify_grasps(scene, hand, kept)
+    assert [(g.verdict, g.grasp) for g in again] == [(Verdict.VERIFIED, g.grasp) for g in kept]
     for grasp in kept:
         for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze):
             assert np.linalg.norm(posture.position - MAP) < 0.4
         gaps = [np.abs(np.array(contact.position) - MAP) for contact in grasp.contacts]
         # Contacts lie on the box, to the planner's grid.
         assert np.array(gaps) == pytest.approx(np.clip(gaps, 0, [0.03, 0.03, 0.045]), abs=0.003)
-        assert hold_trial(world, grasp, protocol).passed
 
 
 # A box that hides the lower part of a ball from the camera.
