@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -239,7 +239,6 @@ def run_verified(cell: Cell) -> dict[str, Any]:
         "first_verified": told.first,
         "rounds": told.rounds,
         "outcome": result.outcome.name,
-        "audits": asdict(result.audits),
         "cpu": {"total": taken["cpu"]},
         "wall": {"total": taken["wall"], "optimise": result.timing.optimise, "verify": result.timing.verify},
         "grasps": [{"verdict": str(grasp.verdict), "reason": grasp.reason} for grasp in result.grasps],

@@ -278,20 +278,17 @@ class Timing:
 
 @dataclass(frozen=True)
 class AuditCount:
-    """How many verified grasps were tried once more at full length, and how many of them failed there."""
+    """Always zero, for readers of version 0.1; goes with version 0.3. `graspd bench early` tries both lengths."""
 
     audited: int = 0
     disagreed: int = 0
-
-    def __add__(self, other: AuditCount) -> AuditCount:
-        return AuditCount(self.audited + other.audited, self.disagreed + other.disagreed)
 
 
 @dataclass(frozen=True)
 class GraspResult:
     """What a run gives back: an outcome, always, and the grasps in rank order, verified ones first.
 
-    `support` is what the object stood on, None where it floated. `audits` counts checks of trials that stop early.
+    `support` is what the object stood on, None where it floated. `audits` is always zero, and goes with 0.3.
     `next_view` is `T_object_camera` [m] of one more view that would show most of the hidden side, where grasps hold on
     the likeliest shape and none is sure enough. `refused` counts by reason the candidates that no trial was spent on,
     because a restriction of the request did not admit them.

@@ -27,7 +27,7 @@ _ENDS = {
 }
 # What is counted since the start, by the key that tells it.
 ACCEPTED, RECEIVED, SUPERSEDED = "requests accepted", "clouds received", "clouds superseded"
-VERIFIED, FAILED, AUDITED, DISAGREED = "grasps verified", "grasps failed", "grasps audited", "audits that disagreed"
+VERIFIED, FAILED = "grasps verified", "grasps failed"
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,6 @@ class Counters:
     def planned(self, result: GraspResult, latency: float) -> None:
         """Count a run that ended `latency` seconds after its request came."""
         with self._lock:
-            self._counts[AUDITED] += result.audits.audited
-            self._counts[DISAGREED] += result.audits.disagreed
             self._last |= {"last_latency": latency, "last_first_verified": result.timing.first_verified}
 
     def clear(self) -> None:

@@ -128,7 +128,6 @@ def _result(run: Run, scene: Scene, found: RoundsResult, config: PlanConfig, see
         seed,
         config.method,
         warnings=scene.object.warnings,
-        audits=found.audits,
         refused=found.refused,
     )
 

@@ -18,7 +18,7 @@ from graspd_core.optimize.loop import Hooks, Poses
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.perception.scene import Scene
-from graspd_core.types import AuditCount, Grasp, Snapshot, Stage
+from graspd_core.types import Grasp, Snapshot, Stage
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.verification import (
     TrialsAhead,
@@ -78,7 +78,6 @@ class RoundsResult:
         context: what grasps are tried with; None where none was tried.
         optimise_time: spent in the method [s].
         first: when the first grasp was verified, a `time.perf_counter()` value.
-        audits: of its trials.
         refused: candidates that restrictions did not admit to any trial, by reason.
     """
 
@@ -87,7 +86,6 @@ class RoundsResult:
     context: VerificationContext | None = None
     optimise_time: float = 0.0
     first: float | None = None
-    audits: AuditCount = field(default_factory=AuditCount)
     refused: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -153,7 +151,7 @@ def run_rounds(
                 if state.context is not None:
                     tried = run_trials(run, state.context, admitted, enough - state.good, state.good)
             grasps = surest_first((*state.grasps, *tried.grasps))
-            state = replace(state, grasps=grasps, first=state.first or tried.first, audits=state.audits + tried.audits)
+            state = replace(state, grasps=grasps, first=state.first or tried.first)
             began = time.perf_counter()
             if state.good >= enough or run.over():
                 break

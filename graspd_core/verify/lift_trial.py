@@ -20,7 +20,6 @@ from jaxtyping import Float
 
 from graspd_core.hands.kinematics import RETREAT, retreat_posture
 from graspd_core.hands.model import HandModel
-from graspd_core.perception.scene import moved_grasp
 from graspd_core.types import Grasp, Posture, TrialResult
 from graspd_core.verify.early_stop import CHECK_EVERY
 from graspd_core.verify.hold_trial import (

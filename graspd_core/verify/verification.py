@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain, repeat
 
@@ -21,7 +21,7 @@ from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
-from graspd_core.types import AuditCount, Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
+from graspd_core.types import Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
 from graspd_core.verify import metrics
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.metrics import measure
@@ -39,7 +39,7 @@ from graspd_core.verify.robustness import (
     try_hypotheses,
 )
 from graspd_core.verify.run_clock import Run
-from graspd_core.verify.trial_registry import TrialContext, audited_trials, build_worlds, grasp_trials
+from graspd_core.verify.trial_registry import TrialContext, build_worlds, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, World, at_friction
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
@@ -134,12 +134,10 @@ class TriedGrasps:
     Attributes:
         grasps: those that were tried, verified ones first.
         first: when the first of them had passed, a `time.perf_counter()` value.
-        audits: how many were tried once more with a pull at full length.
     """
 
     grasps: tuple[Grasp, ...] = ()
     first: float | None = None
-    audits: AuditCount = field(default_factory=AuditCount)
 
 
 def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
@@ -160,19 +158,18 @@ def run_trials(
     others: list[Grasp] = []
     metrics: list[Future[GraspMetrics]] = []
     threads = torch.get_num_threads()
-    first, audits = None, AuditCount()
+    first = None
     seen = None if run.watch is None else candidates_seen(candidates)
     # The first answer comes sooner where the best candidate is tried under several hypotheses at a time.
     alone = context.hypotheses is not None and not before
     # No trial gives more than one verified grasp.
     trials = _tried(run, context, candidates, alone, lambda: count - len(verified))
     with closing(trials), ThreadPoolExecutor(threads, thread_name_prefix="graspd-metrics") as pool:
-        for index, (tried, audit) in enumerate(trials):
+        for index, tried in enumerate(trials):
             passed = tried.verdict is Verdict.VERIFIED
             if run.over() and not passed:
                 # A trial that was cut short says nothing of the grasp.
                 break
-            audits += audit
             first = first or (time.perf_counter() if passed else None)
             found = tried if passed else None
             run.report(Stage.VERIFY, index + 1, len(candidates), 0.0, before + len(verified) + passed, found)
@@ -193,12 +190,12 @@ def run_trials(
                 break
     if metrics:
         verified = [replace(grasp, metrics=one.result()) for grasp, one in zip(verified, metrics, strict=True)]
-    return TriedGrasps(surest_first((*verified, *others)), first, audits)
+    return TriedGrasps(surest_first((*verified, *others)), first)
 
 
 def _tried(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], alone: bool, needed: Callable[[], int]
-) -> Generator[tuple[Grasp, AuditCount]]:
+) -> Generator[Grasp]:
     """Candidates with their trials, in their order.
 
     The first `alone`: under several hypotheses at a time, the others once it waits for the world of one, or has ended.
@@ -212,7 +209,7 @@ def _tried(
 
 def _best_first(
     context: VerificationContext, hypotheses: Hypotheses, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
-) -> tuple[Grasp, AuditCount]:
+) -> Grasp:
     """A candidate with its trials; those that are not the best wait until there is time for them."""
     if grasp is not best:
         while not hypotheses.waited_for.wait(_POLL) and not stop():
@@ -229,15 +226,13 @@ def _at_once(threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: Stop
     return results_in_order(stop, lambda item, ended: item.hold(grasp, ended), items, threads, lambda: len(items))
 
 
-def _all_trials(
-    context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook
-) -> tuple[Grasp, AuditCount]:
+def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook) -> Grasp:
     """The grasp with the trials of the likeliest scene, and where it passes them those of what else may be true."""
-    results, audit = audited_trials(context.trials, grasp, stop)
+    results = grasp_trials(context.trials, grasp, stop)
     if not results[-1].passed or context.hypotheses is None:
-        return replace(grasp, trials=results), audit
+        return replace(grasp, trials=results)
     under, probability = try_hypotheses(context.hypotheses, grasp, stop, hold_under)
-    return replace(grasp, trials=(*results, under), probability=probability), audit
+    return replace(grasp, trials=(*results, under), probability=probability)
 
 
 def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:

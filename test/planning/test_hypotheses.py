@@ -27,7 +27,7 @@ from graspd_core.perception.load_scene import load_scene, scene_from_views
 from graspd_core.perception.reconstruct.shape_completion import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import HYPOTHESES, AuditCount, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
+from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification
 from graspd_core.verify.hold_trial import hold_trial
@@ -120,11 +120,11 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
     second_begun, waited_for = threading.Event(), threading.Event()
     held = TrialResult("hold", True, 0.0, 0.0, "")
 
-    def likeliest(context: TrialContext, grasp: Grasp, stop: StopHook) -> tuple[tuple[TrialResult], AuditCount]:
+    def likeliest(context: TrialContext, grasp: Grasp, stop: StopHook) -> tuple[TrialResult]:
         if grasp is grasps[1]:
             assert waited_for.is_set()
             second_begun.set()
-        return (held,), AuditCount()
+        return (held,)
 
     def waits(grasp: Grasp, stop: StopHook) -> TrialResult:
         assert not second_begun.is_set() or grasp is grasps[1]
@@ -132,7 +132,7 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
         assert second_begun.wait(60)
         return held
 
-    monkeypatch.setattr(verification, "audited_trials", likeliest)
+    monkeypatch.setattr(verification, "grasp_trials", likeliest)
     asked = Hypotheses(((Hypothesis("a shape", waits),),), HELD[1], waited_for)
     box = load_scene("shape:box")
     worlds = build_worlds(box, load_hand("allegro_right"), object_parts(box.object), PROTOCOLS["standard"])

@@ -14,8 +14,7 @@ from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
-from graspd_core.types import AuditCount, Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
-from graspd_core.verify import trial_registry as audit
+from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 from graspd_core.verify import verification
 from graspd_core.verify.trial_registry import TRIALS
 
@@ -61,8 +60,7 @@ def test_grasps_called_verified_have_passed_and_come_first(result):
         assert grasp.contacts
 
 
-def test_the_full_length_gives_the_verdicts_of_the_usual_trials_and_is_not_audited(scene, hand, result, monkeypatch):
-    monkeypatch.setattr(audit, "AUDITED", 1)
+def test_the_full_length_gives_the_verdicts_of_the_usual_trials(scene, hand, result):
     full = plan_grasps(scene, hand, count=2, seed=3, preset="fast", verify="full")
     early = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
     late, soon = ([(g.score, g.verdict, g.reason) for g in run.grasps] for run in (full, early))
@@ -70,7 +68,6 @@ def test_the_full_length_gives_the_verdicts_of_the_usual_trials_and_is_not_audit
     holds = [(a.trials[0], b.trials[0]) for a, b in zip(full.grasps, early.grasps, strict=True)]
     assert all(a.displacement >= b.displacement for a, b in holds)
     assert [grasp.trials for grasp in early.grasps] == [grasp.trials for grasp in result.grasps]
-    assert (full.audits, early.audits) == (AuditCount(0, 0), AuditCount(2, 0))
 
 
 def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result):
@@ -216,7 +213,7 @@ def test_what_held_in_an_earlier_round_stays_told(scene, hand):
 def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
     # They come only once the run has ended; who waited for them would wait for ever.
-    monkeypatch.setattr(verification, "_worlds", lambda *_: release.wait())
+    monkeypatch.setattr(verification, "trial_context", lambda *_: release.wait())
     short = replace(load_preset("fast").settings, explore_steps=3, refine_steps=3, polish_steps=3)
     try:
         late = plan_grasps(scene, hand, count=1, preset=replace(load_preset("fast"), settings=short), deadline=0.5)

@@ -79,13 +79,6 @@ def test_figures_are_readable_and_absent_where_unknown():
     assert values(GOOD, memory=0)["memory [MB]"] == ""
 
 
-def test_audits_of_all_runs_are_counted():
-    counters = Counters()
-    for audits in (AuditCount(2, 0), AuditCount(), AuditCount(1, 1)):
-        counters.planned(GraspResult(Outcome.SUCCEEDED, (), Timing(), 0, "closed_form", audits=audits), 1.0)
-    health = counters.health(name="/graspd", hand="allegro_right", ready=True, worker_alive=True)
-    assert (values(health)["grasps audited"], values(health)["audits that disagreed"]) == ("3", "1")
-
 
 WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS strings end at a zero
 

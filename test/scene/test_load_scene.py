@@ -21,13 +21,12 @@ from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.load_scene import load_scene, scene_from_views
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
-from graspd_core.perception.scene import build_scene, object_parts
+from graspd_core.perception.scene import build_scene, moved_object, object_parts
 from graspd_core.perception.segment.segment import segment
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Outcome, Plane, TriangleMesh, Verdict
-from graspd_core.verify.hold_trial import hold_trial
-from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_core.verify.verification import verify_grasps
 
 
 def test_file_scale_and_value_agree(tmp_path):
