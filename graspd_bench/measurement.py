@@ -30,7 +30,8 @@ from graspd_core.perception.scene import ObjectModel, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime.records import Stopwatch
 from graspd_core.types import Grasp, Progress, Stage, TrialResult, TriangleMesh, Verdict
-from graspd_core.verify.hold_trial import hold_trial, noisy_trial
+from graspd_core.verify.hold_trial import TRIALS as NOISY_TRIALS
+from graspd_core.verify.hold_trial import hold_trial, noisy_share, pose_errors
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.world import PROTOCOLS, build_world
@@ -57,7 +58,8 @@ def _hold(name: str, tried: Tried) -> Trial:
 def _noisy(tried: Tried) -> Trial:
     protocol = PROTOCOLS["standard"]
     world = build_world(tried.hand, tried.target, tried.parts, protocol)
-    return lambda grasp: {"share": noisy_trial(world, grasp, protocol)}
+    errors = pose_errors(0, NOISY_TRIALS)
+    return lambda grasp: {"share": noisy_share(world, grasp, protocol, errors)}
 
 
 def _gravity(tried: Tried) -> Trial:

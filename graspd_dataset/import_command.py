@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from graspd_core.cli.running import EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
-from graspd_core.types import GraspResult, Outcome, Timing, Verdict
+from graspd_core.types import GraspResult, Verdict
 
 if TYPE_CHECKING:
     from graspd_core.hands.model import HandModel
@@ -75,6 +75,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
     """The grasps of one object as a run gives back its own, verified ones first."""
+    from graspd_core.verify.run_clock import result_of
     from graspd_core.verify.verification import verify_grasps
     from graspd_dataset.complete_grasps import complete_grasps
 
@@ -84,17 +85,14 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
         tried = verify_grasps(scene, hand, grasps, verify=verify)
         grasps = tuple(sorted(tried, key=lambda grasp: grasp.verdict is not Verdict.VERIFIED))
     good = sum(grasp.usable for grasp in grasps)
-    outcome = Outcome.SUCCEEDED if good == len(imported) else Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     moved = [grasp.squeeze_moved for grasp in imported if grasp.squeeze_moved > _MOVED]
     warnings = ()
     if moved:
         told = f"the base of {len(moved)} squeezes was moved, by up to {max(moved) * 1000:.1f} mm"
         warnings = (f"{told}; it stays at the grasp's",)
-    return GraspResult(
-        outcome,
+    return result_of(
         grasps,
-        Timing(),
-        seed=0,
+        len(imported),
         method="imported",
         message=f"{len(grasps)} of {len(imported)} imported grasps are kept, {good} are usable",
         warnings=warnings,

@@ -1,6 +1,6 @@
-"""What a library knows an object by: the content of mesh and hand, and the physics that its grasps were tried with.
+"""A file of verified grasps: SQLite, a transaction a record.
 
-A file of verified grasps by object, hand and physics: SQLite, a transaction a record.
+An entry is known by the content of mesh and hand, and by the physics that its grasps were tried with.
 
 The journal is a write-ahead log: readers go on while one writes, and who is killed while it writes loses the record
 that it was writing. Each call opens the file and closes it, so that a library takes no memory between two of them.

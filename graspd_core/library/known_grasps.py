@@ -1,6 +1,6 @@
-"""Which entry of a library a name or a mesh file means, and what is told where there is none.
+"""Grasps of an object that a library knows, in the scene that it is in now; what is missing is planned and added.
 
-Grasps of an object that a library knows, in the scene that it is in now; what is missing is planned and added.
+A name or a mesh file says which object is meant, and an error says what the library has instead.
 
 On an object with nothing about it they are as good as on the day that they were tried. Where something stands about it,
 a hand that would reach into that is refused, one that comes near is tried again, and all others stay as they are.
@@ -39,6 +39,7 @@ from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, re
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene
 from graspd_core.planning.plan_grasps import check_request, plan_grasps
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, StopHook, Timing, Verdict
+from graspd_core.verify.run_clock import result_of
 from graspd_core.verify.trial_registry import grasp_trials
 from graspd_core.verify.verification import trial_context
 
@@ -213,10 +214,9 @@ def known_grasps(
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
     """Grasps of a library as a result of `count` wanted, which took so long."""
-    outcome = Outcome.SUCCEEDED if len(grasps) >= count else Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
     told = f"{len(grasps)} grasps of the library {library.path.name}"
-    return GraspResult(outcome, tuple(grasps), timing, 0, "library", told)
+    return result_of(grasps, count, method="library", timing=timing, message=told)
 
 
 def known_or_planned(

@@ -190,6 +190,8 @@ def build_scene(
 ) -> Scene:
     """The scene of a mesh already in metres; `scale` is what its file was multiplied by, for the record and for advice.
 
+    Its callers check the numbers (`refuse_numbers`).
+
     Args:
         support: what the object stands on.
         obstacles: other things near it.
@@ -204,7 +206,6 @@ def build_scene(
             f"{source}: {len(confidence)} values of confidence for {len(mesh.vertices)} vertices; valid: one each"
         )
     started = time.perf_counter() if started is None else started
-    refuse_numbers(source, mass=mass, friction=friction, resolution=resolution, scale=scale)
     clean, found = check_mesh(mesh, source, MAX_FACES, scale=scale, dusty=confidence is None)
     bodies, gap = bodies_apart(clean) if confidence is None else (1, 0.0)
     if bodies > 1:

@@ -1,7 +1,4 @@
-"""The scene that a run plans on: about its object, on the grid that the settings ask for.
-
-Plan grasps: a scene and a hand in, ranked and verified grasps out.
-"""
+"""Plan grasps: a scene and a hand in, ranked and verified grasps out."""
 
 from __future__ import annotations
 
@@ -36,7 +33,7 @@ from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.runtime.worker_process import start_planning_worker
 from graspd_core.types import Grasp, GraspResult, Outcome, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
-from graspd_core.verify.run_clock import Run
+from graspd_core.verify.run_clock import Run, result_of
 from graspd_core.verify.verification import rank_by_robustness, trials_ahead
 
 
@@ -112,24 +109,20 @@ def plan_grasps(
     scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
     ahead = trials_ahead(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
     found = run_rounds(run, scene, hand, rounds, ahead, bound.moved(run.origin), measure=measure, **request)
-    result = _result(run, scene, replace(found, grasps=_ranked(run, found, config, seed)), config, seed, count)
+    result = result_of(
+        [moved_grasp(grasp, run.origin) for grasp in _ranked(run, found, config, seed)],
+        count,
+        method=config.method,
+        seed=seed,
+        timing=_timing(run, scene, found),
+        ended_early=run.ended_early,
+        warnings=scene.object.warnings,
+        refused=found.refused,
+    )
     told = "" if run.over() else _why_few(scene, bound, found, result)
     result = replace(result, message=message or told, support=support)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
-
-
-def _result(run: Run, scene: Scene, found: RoundsResult, config: PlanConfig, seed: int, count: int) -> GraspResult:
-    """What the rounds found, in the frame of the scene that was given."""
-    return GraspResult(
-        run.outcome(bool(found.grasps), found.good, count),
-        tuple(moved_grasp(grasp, run.origin) for grasp in found.grasps),
-        _timing(run, scene, found),
-        seed,
-        config.method,
-        warnings=scene.object.warnings,
-        refused=found.refused,
-    )
 
 
 def _prepared(

@@ -1,8 +1,7 @@
-"""Parts of space: boxes, balls and what lies near to given points.
+"""Parts of space: boxes, balls and what lies near to given points; and whether a link enters a box.
 
-Whether a link enters a box: exact for solids that are the hull of balls, which all but finely cut hulls are.
-
-Frank and Wolfe's steps (Naval Research Logistics 1956) lead to the point of a solid's core that is nearest to the box.
+The latter is exact for solids that are the hull of balls, which all but finely cut hulls are. Frank and Wolfe's steps
+(Naval Research Logistics 1956) lead to the point of a solid's core that is nearest to the box.
 On their way they give a lower bound of the distance. A pair that they leave undecided counts as entered.
 """
 

@@ -1,6 +1,6 @@
-"""Too little memory is a named failure, whichever library meets it.
+"""Rounds of optimiser and trials: how much effort each takes, and what they find.
 
-Rounds of optimiser and trials: how much effort each takes, and what they find.
+Too little memory is a named failure, whichever library meets it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""The part of an object outside a region, as an obstacle of the search: what touches it there is pushed off.
+"""Steering: where a hand comes from, how it is rolled, what it touches and what it keeps away from.
 
-So the search itself puts all contacts into the region, with the loss and the gradient that it has for obstacles. The
-distance is the greater of two, that to the object and that to the outside of the region: exact where one of them is the
-nearer one's, else too small, and its gradient jumps where they are equal.
-
-Where a hand comes from, how it is rolled, what it touches and what it keeps away from.
+The part of an object outside a wanted region is an obstacle of the search. So the search itself puts all contacts into
+the region, with the loss and the gradient that it has for obstacles. The distance is the greater of two, that to the
+object and that to the outside of the region: exact where one of them is the nearer one's, else too small, and its
+gradient jumps where they are equal.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ After DexGraspBench's floating protocol, re-implemented from its parameters. Tra
 from its pose at the start of the trial, so that what the closing fingers do to it counts too. A pull ends when its
 answer is known (`early_stop`), unless the protocol asks for the full length.
 
-The noisy hold trial: does a grasp survive not knowing exactly where the object is?
+The noisy hold trial repeats the hold trial with the hand out of place, as by a wrong estimate of the object's pose.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ def hold_trial(
 
     worst = np.zeros(2)
     try:
-        return _result(worst, _hold(world, grasp, protocol, worst, stop))
+        reason = _hold(world, grasp, protocol, worst, stop)
     except mujoco.FatalError as error:
-        return _result(worst, gave_up(error))
+        reason = gave_up(error)
+    return TrialResult("hold", not reason, float(worst[0]), float(worst[1]), reason)
 
 
 def gave_up(error: Exception) -> str:
@@ -156,10 +157,6 @@ def close_hand(
     return ""
 
 
-def _result(worst: np.ndarray, reason: str) -> TrialResult:
-    return TrialResult("hold", not reason, float(worst[0]), float(worst[1]), reason)
-
-
 def start_penetration(world: World, data: Any) -> float:
     """Deepest overlap of hand and object in the current state [m]."""
     bodies = world.model.geom_bodyid
@@ -258,30 +255,12 @@ def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
     return ""
 
 
+# Errors of a noisy trial.
 TRIALS = 8
 # A turn and an offset [m] of the hand.
 PoseError = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 # Errors are uniform up to these: along each axis [m], and about a random axis through the centre of mass [rad].
 OFFSET, TURN = 0.005, float(np.deg2rad(5.0))
-
-
-def noisy_trial(
-    world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
-) -> float:
-    """Share of 8 hold trials that the grasp passes, each with the hand out of place by up to 5 mm and 5°."""
-    return sum(hold.passed for hold in noisy_holds(world, grasp, protocol, seed=seed, stop=stop)) / TRIALS
-
-
-def noisy_holds(
-    world: World, grasp: Grasp, protocol: Protocol, *, seed: int = 0, stop: Callable[[], bool] = lambda: False
-) -> tuple[TrialResult, ...]:
-    """The 8 hold trials of a noisy trial.
-
-    The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. Same seed, same
-    errors. A start that the error pushes too deep into the object counts as not held.
-    """
-    moved = [displaced(grasp, *error, world.center_of_mass) for error in pose_errors(seed, TRIALS)]
-    return tuple(hold_trial(world, g, protocol, stop=stop) for g in moved)
 
 
 def noisy_share(
@@ -292,9 +271,10 @@ def noisy_share(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> float | None:
-    """Share of hold trials under the given errors that the grasp passes.
+    """Return the share of hold trials that the grasp passes, one for each error, with the hand out of place by it.
 
-    None where `stop` ended one of them, or there is none.
+    The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. A start that the
+    error pushes too deep into the object counts as not held. None where `stop` ended one of them, or there is none.
     """
     held = 0
     for error in errors:

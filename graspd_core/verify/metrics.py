@@ -1,8 +1,7 @@
-"""The metrics of a grasp, one row each: `measure`, files, messages and tables follow; a test checks docs/metrics.md.
+"""The metrics of a grasp, one row each: `measure`, files, messages and tables follow these rows.
 
-Static quality of one grasp. Definitions are those of docs/metrics.md; every figure is independent of the frame.
-
-How different the grasps of one run are: many copies of one grasp are one grasp.
+They are static, independent of the frame, and defined in docs/metrics.md, which a test compares with the rows.
+`distinct` drops copies of a grasp from a run.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ class Metric:
 
 
 def _contact_per_volume(grasp: PreparedGrasp) -> float | None:
-    volume = grasp.intersection_volume
+    volume = grasp.shared_volume
     return contact_area(grasp.placed) / volume if volume > 0 else None
 
 
@@ -92,7 +91,7 @@ _ROWS = (
         "contact area within 10 mm", 1,
     ),
     Metric(
-        "intersection_volume", "cm³", 1e6, lambda g: g.intersection_volume,
+        "intersection_volume", "cm³", 1e6, lambda g: g.shared_volume,
         "IV: volume shared by hand and object, in 1 mm voxels of a lattice fixed in the hand's base frame; an octree "
         "finds them, so that no overlap is too small to be visited",
     ),

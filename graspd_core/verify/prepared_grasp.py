@@ -1,12 +1,8 @@
-"""What is the same for every grasp of one object by one hand, prepared once.
+"""One grasp ready to be measured: what several metrics need is computed once.
 
-Where a posture of the hand touches an object, by dense samples that no optimiser ever sees.
-
-How far a placed hand and an object, or the hand and itself, share the same space.
-
-The grasp wrench space of unit contact forces: the classic quality figures of Ferrari and Canny (ICRA 1992).
-
-One grasp ready to be measured: what several metrics need is computed once.
+Dense samples of the hand, which no optimiser ever sees, tell where it touches the object, and how far it reaches into
+the object or into itself. The wrench space of unit contact forces gives the quality figures of Ferrari and Canny (ICRA
+1992).
 """
 
 from __future__ import annotations
@@ -42,7 +38,6 @@ from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture
-from graspd_core.verify import prepared_grasp as intersection
 
 # Samples and a seed that the optimiser's candidates never see.
 _SAMPLES, _SEED = 4000, 20_000
@@ -371,9 +366,9 @@ class PreparedGrasp:
         return chosen - target.center_of_mass, normals, target.friction, target.radius
 
     @cached_property
-    def intersection_volume(self) -> float:
+    def shared_volume(self) -> float:
         """Volume of the hand inside the object [m³]."""
-        return intersection.intersection_volume(self.context, self.placed)
+        return intersection_volume(self.context, self.placed)
 
 
 def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:

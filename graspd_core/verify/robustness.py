@@ -1,9 +1,8 @@
-"""Work on several threads whose results come in order, the same for any number of threads.
-
-What else may be true of an object that cameras saw: less friction, another place, another shape of a hidden side.
+"""What else may be true of an object that cameras saw: less friction, another place, another shape of a hidden side.
 
 A grasp that holds on the likeliest scene is tried on these too, cheapest first, until one is failed or it is as sure as
-asked for. How often such grasps hold on the true object was measured (docs/clouds.md).
+asked for. How often such grasps hold on the true object was measured (docs/clouds.md). Trials run on several threads,
+and `results_in_order` gives their results in order, the same for any number of threads.
 """
 
 from __future__ import annotations

@@ -1,14 +1,26 @@
-"""The clock, the hooks and the end of one run."""
+"""The clock, the hooks and the result of one run."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from graspd_core.perception.scene import moved_grasp
-from graspd_core.types import Grasp, Outcome, Progress, ProgressHook, Snapshot, Stage, StopHook, WatchHook
+from graspd_core.types import (
+    Grasp,
+    GraspResult,
+    Outcome,
+    Progress,
+    ProgressHook,
+    Snapshot,
+    Stage,
+    StopHook,
+    Timing,
+    WatchHook,
+)
 
 
 class Run:
@@ -60,12 +72,37 @@ class Run:
         if self.watch is not None:
             self.watch(replace(seen, positions=seen.positions + self.origin))
 
-    def outcome(self, any_found: bool, good: int, count: int) -> Outcome:
-        """How the run ended, with `good` of `count` grasps."""
-        if good >= count:
-            return Outcome.SUCCEEDED
-        if self.cancelled:
-            return Outcome.CANCELLED
-        if self.late():
-            return Outcome.DEADLINE
-        return Outcome.TOO_FEW if any_found else Outcome.NO_CANDIDATES
+    @property
+    def ended_early(self) -> Outcome | None:
+        """Why the run ended before its work was done; None where it did not."""
+        return Outcome.CANCELLED if self.cancelled else Outcome.DEADLINE if self.late() else None
+
+
+def result_of(
+    grasps: Sequence[Grasp],
+    count: int,
+    *,
+    method: str,
+    seed: int = 0,
+    timing: Timing | None = None,
+    ended_early: Outcome | None = None,
+    message: str = "",
+    warnings: tuple[str, ...] = (),
+    refused: Mapping[str, int] | None = None,
+) -> GraspResult:
+    """Return the result of a run for `count` grasps, whose outcome follows from how many of them are usable.
+
+    `ended_early` is the outcome of a run that has too few since it was ended.
+    """
+    few = Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
+    enough = sum(grasp.usable for grasp in grasps) >= count
+    return GraspResult(
+        Outcome.SUCCEEDED if enough else ended_early or few,
+        tuple(grasps),
+        timing or Timing(),
+        seed,
+        method,
+        message,
+        warnings,
+        refused=refused or {},
+    )

@@ -1,6 +1,6 @@
 """The trials of a run: worlds built once, candidates tried in rank order, and those that held put in order.
 
-Grasps from anywhere, another planner's or a file's: tried and measured as those of `plan_grasps` are.
+`verify_grasps` tries and measures grasps of another planner or of a file in the same worlds.
 """
 
 from __future__ import annotations
@@ -84,13 +84,12 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
     turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
     """
 
-    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-
     def build() -> TrialContext | None:
         with _CUTTING:
             return None if run.known_over() else trial_context(scene, hand, verify)
 
     worlds = begin_in_thread("graspd-parts", build)
+    protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     return TrialsAhead(worlds, begin_other_world(run, scene, hand, protocol, certainty.probability))
 
 

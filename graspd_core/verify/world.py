@@ -1,6 +1,4 @@
-"""The world of a trial in MuJoCo bodies and geoms: the hand's solids, the object, the support, the obstacles.
-
-The world of a trial: a hand of primitives on a position-controlled base, and a free object of convex parts.
+"""The world of a trial in MuJoCo: a hand of primitives on a position-controlled base, a free object of convex parts.
 
 With a support there are gravity and a table, with neighbours there are these; without, neither costs anything. They are
 mocap bodies after the hand's own, so that a trial can lower them all away from the hand.
@@ -180,10 +178,6 @@ def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
     m = axes @ np.diag(moments) @ axes.T
     return [m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]]
-
-
-# mujoco is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 # A hand of more solids than this has thousands of contacts with itself and the object, more than MuJoCo's 14 MB hold.

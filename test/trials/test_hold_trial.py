@@ -11,7 +11,7 @@ from graspd_bench.trials import LOST, gravity_trial
 from graspd_core.hands.model import HandModel
 from graspd_core.types import Posture, Verdict
 from graspd_core.verify import world as trial_world
-from graspd_core.verify.hold_trial import displaced, hold_trial, noisy_trial, pose_error
+from graspd_core.verify.hold_trial import displaced, hold_trial, noisy_share, pose_error, pose_errors
 from graspd_core.verify.world import PROTOCOLS, Protocol, World, build_world
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
@@ -111,10 +111,12 @@ def test_friction_holds_above_coulombs_limit_and_slips_below(friction, share, he
 
 
 def test_noise_is_survived_by_a_firm_squeeze_only(world, closing):
-    good = noisy_trial(world, closing(0.008, 0.025, (0.04, 0.04)), STANDARD, seed=1)
+    errors = pose_errors(1, 8)
+    good = noisy_share(world, closing(0.008, 0.025, (0.04, 0.04)), STANDARD, errors)
+    assert good is not None
     assert good >= 0.75
-    assert good == noisy_trial(world, closing(0.008, 0.025, (0.04, 0.04)), STANDARD, seed=1)
-    assert noisy_trial(world, closing(*GOOD, height=-0.145), STANDARD, seed=1) == 0.0
+    assert good == noisy_share(world, closing(0.008, 0.025, (0.04, 0.04)), STANDARD, errors)
+    assert noisy_share(world, closing(*GOOD, height=-0.145), STANDARD, errors) == 0.0
 
 
 def test_pose_errors_stay_within_their_bounds_and_move_all_postures_alike(closing):
