@@ -36,18 +36,18 @@ from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh
 
 
 def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:
-    """The signed distance elsewhere."""
+    """Return the SDF shifted by `offset` [m]."""
     origin = sdf.origin.double() + torch.as_tensor(offset, device=sdf.origin.device)
     return GridSDF(sdf.field, origin.to(sdf.origin), sdf.spacing, sdf.half)
 
 
 def moved_plane(plane: Plane, offset: Float[np.ndarray, "3"]) -> Plane:
-    """The plane elsewhere."""
+    """Return the plane shifted by `offset` [m]."""
     return Plane(plane.normal, plane.offset + float(plane.normal @ offset))
 
 
 def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
-    """The grasp of the object elsewhere; itself where the offset is zero."""
+    """Return the grasp shifted by `offset` [m], or the grasp itself if the offset is zero."""
     if not offset.any():
         return grasp
 
@@ -306,7 +306,7 @@ def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
 
 
 def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectModel:
-    """The object elsewhere; itself where the offset is zero."""
+    """Return the object shifted by `offset` [m], or the object itself if the offset is zero."""
     if not offset.any():
         return model
     mesh = moved_mesh(model.mesh, offset)
@@ -314,7 +314,7 @@ def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectMo
 
 
 def moved_obstacle(neighbour: Obstacle, offset: Float[np.ndarray, "3"]) -> Obstacle:
-    """The thing elsewhere."""
+    """Return the obstacle shifted by `offset` [m]."""
     return Obstacle(moved_mesh(neighbour.mesh, offset), moved_sdf(neighbour.sdf, offset))
 
 

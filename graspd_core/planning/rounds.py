@@ -163,7 +163,7 @@ def run_rounds(
 def _in_rank_order(
     candidates: tuple[Grasp, ...], wanted: int, restrictions: BoundRestrictions
 ) -> Iterator[tuple[Grasp, ...]]:
-    """All candidates at once; where restrictions look at them, which takes time, few first, then twice as many."""
+    """Yield candidates best first. With restrictions, yield batches that double in size, because checking is slow."""
     some = 2 * max(wanted, _FIRST_BATCH) if restrictions.each else len(candidates)
     while candidates:
         yield candidates[:some]

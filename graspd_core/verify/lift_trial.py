@@ -156,7 +156,6 @@ def _stages(
 
 
 def _touches(world: World, data: Any) -> bool:
-    """Whether hand and object are in contact."""
     bodies = world.model.geom_bodyid
     first, second = data.contact.geom1, data.contact.geom2
     hand = np.isin(first, world.hand_geoms) | np.isin(second, world.hand_geoms)
@@ -170,7 +169,7 @@ def _rest(world: World, data: Any) -> None:
 
 
 def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, settings: LiftSettings) -> None:
-    """All that is fixed but the hand, at a share `a` of the lift from rest to rest; what is free feels it."""
+    """Move table and neighbours down by the fraction `a` of the lift height. Free bodies react by physics."""
     data.mocap_pos[1:] = -settings.lift_height * a * a * (3 - 2 * a) * up
     acceleration = settings.lift_height * (6 - 12 * a) / settings.lift_time**2 if a < 1 else 0.0
     for body in (world.object_body, *world.others):

@@ -45,10 +45,6 @@ class Trial:
     run: Callable[[TrialContext, Grasp, StopHook], TrialResult]
 
 
-def _hold(context: TrialContext, grasp: Grasp, stop: StopHook) -> TrialResult:
-    return hold_trial(context.alone, grasp, context.protocol, stop=stop)
-
-
 def _lift(context: TrialContext, grasp: Grasp, stop: StopHook) -> TrialResult:
     if context.around is None:
         raise ValueError("the lift trial needs a support or obstacles")
@@ -56,7 +52,7 @@ def _lift(context: TrialContext, grasp: Grasp, stop: StopHook) -> TrialResult:
 
 
 _ROWS = (
-    Trial("hold", lambda context: True, _hold),
+    Trial("hold", lambda context: True, lambda c, grasp, stop: hold_trial(c.alone, grasp, c.protocol, stop=stop)),
     Trial("lift", lambda context: context.around is not None, _lift),
 )
 TRIALS: dict[str, Trial] = {row.name: row for row in _ROWS}

@@ -108,7 +108,7 @@ def make_trial_context(
 # Kept for the last few scenes and hands, which are hashed by identity.
 @lru_cache(maxsize=4)
 def trial_context(scene: Scene, hand: HandModel, verify: str) -> TrialContext:
-    """The worlds that `verify` trials of a scene's grasps take place in, at its object's friction."""
+    """Build the worlds of `verify` trials in a scene near the origin (`near_scene`), at its object's friction."""
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     return build_worlds(scene, hand, object_parts(scene.object), protocol)
 
