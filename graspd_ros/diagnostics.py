@@ -171,7 +171,7 @@ def _values(health: Health, memory: int) -> dict[str, str]:
         "queue size": str(health.queue_size),
         "last latency [s]": _seconds(health.last_latency),
         "last first verified [s]": _seconds(health.last_first_verified),
-        **counted(ACCEPTED, *_ENDS.values(), VERIFIED, FAILED, AUDITED, DISAGREED),
+        **counted(ACCEPTED, *_ENDS.values(), VERIFIED, FAILED),
         "last error": health.last_error,
         **counted(RECEIVED, SUPERSEDED),
         "transforms heard": "yes" if health.transforms else "no: tf2_msgs is not installed",

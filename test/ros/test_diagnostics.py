@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
-from graspd_core.types import AuditCount, GraspResult, Outcome, Timing
-from graspd_ros.diagnostics import Counters, Health, health_message, resident_memory
+from graspd_ros.diagnostics import Health, health_message, resident_memory
 
 GOOD = Health(name="/graspd", hand="allegro_right", ready=True, worker_alive=True, queue_size=4)
 
@@ -77,7 +76,6 @@ def test_figures_are_readable_and_absent_where_unknown():
     assert (found["grasps verified"], found["clouds superseded"]) == ("12", "5")
     assert found["memory [MB]"] == "300"
     assert values(GOOD, memory=0)["memory [MB]"] == ""
-
 
 
 WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS strings end at a zero
