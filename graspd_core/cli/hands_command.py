@@ -1,7 +1,4 @@
-"""`graspd hands`: the built-in hands; `graspd hands inspect`: what is in a hand, and a picture of it.
-
-What a hand is, as plain data and as text: for a person who brings a new one.
-"""
+"""`graspd hands`: the built-in hands; `graspd hands inspect`: what is in a hand, as text, picture and description."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What every command that plans has in common: its options, what they stand for, and the lines at its end.
-
-Clouds for commands: out of files or bags, and into scenes.
-
-Options that restrict grasps: where a hand comes from, what it touches and keeps away from, what an arm reaches.
-"""
+"""Options that commands share: planning, clouds out of files or bags, and restrictions of grasps. And their last lines."""
 
 from __future__ import annotations
 

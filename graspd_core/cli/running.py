@@ -1,7 +1,4 @@
-"""A running command: its exit status, its progress, and what Ctrl-C does to it.
-
-The deadline of a command: it counts from the start of its process, and ends what knows nothing of it.
-"""
+"""A running command: its exit status, its progress, its deadline, and what Ctrl-C does to it."""
 
 from __future__ import annotations
 

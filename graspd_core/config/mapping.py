@@ -1,7 +1,4 @@
-"""Config dataclasses from nested mappings, with errors that name the key.
-
-YAML that a user wrote: what a page of it can stand for is bounded.
-"""
+"""Config dataclasses from nested mappings and from YAML that a user wrote, with errors that name the key."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Settings of planning that every method shares.
-
-Settings of how sure a verified grasp must be of an object that cameras saw.
-"""
+"""Settings of planning that every method shares, and how sure a verified grasp must be of what cameras saw."""
 
 from __future__ import annotations
 

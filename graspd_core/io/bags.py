@@ -1,8 +1,7 @@
-"""What sensor messages hold, as arrays: those of a bag, and any other objects with the attributes that ROS names.
+"""Read rosbag2 recordings (mcap and sqlite3) by the rosbags library: no ROS installation, no DDS.
 
-Reading rosbag2 recordings (mcap and sqlite3) by the rosbags library: no ROS installation, no DDS.
-
-The order is the recording's, so that the same bag gives the same clouds every time.
+What sensor messages hold becomes arrays: those of a bag, and any other objects with the attributes that ROS names. The
+order is the recording's, so that the same bag gives the same clouds every time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The file format `graspd/grasps`, version 2 (docs/format.md): write a result.
-
-Read files of the format `graspd/grasps`, versions 1 and 2 (docs/format.md).
-"""
+"""The file format `graspd/grasps` (docs/format.md): write a result in version 2, read versions 1 and 2."""
 
 from __future__ import annotations
 

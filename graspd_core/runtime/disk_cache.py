@@ -3,8 +3,7 @@
 Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`); `GRASPD_CACHE=off` keeps everything in memory. A file
 that cannot be read back whole is built again, and a disk that cannot be written is done without. Clouds are never the
 same twice, so that a node that sees them would fill the disk: the files not used for longest give way.
-
-Files that appear whole or not at all.
+Every file appears whole or not at all.
 """
 
 from __future__ import annotations

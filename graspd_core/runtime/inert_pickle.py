@@ -1,15 +1,13 @@
 """A pickle reader that runs nothing that a file asks for.
 
 A pickle is a program: it names classes and functions, and calls them. Here every name that a format uses stands for an
-inert stand-in of this module, from which the numbers are read afterwards (`inert_arrays`); neither numpy nor any other
+inert stand-in of this module, from which the arrays of numbers are read afterwards (`array_of`); neither numpy nor any other
 library is called by the file, and every other name is refused. What bounds time and memory: the size of the file, a
 memo that is a dictionary (the C reader allocates as many slots as a file says), no opcode that reserves memory
 beforehand, few arguments to a call, and keys that are text or small numbers: to hash a tuple of tuples takes time
 without bound, or more stack than there is.
 
 Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
-
-Arrays of numbers from the inert objects of a pickle (`inert_pickle`).
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
-"""Memory that was freed, back to the system: for processes that serve for days.
-
-Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
+"""Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
 
 A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child.
 All others, the command line among them, do it themselves. The child is a bare interpreter, not one of
 multiprocessing's, which would import the user's main module again: a script without a guard, or none, as in a notebook.
-
-The child process of a process that serves: cheap to import, so that it can be started before all else.
+This module is cheap to import, so that the child can be started before all else. For processes that serve for days, it
+also gives freed memory back to the system.
 """
 
 from __future__ import annotations
