@@ -1,9 +1,9 @@
 """Paths of an arm through grasps: joint values at every waypoint of the hand, or why there are none.
 
-The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. Of each grasp several postures are found, from
-starts all over the arm's postures, so that elbow and wrist vary. From each the whole way is solved at once; the first
-in order of nearness to the seed posture is taken whose way stays within the limits, goes on without a jump, and hits
-nothing.
+The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. Of each grasp several postures are found,
+from starts all over the arm's postures, so that elbow and wrist vary. From each the whole way is solved at once; the
+first in order of nearness to the seed posture is taken whose way stays within the limits, goes on without a jump, and
+hits nothing.
 """
 
 from __future__ import annotations

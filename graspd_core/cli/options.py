@@ -1,4 +1,4 @@
-"""Options that commands share: planning, clouds out of files or bags, and restrictions of grasps. And their last lines."""
+"""Options that commands share: planning, clouds out of files or bags, restrictions of grasps. And their last lines."""
 
 from __future__ import annotations
 

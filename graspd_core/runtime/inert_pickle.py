@@ -1,7 +1,7 @@
 """A pickle reader that runs nothing that a file asks for.
 
 A pickle is a program: it names classes and functions, and calls them. Here every name that a format uses stands for an
-inert stand-in of this module, from which the arrays of numbers are read afterwards (`array_of`); neither numpy nor any other
+inert stand-in of this module, from which the numbers are read afterwards (`array_of`); neither numpy nor any other
 library is called by the file, and every other name is refused. What bounds time and memory: the size of the file, a
 memo that is a dictionary (the C reader allocates as many slots as a file says), no opcode that reserves memory
 beforehand, few arguments to a call, and keys that are text or small numbers: to hash a tuple of tuples takes time
