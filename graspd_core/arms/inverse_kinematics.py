@@ -3,7 +3,7 @@
 Tip and Jacobian are those of pytorch-kinematics. The damping follows the error's own square (T. Sugihara,
 Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IEEE T-RO 2011): strong far away and near
 singular postures, none at the end, where steps are Newton's. A joint at its limit that the step would push beyond is
-held there and the step is found without it. The loop is ours: it is eight times faster than the library's solver, since
+held there and the step is found without it. The loop is ours: it is five times faster than the library's solver, since
 it starts near and drops poses as they are reached (docs/arms.md).
 
 Starts are the postures of a table whose tips are nearest. No pose is in reach whose tip, or a point fixed to the tip,
