@@ -32,8 +32,8 @@ from graspd_bench.rendering.depth_noise import DepthNoise
 from graspd_bench.rendering.render import camera_of_view, look_at, render_scene, render_shaded, save_png
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core import HandModel, PlanConfig, hand_names, load_hand, load_preset, load_scene, plan_grasps
-from graspd_core.perception.load_scene import scene_from_views
 from graspd_core.perception.scene import Scene, object_parts
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
 from graspd_core.verify.trial_registry import build_worlds

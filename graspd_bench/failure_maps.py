@@ -30,8 +30,9 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
-from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, Scene, build_scene, object_parts
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.feasibility import kind_of
 from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, TriangleMesh

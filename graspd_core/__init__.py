@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from graspd_core.perception.cloud.camera import depth_in_metres as depth_in_metres
     from graspd_core.perception.cloud.point_cloud import PointCloud as PointCloud
     from graspd_core.perception.load_scene import load_scene as load_scene
-    from graspd_core.perception.load_scene import scene_from_views as scene_from_views
     from graspd_core.perception.obstacles import with_neighbours as with_neighbours
     from graspd_core.perception.scene import Scene as Scene
+    from graspd_core.perception.scene_from_views import scene_from_views as scene_from_views
     from graspd_core.perception.segment.target_selection import Target as Target
     from graspd_core.planning.plan_grasps import plan_grasps as plan_grasps
     from graspd_core.planning.plan_grasps import warm_up as warm_up
@@ -76,7 +76,8 @@ if TYPE_CHECKING:
 
 # The names of each module.
 _MODULES = {
-    "perception.load_scene": "load_scene scene_from_views",
+    "perception.load_scene": "load_scene",
+    "perception.scene_from_views": "scene_from_views",
     "perception.obstacles": "with_neighbours",
     "perception.scene": "Scene",
     "config": "SceneConfig",

@@ -24,8 +24,8 @@ from graspd_bench.stress.broken_meshes import box
 from graspd_bench.stress.run_stress_case import GRASP, Case
 from graspd_core.perception.cloud.camera import cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import scene_from_views
 from graspd_core.perception.scene import Scene
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target
 from graspd_core.types import TriangleMesh
 

@@ -22,7 +22,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth, depth_in_metres
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target, segment
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime.records import markdown_table

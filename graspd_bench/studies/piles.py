@@ -31,8 +31,9 @@ from graspd_core.mesh.shapes import SHAPES, object_hash, thing_name
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.cloud.camera import cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps

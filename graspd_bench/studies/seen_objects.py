@@ -26,8 +26,8 @@ from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import thing_name
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.mesh.topology import is_closed
-from graspd_core.perception.load_scene import scene_from_views
 from graspd_core.perception.scene import Obstacle, Scene, build_scene, object_parts
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache

@@ -154,7 +154,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
 
 def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
     """What the views of a job show. Raises a GraspdError: they show no usable object."""
-    from graspd_core.perception.load_scene import scene_from_views
+    from graspd_core.perception.scene_from_views import scene_from_views
 
     if job.refusal:
         raise CloudError(job.refusal)

@@ -29,7 +29,7 @@ from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_propertie
 from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
 from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
-from graspd_core.perception.reconstruct.shape_completion import Evidence
+from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh

@@ -204,7 +204,7 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
     done in a child process, since threads beside would stand still meanwhile.
     """
-    from graspd_core.perception.load_scene import scene_from_views
+    from graspd_core.perception.scene_from_views import scene_from_views
 
     start_planning_worker()
     ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])

@@ -243,7 +243,7 @@ def _answer(call: bytes) -> bytes:
 
 
 # What the child's work imports: all of a scene from clouds and of other shapes, and the library behind them.
-_MODULES = ("graspd_core.perception.load_scene", "graspd_core.verify.robustness", "open3d")
+_MODULES = ("graspd_core.perception.scene_from_views", "graspd_core.verify.robustness", "open3d")
 
 
 def start_planning_worker() -> None:

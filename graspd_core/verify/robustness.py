@@ -22,7 +22,7 @@ from graspd_core.config.planning_config import HELD, HELD_THOUGH_FAILED
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
-from graspd_core.perception.reconstruct.shape_completion import Evidence
+from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, build_scene
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult

@@ -20,6 +20,7 @@ from graspd_core.errors import GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, to_mapping
+from graspd_core.runtime import records
 from graspd_core.types import TriangleMesh
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "allegro_right", 0, 4, ("standard", "hard"))
@@ -116,20 +117,20 @@ def test_a_file_name_is_for_the_eye_and_safe():
 
 
 def test_the_code_is_of_the_package_the_kernel_and_what_a_study_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    released, digest = store.code_version().split("+")
+    released, digest = records.code_version().split("+")
     assert released
     assert len(digest) == 12
-    assert store.code_version(("stress/*.py",)) != store.code_version()
+    assert store.bench_version(("stress/*.py",)) != store.bench_version(()) != records.code_version()
     root = tmp_path / "graspd_core"
-    for file in ("bench/result_store.py", "kernel/src/step.cpp", "cli/run.py"):
+    for file in ("runtime/records.py", "optimize/kernel/src/step.cpp", "cli/run.py"):
         (root / file).parent.mkdir(parents=True, exist_ok=True)
         (root / file).write_text("1")
-    monkeypatch.setattr(store, "__file__", str(root / "bench" / "result_store.py"))
-    fresh = store.code_version.__wrapped__
+    monkeypatch.setattr(records, "__file__", str(root / "runtime" / "records.py"))
+    fresh = records.code_version.__wrapped__
     before = fresh()
     (root / "cli" / "run.py").write_text("2")
     assert fresh() == before
-    (root / "kernel" / "src" / "step.cpp").write_text("2")
+    (root / "optimize" / "kernel" / "src" / "step.cpp").write_text("2")
     assert fresh() != before
 
 

@@ -24,7 +24,7 @@ from graspd_bench.tables import sourced, written
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 from graspd_core.errors import ConfigError
-from graspd_core.runtime.records import code_version
+from graspd_core.runtime.records import bench_version
 
 ROOT = Path(__file__).parents[2]
 
@@ -62,9 +62,9 @@ def test_all_of_them_fit_into_eighty_minutes_on_two_cores():
 
 
 def test_every_source_that_a_study_names_is_there():
-    folder = ROOT / "graspd_core" / "bench"
+    folder = ROOT / "graspd_bench"
     assert all(list(folder.glob(source)) for study in STUDIES.values() for source in study.sources)
-    assert len({code_version(study.sources) for study in STUDIES.values()}) == len(
+    assert len({bench_version(study.sources) for study in STUDIES.values()}) == len(
         {s.sources for s in STUDIES.values()}
     )
 

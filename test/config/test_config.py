@@ -17,9 +17,9 @@ from graspd_core.errors import ConfigError
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import scene_from_views
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import segment
 from graspd_core.perception.segment.target_selection import Target
 

@@ -23,9 +23,10 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception import scene as scene_module
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import load_scene, scene_from_views
-from graspd_core.perception.reconstruct.shape_completion import Evidence
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses

@@ -19,9 +19,9 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, InitialPosesConfig, LevelSetConfig
-from graspd_core.optimize.plan_config import METHODS, PlanConfig
-from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.optimize.plan_config import PlanConfig, method_names, method_row
 from graspd_core.perception.scene import Scene, build_scene
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Grasp, Plane, Posture, Progress, Stage
 
@@ -149,14 +149,14 @@ def leaves(cls: type, prefix: str = "") -> list[str]:
 
 def all_leaves() -> list[str]:
     """Dotted names of all settings of all methods, as a preset file has them."""
-    methods = [leaf for name, row in METHODS.items() for leaf in leaves(row.config, f"{name}.")]
+    methods = [leaf for name in method_names() for leaf in leaves(method_row(name).config, f"{name}.")]
     return [name for name in leaves(PlanConfig) if name != "settings"] + methods
 
 
 def in_config(name: str) -> str:
     """The dotted name in a `PlanConfig`, where the method's own section is `settings`."""
     first, _, rest = name.partition(".")
-    return f"settings.{rest}" if first in METHODS else name
+    return f"settings.{rest}" if first in method_names() else name
 
 
 def setting(config: Any, name: str) -> Any:
@@ -177,7 +177,7 @@ def another(name: str, value: Any) -> Any:
     *path, last = name.split(".")
     if name == "method":
         return "annealing"
-    config = PlanConfig(method=path[0]) if path and path[0] in METHODS else SHORT
+    config = PlanConfig(method=path[0]) if path and path[0] in method_names() else SHORT
     hint = get_type_hints(type(setting(config, ".".join(path)) if path else config))[last]
     if get_origin(hint) is Literal:
         return next(choice for choice in get_args(hint) if choice != value)
@@ -273,7 +273,7 @@ def test_only_settings_have_cases():
 @pytest.mark.parametrize("name", all_leaves())
 def test_a_setting_reaches_the_run(name: str):
     case, method = CASES.get(name, Case()), name.split(".")[0]
-    config = changed(SHORT, "method", method) if method in METHODS else SHORT
+    config = changed(SHORT, "method", method) if method in method_names() else SHORT
     for key, value in case.base:
         config = changed(config, key, value)
     value = another(name, setting(config, name)) if case.value is None else case.value

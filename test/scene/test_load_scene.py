@@ -19,9 +19,10 @@ from graspd_core.mesh.topology import far_centre
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import load_scene, scene_from_views
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.scene import build_scene, moved_object, object_parts
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import segment
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps, planning_scene

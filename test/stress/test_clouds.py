@@ -15,7 +15,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import scene_from_views
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Outcome, Verdict

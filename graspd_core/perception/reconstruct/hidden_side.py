@@ -15,10 +15,10 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import first_hits, make_surface, surface_distance
 from graspd_core.mesh.topology import moved_mesh
 from graspd_core.perception.cloud.point_cloud import Points, Vector
-from graspd_core.perception.reconstruct.merge_views import thin
+from graspd_core.perception.reconstruct.merge_views import Evidence, thin
 from graspd_core.perception.reconstruct.poisson import grid_poisson_field
 from graspd_core.perception.reconstruct.reconstruct import closed_mesh
-from graspd_core.perception.reconstruct.shape_completion import RULES, Evidence, guess_by
+from graspd_core.perception.reconstruct.shape_completion import RULES, guess_by
 from graspd_core.se3 import perpendicular
 from graspd_core.types import TriangleMesh
 

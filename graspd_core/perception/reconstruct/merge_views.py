@@ -15,12 +15,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows, voxel_keys
-from graspd_core.perception.cloud.free_space import view_frame
-from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, clean_cloud, least_axes
+from graspd_core.perception.cloud.free_space import FreeSpace, view_frame
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, Vector, clean_cloud, least_axes
 from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
@@ -196,3 +197,25 @@ def _normals(points: Points) -> Points:
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
     cloud.orient_normals_consistent_tangent_plane(ORIENTATION_NEIGHBOURS)
     return np.asarray(cloud.normals)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was seen of an object: other guesses of what was hidden are made of it.
+
+    Attributes:
+        seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
+        rotation, origin: of that frame in the views' [m].
+        chosen: the rule that the reconstruction took; empty where none applied.
+        settings: of the reconstruction.
+        hidden: whether a good part of the surface was.
+    """
+
+    seen: Surfels
+    free_space: FreeSpace
+    step: float
+    rotation: Float[np.ndarray, "3 3"]
+    origin: Vector
+    chosen: str
+    settings: ReconstructionConfig
+    hidden: bool

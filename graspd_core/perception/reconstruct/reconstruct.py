@@ -24,6 +24,7 @@ from graspd_core.perception.cloud.free_space import FreeSpace, make_view_depths
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, clean_cloud, measured
 from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, with_foot
 from graspd_core.perception.reconstruct.merge_views import (
+    Evidence,
     Surfels,
     is_unposed,
     join,
@@ -41,7 +42,7 @@ from graspd_core.perception.reconstruct.poisson import (
     part_walls,
     poisson_field,
 )
-from graspd_core.perception.reconstruct.shape_completion import Completion, Evidence, complete_shape
+from graspd_core.perception.reconstruct.shape_completion import Completion, complete_shape
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 

@@ -10,38 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
-from graspd_core.perception.cloud.point_cloud import Vector
 from graspd_core.perception.reconstruct.extrusion import extrude, with_foot
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
 from graspd_core.perception.reconstruct.revolution import find_revolution
 from graspd_core.perception.reconstruct.symmetry import Symmetry, find_centre, find_mirrors, image
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What was seen of an object: other guesses of what was hidden are made of it.
-
-    Attributes:
-        seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
-        rotation, origin: of that frame in the views' [m].
-        chosen: the rule that the reconstruction took; empty where none applied.
-        settings: of the reconstruction.
-        hidden: whether a good part of the surface was.
-    """
-
-    seen: Surfels
-    free_space: FreeSpace
-    step: float
-    rotation: Float[np.ndarray, "3 3"]
-    origin: Vector
-    chosen: str
-    settings: ReconstructionConfig
-    hidden: bool
-
 
 REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION = "revolution", "mirror", "point symmetry", "extrusion"
 RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
