@@ -96,6 +96,12 @@ MAX_PACKAGE_LINES = {
 # Lines that a program reaches through its imports, those inside functions too.
 MAX_REACH = {"graspd_core.cli.synthesize_command": 21_000, "graspd_ros.node": 22_000}
 
+# The launch file imports this one where ROS runs it, perhaps without any library of graspd.
+SHORT = ("graspd_core/paths.py",)
+# Parts that are imported only where a request asks for them (test_public_names.py and test/ros/test_optional_parts.py
+# plan without them), so that no program's reach counts them.
+OPTIONAL = ("graspd_core/arms", "graspd_core/library", "graspd_core/hands/mano")
+
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {
     "mujoco": ("graspd_core/verify/", "graspd_core/hands/readers/", "graspd_bench/", "graspd_viewer/"),
@@ -185,7 +191,7 @@ def length_faults(path: str, source: str) -> list[str]:
     lines = source.count("\n")
     if lines > MAX_LINES:
         return [f"{path}: {lines} lines, more than {MAX_LINES}: split it"]
-    if lines < MIN_LINES and Path(path).stem not in ("__init__", "__main__"):
+    if lines < MIN_LINES and Path(path).stem not in ("__init__", "__main__") and path not in SHORT:
         return [f"{path}: {lines} lines, fewer than {MIN_LINES}: make it part of another"]
     return []
 
@@ -200,7 +206,7 @@ def public_names() -> dict[str, str]:
 def reach_of(module: str) -> dict[Path, int]:
     """The files that a module reaches through its imports, those inside functions too, and their lines.
 
-    Imports for types only are left out: they are not run. A name that graspd_core offers counts by its module.
+    Imports for types only are left out, and `OPTIONAL` parts. A name that graspd_core offers counts by its module.
     """
     offered, reached, left = public_names(), dict[Path, int](), [module]
     while left:
@@ -209,7 +215,7 @@ def reach_of(module: str) -> dict[Path, int]:
             name = offered[name.removeprefix("graspd_core.")]
         path = ROOT.joinpath(*name.split("."))
         path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        if path in reached or not path.is_file():
+        if path in reached or not path.is_file() or str(path.relative_to(ROOT)).startswith(OPTIONAL):
             continue
         source = path.read_text()
         reached[path] = source.count("\n")
@@ -298,7 +304,7 @@ def test_packages_stay_within_their_lines(package: str):
 @pytest.mark.parametrize("program", MAX_REACH)
 def test_programs_reach_few_lines(program: str):
     reached = reach_of(program)
-    assert len(reached) > 100
+    assert len(reached) > 80
     assert sum(reached.values()) <= MAX_REACH[program]
     packages = {path.relative_to(ROOT).parts[0] for path in reached}
     assert packages <= {"graspd_core", program.split(".")[0]}

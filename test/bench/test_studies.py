@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from graspd_bench import run_studies
-from graspd_bench.result_store import case_file, case_key, read_results
+from graspd_bench.result_store import bench_version, case_file, case_key, read_results
 from graspd_bench.run_studies import Job, make_plan, run_job, studies_of
 from graspd_bench.studies.human_hand import SOFTNESS
 from graspd_bench.study import Request
@@ -24,7 +24,6 @@ from graspd_bench.tables import sourced, written
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 from graspd_core.errors import ConfigError
-from graspd_core.runtime.records import bench_version
 
 ROOT = Path(__file__).parents[2]
 

@@ -201,7 +201,7 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
     right = perpendicular(axis.direction)
     up = np.cross(axis.direction, right)
     row = np.repeat(np.arange(len(profile)), RING_SAMPLES)
-    confirmed, wrong = _judged(profile, axis, right, up, free_space)
+    confirmed, wrong = _confirmed_and_wrong(profile, axis, right, up, free_space)
     good = np.bincount(row, wrong) / RING_SAMPLES < MAX_CONTRADICTED_SHARE
     if good.sum() < 5:
         return None
@@ -236,9 +236,9 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
             patch = np.column_stack([np.full((n := int(rim[1] / step)), way * end), np.linspace(0.3 * step, rim[1], n)])
             patch = np.column_stack([patch, np.full(n, way), np.zeros(n)])
             beyond = patch[-1:] + np.array([[0.008 * way, 0, 0, 0]])
-            if (_judged(beyond, axis, right, up, free_space)[1] > 0.1).mean() < 0.2:
+            if (_confirmed_and_wrong(beyond, axis, right, up, free_space)[1] > 0.1).mean() < 0.2:
                 continue
-        if len(patch) and _judged(patch, axis, right, up, free_space)[1].mean() < 0.1:
+        if len(patch) and _confirmed_and_wrong(patch, axis, right, up, free_space)[1].mean() < 0.1:
             found.append(patch)
     return found
 
@@ -262,7 +262,7 @@ def _foot(rim, way: float, ground: float, step: float) -> Rows:
     return np.column_stack([way * (ground - z), r, -way * slope[:, 0], -slope[:, 1]])
 
 
-def _judged(rows: Rows, axis: Axis, right, up, free_space: FreeSpace) -> tuple[np.ndarray, np.ndarray]:
+def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpace) -> tuple[np.ndarray, np.ndarray]:
     """What the cameras confirm of, and how much they speak against, `RING_SAMPLES` places of each row, turned."""
     ring = _ring(rows, axis, right, up, np.full(len(rows), RING_SAMPLES))
     return weigh(free_space, ring.points, ring.normals)
