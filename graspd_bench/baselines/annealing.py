@@ -197,7 +197,7 @@ class Annealing:
     Attributes:
         config: its settings.
         seed: of the jumps.
-        center, basis, low, high: the space of postures, see `eigengrasps.PostureSpace`.
+        center, basis, low, high: the space of postures, see `PostureSpace`.
         lower, upper: joint limits [rad] or [m].
         contacts: places the chosen contact locations, see `hands.kinematics.placement`.
         normals: places their outward normals likewise.

@@ -388,7 +388,7 @@ JOINT_COST, BASE_COST = 0.1, 2e3
 def find_pregrasp_compiled(
     compiled: KernelProblem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
 ) -> tuple[Poses, Float[Tensor, "batch"]]:
-    """`pregrasp.find_pregrasp` for the problem as the kernel reads it."""
+    """`find_pregrasp` for the problem as the kernel reads it."""
     x = pack(poses).contiguous()
     out, share = x.new_empty(len(x), x.shape[1] - 4), x.new_empty(len(x))
     settings = structs.Pregrasp(
@@ -407,7 +407,7 @@ def find_pregrasp_compiled(
 def self_overlap_compiled(
     compiled: KernelProblem, joints: Float[Tensor, "batch joints"], checked: Bool[Tensor, "links solids"]
 ) -> Float[Tensor, "batch"]:
-    """`contact_set.self_overlap` of the pairs that are `checked`."""
+    """`self_overlap` of the pairs that are `checked`."""
     joints, asked = joints.contiguous(), checked.to(torch.int32).contiguous()
     depth = joints.new_empty(len(joints))
     arguments = len(joints), joints.data_ptr(), asked.data_ptr(), depth.data_ptr(), torch.get_num_threads()
@@ -418,7 +418,7 @@ def self_overlap_compiled(
 def nearest_features_compiled(
     compiled: KernelProblem, poses: Poses, solids: int
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """`contact_set.nearest_features` for the problem as the kernel reads it."""
+    """`nearest_features` for the problem as the kernel reads it."""
     x = pack(poses).contiguous()
     pick = torch.zeros((len(x), solids), dtype=torch.int32)
     distance, gradient = x.new_empty(pick.shape), x.new_zeros((*pick.shape, 3))

@@ -102,7 +102,7 @@ def kernel_problem(problem: Problem) -> KernelProblem | None:
 
 @lru_cache(maxsize=8)
 def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
-    """The fields of `structs.Problem` that tell of the hand."""
+    """The fields of `builds.Problem` that tell of the hand."""
     arrays = Arrays()
     spheres, links = placed_points(hand.spheres.matrix)
     order = np.argsort(links.numpy(), kind="stable")

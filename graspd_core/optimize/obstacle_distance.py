@@ -2,7 +2,7 @@
 
 A solid is convex, so it is clear of a half-space exactly when its extreme points are: boxes and hulls by their corners,
 spheres and capsules by their ends less their radius, cylinders by points of their rims. Against neighbours the
-collision spheres (`hands.collision_spheres`), which bulge a little out of flat faces, stand in for what lies between
+collision spheres (`hands.self_collision`), which bulge a little out of flat faces, stand in for what lies between
 the corners. Gradients are exact but for that of the neighbours' interpolated distance.
 """
 

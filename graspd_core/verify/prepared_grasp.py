@@ -62,7 +62,7 @@ class HandSurface:
 
 @dataclass(frozen=True, eq=False)
 class MetricsContext:
-    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `measure.measure`."""
+    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `metrics.measure`."""
 
     target: ObjectModel
     hand: HandModel
