@@ -349,7 +349,8 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     Between two stages time is shared out evenly, enough for joints below `pace.joint_speed` and the hand below
     `pace.base_speed`.
     """
-    from graspd_core.arms.arm_paths import LIFT, RETREAT
+    from graspd_core.arms.arm_paths import LIFT
+    from graspd_core.hands.kinematics import RETREAT
 
     way = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
     times = [pace.shortest]
