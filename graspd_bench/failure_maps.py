@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from graspd_bench import failure_maps as map_runs
 from graspd_bench.charts import figure, save
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
@@ -295,7 +294,7 @@ MAPS: Mapping[str, Map] = {
         MapAxis("friction coefficient", (0.1, 0.2, 0.3, 0.6, 1.5)),
         MapAxis("mass [kg]", (0.005, 0.03, 0.1, 0.3, 1.0, 2.0)),
         ("cylinder", "mug"),
-        map_runs.run_friction_mass,
+        run_friction_mass,
         together=True,
     ),
     "size": Map(
@@ -303,21 +302,21 @@ MAPS: Mapping[str, Map] = {
         MapAxis("least width of the object / span of the hand", (0.025, 0.05, 0.1, 0.25, 0.4, 0.5)),
         MapAxis("object", _SIZED),
         _SIZED,
-        map_runs.run_size,
+        run_size,
     ),
     "view": Map(
         "view",
         MapAxis("elevation of the only camera [deg]", (15.0, 30.0, 50.0, 80.0)),
         MapAxis("noise [times a D415's]", (0.0, 1.0, 2.0, 4.0)),
         ("mug",),
-        map_runs.run_view,
+        run_view,
     ),
     "wall": Map(
         "wall and grid",
         MapAxis("resolution of the distance grid", (8.0, 16.0, 48.0, 96.0)),
         MapAxis("wall of the cup [mm]", (0.3, 1.0, 3.0, 6.0)),
         ("cup",),
-        map_runs.run_wall,
+        run_wall,
     ),
 }
 

@@ -169,7 +169,6 @@ def _moved_to(old: str, new: str) -> str:
 
 @cache
 def _moved_modules() -> dict[str, str]:
-    """Return the new name of each module path of version 0.1."""
     import json
 
     rows = json.loads(Path(__file__).with_name("moved.json").read_text())

@@ -112,7 +112,6 @@ class TransformBuffer:
             raise TransformError(f"unknown frame {name!r}; known: {', '.join(known) or 'none'}")
 
     def _chain(self, name: str) -> list[str]:
-        """The frame, its parent, and so on to the root."""
         chain = [name]
         while chain[-1] in self._links:
             chain.append(self._links[chain[-1]].parent)
@@ -130,7 +129,6 @@ class TransformBuffer:
             del link.stamps[:old], link.poses[:old]
 
     def _down(self, names: list[str], stamp: int, asked: str) -> Float[np.ndarray, "4 4"]:
-        """Pose of the first frame in the parent of the last."""
         pose = np.eye(4)
         for name in names:
             pose = _pose_at(self._links[name], name, stamp, asked) @ pose

@@ -23,7 +23,6 @@ from graspd_core.runtime.records import code_version, forget_peak, peak_mb
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
-from graspd_dataset import block_rows
 from graspd_dataset.blocks import Block, DatasetObject
 from graspd_dataset.dataset_store import parquet_bytes
 from graspd_dataset.guarded_calls import Limits, MadeBlock, ReadyObject, call_guarded, close_child
@@ -177,8 +176,8 @@ def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str
     measured: dict[str, tuple[Block, MadeBlock]] = {}
     for block in blocks:
         if block.hand_content not in measured:
-            ready = call_guarded(limits, block_rows.make_ready, block.object, None, block.config)
-            made = call_guarded(limits, block_rows.make_block, block, pickled_hand(block), ready.shared)
+            ready = call_guarded(limits, make_ready, block.object, None, block.config)
+            made = call_guarded(limits, make_block, block, pickled_hand(block), ready.shared)
             measured[block.hand_content] = block, made
     close_child()
     lines, wanted = [], Counter[str]()

@@ -85,7 +85,6 @@ def _name(arm: Arm, capsule: int) -> str:
 def _worst_of_each(
     depth: Float[Tensor, "batch n"], owner: Int[np.ndarray, "n"], count: int
 ) -> Float[Tensor, "batch owners"]:
-    """The greatest depth of the columns that each owner has; minus infinity where it has none."""
     worst = depth.new_full((len(depth), count), -torch.inf)
     return worst.scatter_reduce(1, torch.as_tensor(owner).expand(len(depth), -1), depth, "amax")
 
@@ -118,7 +117,6 @@ def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "b
 
 
 def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Ends and radii of the hand's capsules in the arm's base frame."""
     capsules = capsules_of_hand(hand)
     fingers = forward(make_kinematics(hand, dtype=joints.dtype), joints)
     base = links[:, arm.tip].compose(tip_hand(arm, hand))
@@ -148,14 +146,12 @@ def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]
 
 
 def _group_above(arm: Arm, group: int) -> int:
-    """The group that a group of welded links hangs on; -1 for the base's."""
     parent = arm.chain.link_parent[group]
     return -1 if parent < 0 else int(arm.chain.link_group[parent])
 
 
 @lru_cache(maxsize=8)
 def _clear_of_hand(arm: Arm, hand: HandModel) -> np.ndarray:
-    """Which of the arm's capsules (rows) are held against which of the open hand's: those clear in the seed posture."""
     links = _seed_links(arm)
     start, end, radius = _hand_capsules(arm, hand, links, torch.as_tensor(hand.open_posture)[None].double())
     a, b, own = placed(arm.capsules, links)

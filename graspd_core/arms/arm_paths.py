@@ -61,7 +61,6 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
 
 
 def _shares() -> Float[np.ndarray, "way 4"]:
-    """What each of the four stages contributes to each waypoint."""
     along = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
     return np.maximum(1.0 - np.abs(along[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 

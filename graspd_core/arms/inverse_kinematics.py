@@ -193,7 +193,6 @@ def start_table(arm: Arm) -> StartTable:
 
 
 def _shoulder(arm: Arm) -> Float[Tensor, "3"]:
-    """See `StartTable`; of an arm with one joint the joint itself."""
     links = arm_links(arm, torch.as_tensor(arm.seed)[None])[0]
     first, second = arm.moved_link[0], arm.moved_link[min(1, len(arm.moved_link) - 1)]
     axis = links.rotation[first] @ torch.as_tensor(arm.chain.joint_axis[first])
@@ -279,7 +278,6 @@ def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -
 
 
 def _beyond(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
-    """How far each joint is beyond its limits [rad] or [m], turned by full turns to where that is least."""
     lower, upper = torch.as_tensor(arm.lower), torch.as_tensor(arm.upper)
     turns = ((0.5 * (lower + upper) - q) / (2 * np.pi)).round() * (2 * np.pi)
     q = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)

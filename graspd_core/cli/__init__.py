@@ -79,7 +79,6 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def _with_siblings(command: str) -> dict[str, str]:
-    """Return the module of each command of all installed packages, or only that of `command` if it is one of them."""
     registered = {point.name: point.value for point in entry_points(group="graspd.commands")}
     if command in SIBLINGS and command not in registered:
         raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")

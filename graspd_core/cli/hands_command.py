@@ -196,7 +196,6 @@ def as_yaml(found: HandReport, urdf: str) -> str:
 
 
 def _joint_of_link(hand: HandModel) -> list[str]:
-    """The name of the movable joint that carries each link, empty where it is welded."""
     coupled = {mimic.link: mimic.name for mimic in hand.mimics}
     return [
         coupled.get(link) or (hand.joint_names[joint] if joint >= 0 else "")
@@ -238,5 +237,4 @@ def _list(values: Float[np.ndarray, "3"]) -> str:
 
 
 def _quoted(name: str) -> str:
-    """A name as YAML: a bare number would be read as one, and a colon or a hash as something else."""
     return '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -82,7 +82,6 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
 
 
 def _refuse_name(library: GraspLibrary, entry: LibraryEntry) -> None:
-    """Refuse an object that would go by the name of another one. Raises ConfigError."""
     for other, _ in library.entries(name=entry.name):
         if other.source != entry.source and other.mesh_sha256 != entry.mesh_sha256:
             told = f"{entry.source}: the library {library.path} has another {entry.name!r}, of {other.source}"

@@ -83,7 +83,6 @@ def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: boo
 
 
 def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
-    """Places and the like: one value for each hint, of either sign."""
     if not isinstance(value, list | tuple) or len(value) != len(hints):
         raise ConfigError(f"{where}: expected {len(hints)} values, got {shown(value)}")
     pairs = enumerate(zip(hints, value, strict=True))

@@ -1,6 +1,4 @@
-"""A search for the posture that puts the fingertips around a ball: how hands without a description open and close.
-
-A palm, an approach and two postures for a hand whose description names none. A hand description beats them.
+"""A palm, an approach and two postures for a hand whose description names none. A hand description beats them.
 
 Fingers are the chains that end in links which move no others; the palm is the link that all of them hang from. Where
 most fingers bend the same way (a human-like hand), the palm faces where they bend to: the linearised sweep of the
@@ -141,7 +139,6 @@ def _worst_overlap(
     points: Float[np.ndarray, "samples 3"],
     links: Int[np.ndarray, "samples"],
 ) -> Float[np.ndarray, "postures"]:
-    """Deepest overlap [m] of links that are neither welded nor joined."""
     groups = hand.link_group
     above = np.where(hand.link_parent >= 0, groups[np.maximum(hand.link_parent, 0)], -1)[groups]
     joined = (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)

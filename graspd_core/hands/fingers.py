@@ -102,7 +102,6 @@ def _far_end(
 
 
 def _chain(group: int, above: dict[int, int]) -> list[int]:
-    """The group and all above it, the base's last."""
     chain = [group]
     while above[chain[-1]] >= 0:
         chain.append(above[chain[-1]])
@@ -157,7 +156,6 @@ def _group_surface(
     count: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "points 3"]:
-    """`count` random surface points of each solid of a rigid group, base frame [m]."""
     rotations, translations = poses
     solids = [solid for solid in hand.primitives if hand.link_group[solid.link] == group]
     drawn = [surface_points(p, count, rng)[0] @ rotations[p.link].T + translations[p.link] for p in solids]

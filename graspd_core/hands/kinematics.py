@@ -1,10 +1,8 @@
-"""Forward kinematics, batched over postures and parallel over the links of equal depth.
+"""Forward kinematics, batched over postures and parallel over the links of equal depth; a hand at a posture as a mesh.
 
 Everything is differentiable in the joint values; gradients are exact. Formulas: Rodrigues' rotation formula
 `R = I + sin(q) K + (1 - cos(q)) K²`, multiplied into each joint's constant offset beforehand, so that one link's local
 transform is a sum of three constant matrices.
-
-A hand at a posture as one triangle mesh, for pictures, volumes and viewers.
 """
 
 from __future__ import annotations
@@ -193,7 +191,6 @@ def in_base(
 
 
 def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    """Row i: link i and all links behind it."""
     behind = np.eye(hand.num_links, dtype=bool)
     for link in range(1, hand.num_links):
         behind[:, link] |= behind[:, hand.link_parent[link]]

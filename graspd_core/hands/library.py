@@ -98,7 +98,6 @@ def _find(name_or_path: str | Path) -> Path:
 
 
 def _with_effort(hand: HandModel) -> HandModel:
-    """Efforts that the URDF leaves open (absent or zero, a common placeholder) set to the default."""
     default = np.where(hand.slides, DEFAULT_FORCE, DEFAULT_EFFORT)
     return replace(hand, effort=np.where(np.isfinite(hand.effort), hand.effort, default))
 

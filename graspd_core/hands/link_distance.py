@@ -1,15 +1,14 @@
 """Signed distance of points to a link's collision primitives, negative inside.
 
 Distances to boxes, spheres, capsules and cylinders are exact [m]. Their gradients are exact where the distance is
-differentiable; on a centre or an axis, where it is not, they are zero (see `se3.safe_norm`), never NaN.
-Two approximations: inside a union the depth to the nearest single primitive's surface is a lower bound of the depth
-below the union's surface, and a hull's distance is the greatest of its face planes' distances, exact inside and a lower
+differentiable; on a centre or an axis, where it is not, they are zero (see `se3.safe_norm`), never NaN. Two
+approximations: inside a union the depth to the nearest single primitive's surface is a lower bound of the depth below
+the union's surface, and a hull's distance is the greatest of its face planes' distances, exact inside and a lower
 bound outside near edges and corners.
 
-All collision primitives of a hand at once, as tensors: distance of object points to every link.
-
-Boxes and round solids (cylinders; spheres and capsules count as swept points and segments) are exact; hulls are left
-to the contact candidates. Gradients are exact where the distance is smooth.
+`CollisionTensors` hold all primitives of a hand at once, for the distance of object points to every link: boxes and
+round solids (cylinders; spheres and capsules count as swept points and segments) are exact; hulls are left to the
+contact candidates. Gradients are exact where the distance is smooth.
 """
 
 from __future__ import annotations
@@ -74,7 +73,6 @@ def within_bounds(
 
 @lru_cache(maxsize=_MOST)
 def _bounds_of_all(primitives: tuple[Primitive, ...]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Least and greatest coordinates of one or more primitives in their link's frame [m]."""
     low, high = zip(*(bounds(primitive) for primitive in primitives), strict=True)
     return np.min(low, axis=0), np.max(high, axis=0)
 
@@ -220,7 +218,6 @@ def solid_bound(
 
 
 def _in_parts(whole: Callable[[SE3, Tensor], Tensor], solids: int, links: SE3, points: Tensor) -> Tensor:
-    """`whole` of link poses and points, of so many rows of the batch at once as memory is there for."""
     most = max(1, _AT_ONCE // max(1, solids * points.shape[1]))
     if len(points) <= most:
         return whole(links, points)
@@ -231,7 +228,6 @@ def _in_parts(whole: Callable[[SE3, Tensor], Tensor], solids: int, links: SE3, p
 def _to_solids(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids 3"]:
-    """Base-frame points in the frame of every solid."""
     placed = links[:, solids.link].compose(SE3(solids.rotation, solids.translation))
     columns = placed.rotation.permute(0, 2, 1, 3).flatten(2)
     origin = (placed.translation[:, :, None, :] @ placed.rotation).squeeze(-2)

@@ -1,12 +1,11 @@
-"""Spheres that fill the links, for a cheap differentiable self-collision term.
+"""Spheres that fill the links, for a cheap differentiable self-collision term; which links overlap at a posture.
 
-An approximation by choice: spheres bulge out of the flat faces of long boxes by up to a fifth of their half thickness,
-and leave edges and corners bare. Metrics use signed distances instead.
+The spheres are an approximation by choice: spheres bulge out of the flat faces of long boxes by up to a fifth of their
+half thickness, and leave edges and corners bare. Metrics use signed distances instead.
 
 The term looks at every pair of spheres, so that they are bounded: solids thinner than a few millimetres get spheres
-that bulge, and of those of a hand of many or large solids only the ones are kept that stick out of each other farthest.
-
-Which links overlap at a posture, and which pairs of links are never worth checking.
+that bulge, and of those of a hand of many or large solids only the ones are kept that stick out of each other
+farthest.
 """
 
 from __future__ import annotations
@@ -104,7 +103,6 @@ def _fill_box(half: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "spheres 
 
 
 def _row(reach: float, step: float) -> Float[np.ndarray, "n"]:
-    """Positions from −reach to +reach no more than 1.2 steps apart; one in the middle where the reach is short."""
     if reach < 0.2 * step:
         return np.zeros(1)
     return np.linspace(-reach, reach, int(np.ceil(2 * reach / (1.2 * step))) + 1)

@@ -1,11 +1,8 @@
-"""Points on the surface of one primitive, with outward normals, in the frame of its link.
-
-Random points are uniform by area. Feature points are what a sparse random set misses: edges, corners and rims.
-
-The hand's outer surface as points: contact candidates for the optimiser, dense samples for the metrics.
+"""The hand's outer surface as points: contact candidates for the optimiser, dense samples for the metrics.
 
 The outer surface is what can touch something: points inside another solid welded to the same link are left out, and so
-are those that stay inside the next link of the chain at every value of the joint between them.
+are those that stay inside the next link of the chain at every value of the joint between them. Random points are
+uniform by area. Feature points are what a sparse random set misses: edges, corners and rims.
 """
 
 from __future__ import annotations
@@ -240,7 +237,6 @@ def candidates(
 def _on_skin(
     hand: HandModel, pool: _Pool
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"], Int[np.ndarray, "count"]]:
-    """Points, normals and links of a pool, drawn to the nearest skin of their link where it has one."""
     points, normals = pool.points.copy(), pool.normals.copy()
     for link, skin in hand.skins:
         own = pool.links == link
@@ -372,7 +368,6 @@ def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"
 
 
 def _by_group(hand: HandModel) -> dict[int, list[tuple[int, Primitive]]]:
-    """Number and primitive of all solids of each rigid group."""
     found: dict[int, list[tuple[int, Primitive]]] = {}
     for number, primitive in enumerate(hand.primitives):
         found.setdefault(int(hand.link_group[primitive.link]), []).append((number, primitive))

@@ -395,7 +395,6 @@ def _is_depth(path: str | Path, reader: Any, topic: BagTopic) -> bool:
 
 
 def _first(path: str | Path, reader: Any, topic: str) -> Any:
-    """The first message of a topic that the recording says has some."""
     connections = [c for c in reader.connections if c.topic == topic]
     for connection, _, raw in _messages(path, reader, connections):
         return _decode(path, reader, connection, raw)

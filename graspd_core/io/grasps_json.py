@@ -137,7 +137,6 @@ def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
 
 
 def _arm(path: ArmPath) -> dict[str, Any]:
-    """The arm's way, and the waypoint at which it is at each stage."""
     stages = dict(zip(ARM_STAGES, path.stages, strict=True))
     return {"joint_names": list(path.joint_names), "positions": path.positions.tolist(), "stages": stages}
 
@@ -277,7 +276,6 @@ def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _metrics_of(values: dict[str, Any]) -> GraspMetrics | None:
-    """The metrics of the registry; None where none was measured."""
     read = {name: _scaled(values, row.key, 1 / row.scale) for name, row in METRICS.items()}
     return None if set(read.values()) <= {None} else GraspMetrics(read)
 
@@ -292,7 +290,6 @@ def _trial_of(values: dict[str, Any]) -> TrialResult:
 
 
 def _scaled(values: dict[str, Any], key: str, factor: float) -> float | None:
-    """A number times `factor`; None where there is none."""
     return None if values.get(key) is None else float(_numbers_of(values, key)) * factor
 
 
@@ -311,7 +308,6 @@ def _contact_of(values: dict[str, Any]) -> Contact:
 
 
 def _numbers_of(values: dict[str, Any], key: str, *shape: int) -> Float[np.ndarray, "..."]:
-    """What a key holds, as finite numbers of a shape. Raises ValueError: it holds something else."""
     numbers = np.array(values[key], dtype=float)
     if numbers.shape != shape or not np.isfinite(numbers).all():
         raise ValueError(f"{key}: {shown(values[key])}; expected {math.prod(shape)} finite number(s)")

@@ -115,7 +115,6 @@ def source_hash(source: str) -> str:
 
 @lru_cache(maxsize=4096)
 def _file_hash(path: str, changed: int, size: int) -> str:
-    """Of a file that was last written then [ns] and is so long [bytes]: read again only after a change."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

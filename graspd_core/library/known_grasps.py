@@ -338,7 +338,6 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
 
 
 def _hemmed_in(scene: Scene) -> bool:
-    """Whether an obstacle is so near to the object that the object itself may strike it."""
     vertices = torch.as_tensor(scene.object.mesh.vertices)
     return any(float(sample_sdf(o.sdf, vertices.to(o.sdf.field))[0].min()) < NEAR for o in scene.obstacles)
 

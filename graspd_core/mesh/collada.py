@@ -163,7 +163,6 @@ def _surface(
 def _placed(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], pose: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """A surface moved by a pose, turned over where that mirrors."""
     corners = vertices @ pose[:3, :3].T + pose[:3, 3]
     return corners, faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else faces
 
@@ -180,7 +179,6 @@ def _positions(vertices: ET.Element, named: dict[str, ET.Element]) -> Float[np.n
 
 
 def _strip(corners: Int[np.ndarray, "corners"]) -> Int[np.ndarray, "_"]:
-    """The corners of a strip's triangles: every corner and the two after it, every other triangle turned over."""
     faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
     faces[1::2] = faces[1::2, [1, 0, 2]]
     return faces.ravel()

@@ -1,6 +1,7 @@
-"""Drop small components: tiny pieces that float clear of a mesh, as scanners and careless exports leave them.
+"""Pieces of one mesh: tiny ones that float clear are dropped, bodies that stand apart are told.
 
-Bodies of one mesh that stand apart: a hand grasps them as one rigid thing, which they may not be.
+Scanners and careless exports leave floating pieces. A hand grasps bodies apart as one rigid thing, which they may not
+be.
 """
 
 from __future__ import annotations
@@ -56,7 +57,6 @@ def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
 
 
 def _extents(corners: Float[np.ndarray, "faces 3 3"], piece: Int[np.ndarray, "faces"]) -> Float[np.ndarray, "pieces"]:
-    """Diagonal of each piece's bounding box [m]."""
     order = np.argsort(piece, kind="stable")
     starts = np.flatnonzero(np.diff(piece[order], prepend=-1))
     low = np.minimum.reduceat(corners.min(1)[order], starts)

@@ -109,7 +109,6 @@ def _cut_up(sdf: GridSDF, points: Points, tolerance: float, most: int) -> list[P
 
 
 def _best_cut(sdf: GridSDF, cluster: Points) -> _Cut | None:
-    """The cut with the least volume of bulge left on both sides; None when nothing can be cut."""
     cuts = _promising_cuts(sdf, cluster)
     trial = _thin(cluster, TRIAL_POINTS)
     return min(cuts, key=lambda cut: _bulge_left(sdf, trial, cut), default=None)
@@ -147,7 +146,6 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
 def _sums_below(
     slices: Int[np.ndarray, "n directions"], weights: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "directions cuts"]:
-    """Along each direction, the sum of the weights that lie in the slices below each cut."""
     directions = slices.shape[1]
     flat = (slices + SLICES * np.arange(directions)).ravel()
     # Of no weights at all numpy counts in integers.
@@ -156,7 +154,6 @@ def _sums_below(
 
 
 def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
-    """Area times mean bulge of the hulls on both sides of a cut [m³]."""
     below = points @ cut.direction <= cut.offset
     hulls = [hull for hull in (_hull(points[below]), _hull(points[~below])) if hull is not None]
     return float(sum(hull.area * _outside(sdf, _hull_samples(hull)).mean() for hull in hulls))
@@ -201,7 +198,6 @@ def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> 
 
 
 def _bulges_between(sdf: GridSDF, one: Points, others: list[Points]) -> Float[np.ndarray, "_"]:
-    """How far the segments from one cluster to each of the others reach outside the object [m]."""
     if not others:
         return np.zeros(0)
     first, *rest = (_few(points) for points in (one, *others))
@@ -210,23 +206,19 @@ def _bulges_between(sdf: GridSDF, one: Points, others: list[Points]) -> Float[np
 
 
 def _few(points: Points) -> Float[np.ndarray, "few 1 3"]:
-    """`PAIRED_POINTS` of the points, repeated where there are fewer."""
     return points[np.linspace(0, len(points) - 1, PAIRED_POINTS).astype(int), None]
 
 
 def _bulge(sdf: GridSDF, cluster: Points) -> float:
-    """How far the cluster's hull reaches outside the object: 98th percentile over its area [m]."""
     hull = _hull(cluster)
     return 0.0 if hull is None else _quantile(_outside(sdf, _hull_samples(hull)), 0.98)
 
 
 def _blur(sdf: GridSDF, cluster: Points) -> float:
-    """How far the surface itself looks outside [m]: its details are finer than the grid, and no cut mends that."""
     return _quantile(_outside(sdf, _thin(cluster, 2 * TRIAL_POINTS)), 0.9)
 
 
 def _quantile(values: Float[np.ndarray, "_"], share: float) -> float:
-    """The value that this share of them does not exceed; a tenth of np.quantile's time."""
     rank = min(int(share * len(values)), len(values) - 1)
     return float(np.partition(values, rank)[rank])
 
@@ -252,7 +244,6 @@ def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
 
 
 def _outside(sdf: GridSDF, points: Points) -> Float[np.ndarray, "_"]:
-    """How far points are outside the object [m], 0 within: φ alone, a quarter of `sample_sdf`'s work."""
     unit = (torch.as_tensor(points, dtype=sdf.field.dtype) - sdf.origin) / sdf.half - 1
     field = sdf.field[None, :1].permute(0, 1, 4, 3, 2)
     sampled = grid_sample(field, unit[None, None, None], align_corners=True, padding_mode="border")
@@ -260,7 +251,6 @@ def _outside(sdf: GridSDF, points: Points) -> Float[np.ndarray, "_"]:
 
 
 def _thin(points: Points, most: int) -> Points:
-    """Every n-th point: surface samples come in no particular place order within a face, so this is even."""
     if len(points) <= most:
         return points
     return points[np.linspace(0, len(points) - 1, most).astype(int)]

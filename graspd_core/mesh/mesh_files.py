@@ -1,8 +1,7 @@
-"""Sizes that a hand's object can have, and guesses at the unit of a file: offered in messages, never applied.
+"""Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres.
 
-Files that hold no mesh, or half of one: a pointer, a picture, an archive, what a transfer cut off.
-
-Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres.
+Files that hold no mesh, or half of one, are refused by what they are. Guesses at the unit of a file are offered in
+messages, never applied.
 """
 
 from __future__ import annotations
@@ -346,7 +345,6 @@ def _strays_told(source: str, strays: int) -> tuple[str, ...]:
 
 
 def _is_open(mesh: TriangleMesh) -> bool:
-    """Whether a mesh as read has a border; one of absurd size, which is refused later, is not looked at."""
     return bool(np.ptp(mesh.vertices, axis=0).max() < 1e6) and not is_closed(TriangleMesh(*merge_vertices(mesh)))
 
 
@@ -391,7 +389,6 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
 def _moments(
     points: Float[np.ndarray, "points 3"], volume: float
 ) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Volume, centre and inertia of a solid evenly filled with points."""
     centre = points.mean(0)
     second = (points - centre).T @ (points - centre) * (volume / len(points))
     return volume, centre, np.trace(second) * np.eye(3) - second

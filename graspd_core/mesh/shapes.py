@@ -134,7 +134,6 @@ def _revolve(profile, closed: bool = False) -> TriangleMesh:
 
 
 def _ribbon(outer: Float[np.ndarray, "n 2"], inner: Float[np.ndarray, "n 2"], half_width: float) -> TriangleMesh:
-    """A bar of rectangular section between two curves of the x-z plane, `half_width` [m] to either side of it."""
     corners = [(outer, -half_width), (outer, half_width), (inner, half_width), (inner, -half_width)]
     rings = np.stack([np.column_stack([c[:, 0], np.full(len(c), y), c[:, 1]]) for c, y in corners], 1)
     # A ring shrunk to a point closes either end.

@@ -55,7 +55,6 @@ def sharp_points(
 def _is_thin(
     query: DistanceQuery, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], probe: float
 ) -> Bool[np.ndarray, "n"]:
-    """Whether there is less than `probe` [m] of material below each point."""
     return -signed_distance(query, points - probe * normals) < (1 - _SHARP) * probe
 
 
@@ -112,7 +111,6 @@ def neighbours_together(points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray
 
 
 def _scaled_normals(mesh: TriangleMesh) -> Float[np.ndarray, "faces 3"]:
-    """Normals of the faces, as long as twice their areas [m²]."""
     corners = mesh.vertices[mesh.faces]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 

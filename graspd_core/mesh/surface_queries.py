@@ -1,14 +1,8 @@
-"""Exact signed distance of points to a mesh: what metrics are measured with. No grid, no gradient.
+"""Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64. No grid, no gradient.
 
-Negative where the winding number says inside.
-
-Which side of a surface points are on, by the generalised winding number (Barill et al. 2018). No gradient.
-
-Needs no closed, oriented or single surface: open, overlapping, doubled and inverted ones have an inside too.
-
-Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64. No gradient.
-
-Rays alone go by Open3D (Embree), which takes half a second to import: no plan on a mesh needs it.
+Signed distances are what metrics are measured with: negative where the generalised winding number (Barill et al. 2018)
+says inside. It needs no closed, oriented or single surface: open, overlapping, doubled and inverted ones have an inside
+too. Rays alone go by Open3D (Embree), which takes half a second to import: no plan on a mesh needs it.
 """
 
 from __future__ import annotations
@@ -115,7 +109,6 @@ def winding_inside(mesh: TriangleMesh, points: Float[np.ndarray, "points 3"]) ->
 
 
 def _numbers(tree: WindingTree, points: Float[np.ndarray, "n 3"], accuracy: float) -> Float[np.ndarray, "n"]:
-    """Absolute winding numbers of points about the tree's centre."""
     chunks = [points[i : i + _POINTS_AT_ONCE] for i in range(0, len(points), _POINTS_AT_ONCE)]
     numbers = [np.abs(tree.tree.winding_number(np.ascontiguousarray(chunk), accuracy)) for chunk in chunks]
     return np.concatenate(numbers) if numbers else np.zeros(0)

@@ -1,6 +1,6 @@
-"""Rows of integers, and the voxels that points lie in, as single numbers.
+"""What the vertices and faces of a triangle soup say of its surface, and how to tidy them.
 
-What the vertices and faces of a triangle soup say of its surface, and how to tidy them.
+Rows of integers, and the voxels that points lie in, are packed into single numbers.
 """
 
 from __future__ import annotations

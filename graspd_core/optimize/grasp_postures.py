@@ -220,7 +220,6 @@ def _obstacle_cost(
     rotation: Float[Tensor, "batch 3 3"],
     x: Float[Tensor, "batch variables"],
 ) -> Float[Tensor, "batch"]:
-    """The loss term of obstacles for rows of translation and joints."""
     gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.hand.kinematics, x[:, 3:]))
     return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
 

@@ -86,7 +86,6 @@ def make_obstacle_tensors(
 
 
 def _in_reach(neighbour: Obstacle, scene: Scene, hand: HandModel) -> bool:
-    """Whether a hand whose palm lies on the object, or comes from a retreat, could touch the neighbour."""
     reach = hand_reach(hand) + RETREAT
     gap, _ = sample_sdf(neighbour.sdf, torch.as_tensor(scene.object.mesh.vertices).to(neighbour.sdf.field))
     return float(gap.min()) < reach

@@ -214,7 +214,6 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
 
 
 def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
-    """The middle of the palm, or the base frame's origin where that lies in the palm [m]."""
     far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
     return hand.palm_center if far else np.zeros(3)
 
@@ -242,7 +241,6 @@ def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "po
 
 
 def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"]) -> Int[np.ndarray, "groups width"]:
-    """Indices that belong to each group, rows padded by repetition; a group without any repeats the first index."""
     members = [np.flatnonzero(group_of == group) for group in present]
     width = max(map(len, members))
     return np.stack([np.resize(m if len(m) else [0], width) for m in members])
@@ -344,7 +342,6 @@ def feature_distance(
 def _nearest_of_group(
     distance: Float[Tensor, "batch pairs"], groups: Int[Tensor, "batch pairs"], count: int
 ) -> Float[Tensor, "batch groups"]:
-    """Least distance per group, infinite where no pair belongs to it; pairs of no group go to a last, dropped one."""
     start = distance.new_full((len(distance), count + 1), torch.inf)
     return start.scatter_reduce(1, groups, distance, "amin")[:, :count]
 

@@ -115,24 +115,20 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
 
 
 def _depth(staged: Staged) -> Float[Tensor, "batch"]:
-    """How deep the hand lies in the object [mm]."""
     return (-staged.contact_set.distance.amin(-1)).clamp_min(0.0) / 0.001
 
 
 def _links_touching(contact_set: ContactSet) -> Float[Tensor, "batch"]:
-    """How many links touch."""
     members = contact_set.link[None] == torch.unique(contact_set.link)[:, None]
     return (contact_set.active[:, None] & members).any(-1).sum(-1).to(contact_set.distance)
 
 
 def _spread(rows: Float[Tensor, "batch slots 3"], count: Float[Tensor, "batch"]) -> Float[Tensor, "3 batch"]:
-    """Mean squares of some vectors along their principal axes, least first."""
     squares = torch.linalg.eigvalsh(rows.transpose(1, 2) @ rows / count[:, None, None])
     return squares.clamp_min(0.0).T
 
 
 @lru_cache(maxsize=1)
 def _fitted() -> dict[str, Tensor]:
-    """The network: mean and deviation of the figures, weights and biases of its layers."""
     with files("graspd_core.optimize").joinpath("ranking.npz").open("rb") as file, np.load(file) as arrays:
         return {name: torch.as_tensor(arrays[name]).double() for name in arrays.files}

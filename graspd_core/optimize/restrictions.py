@@ -159,7 +159,6 @@ def aimed(
 def _standing_off(
     places: Float[Tensor, "batch 3"], facing: Float[Tensor, "batch 3"], surface: Float[Tensor, "points 3"]
 ) -> Float[Tensor, "batch"]:
-    """How far a palm must be drawn back from each place against its facing to have the surface ahead of it [m]."""
     away = surface[None] - places[:, None]
     back = -(away * facing[:, None]).sum(-1)
     near = (away + back[..., None] * facing[:, None]).norm(dim=-1) < _PALM_RADIUS

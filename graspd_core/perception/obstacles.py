@@ -81,7 +81,6 @@ def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle
 
 
 def _swallows(neighbour: Obstacle, target: TriangleMesh, padding: float) -> bool:
-    """Whether a neighbour's hull holds part of the object, more than where one leans on the other."""
     at = torch.as_tensor(target.vertices).to(neighbour.sdf.field)
     return bool((sample_sdf(neighbour.sdf, at)[0] < -2 * padding).any())
 
@@ -154,7 +153,6 @@ def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
 
 
 def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
-    """The points, or some that span nearly the same hull where they are many: a scan has hundreds of thousands."""
     if len(points) <= _CORNERS:
         return points
     rays = np.random.default_rng(0).normal(size=(_CORNERS, 3))

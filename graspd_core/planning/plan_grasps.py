@@ -140,14 +140,12 @@ def _prepared(
 
 
 def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tuple[Grasp, ...]:
-    """The grasps of the rounds, those first that hold out of place where the settings ask for it."""
     if found.context is None or not config.robust.rank:
         return found.grasps
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
 
 
 def _why_few(scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:
-    """What restrictions refused; without any, what the trials of a run failed of that ended with too few grasps."""
     told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
     return told or (why_trials_failed(scene, result.grasps) if result.outcome is Outcome.TOO_FEW else "")
 

@@ -217,7 +217,6 @@ def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple
 
 
 def _box_mesh(box: Box, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """The part of a box between two corners of its own frame."""
     import trimesh
 
     mesh = trimesh.creation.box(bounds=np.stack([low, high]))

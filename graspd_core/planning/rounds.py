@@ -163,7 +163,6 @@ def run_rounds(
 def _in_rank_order(
     candidates: tuple[Grasp, ...], wanted: int, restrictions: BoundRestrictions
 ) -> Iterator[tuple[Grasp, ...]]:
-    """Yield candidates best first. With restrictions, yield batches that double in size, because checking is slow."""
     some = 2 * max(wanted, _FIRST_BATCH) if restrictions.each else len(candidates)
     while candidates:
         yield candidates[:some]

@@ -86,7 +86,6 @@ NUMPY_NAMES = makers(
 
 
 def _is_plain(key: object) -> bool:
-    """Whether a dictionary may have this key: hashed in a step, and no collisions by choice."""
     return isinstance(key, (str, bytes)) or (isinstance(key, int) and 0 <= key < 2**32)
 
 
@@ -110,14 +109,12 @@ class _Reader(pickle._Unpickler):
     readline: Any
 
     def _call(self) -> None:
-        """REDUCE and NEWOBJ: a call, or an object of a class."""
         arguments = self.stack.pop()
         if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
             raise pickle.UnpicklingError(f"a call with other than at most {_MOST_ARGUMENTS} arguments")
         self.stack[-1] = self.stack[-1](*arguments)
 
     def _put(self) -> None:
-        """PUT: the one opcode that names a place in the memo by a number of any length."""
         place = int(self.readline()[:-1])
         if not _is_plain(place):
             raise pickle.UnpicklingError("a place in the memo that no file needs")
@@ -221,7 +218,6 @@ def _dtype(value: Any) -> np.dtype:
 
 
 def _shown(value: object) -> str:
-    """A value for an error. What is not text is not written out: lists in lists can be endless."""
     return repr(value[:40]) if isinstance(value, str) else f"a {type(value).__name__}"
 
 

@@ -219,7 +219,6 @@ def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """Have this process killed when the thread that started it ends; end it where that has happened already."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:

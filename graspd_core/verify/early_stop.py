@@ -100,7 +100,6 @@ def answer_known(
 
 
 def _stays(protocol: Protocol, moved: tuple[float, float], drift: tuple[float, float], times: float) -> bool:
-    """Whether the object is within the limits when it has drifted on so many times."""
     travel, turn = (so_far + times * more for so_far, more in zip(moved, drift, strict=True))
     return travel < protocol.max_displacement and turn < protocol.max_rotation
 

@@ -139,7 +139,6 @@ def _raise(
 
 
 def _said(reason: str, stage: str) -> str:
-    """A reason with the stage that it came in; empty without one."""
     return f"{reason} {stage}" if reason and reason != STOPPED else reason
 
 
@@ -163,13 +162,11 @@ def _touches(world: World, data: Any) -> bool:
 
 
 def _rest(world: World, data: Any) -> None:
-    """Put the object back to where it was seen."""
     data.qpos[world.object_address : world.object_address + 7] = [0, 0, 0, 1, 0, 0, 0]
     data.qvel[world.object_velocity : world.object_velocity + 6] = 0
 
 
 def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, settings: LiftSettings) -> None:
-    """Move table and neighbours down by the fraction `a` of the lift height. Free bodies react by physics."""
     data.mocap_pos[1:] = -settings.lift_height * a * a * (3 - 2 * a) * up
     acceleration = settings.lift_height * (6 - 12 * a) / settings.lift_time**2 if a < 1 else 0.0
     for body in (world.object_body, *world.others):

@@ -244,7 +244,6 @@ def _against_object(
     known: Bool[np.ndarray, "cells"],
     half_diagonal: float,
 ) -> tuple[Bool[np.ndarray, "cells"], Bool[np.ndarray, "cells"]]:
-    """Which cells may share space with the object, and which are known to lie inside it as a whole."""
     kept, whole = np.ones(len(centers), dtype=bool), known.copy()
     unknown = np.flatnonzero(~known)
     clear = unknown[unsigned_distance(context.query, centers[unknown]) > half_diagonal]
@@ -257,7 +256,6 @@ def _halve(cells: Int[np.ndarray, "cells 3"], size: int) -> Int[np.ndarray, "chi
 
 
 def _lattice(low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> Int[np.ndarray, "n 3"]:
-    """All integer points from `low` to before `high`."""
     return np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), -1).reshape(-1, 3)
 
 
@@ -359,7 +357,6 @@ class PreparedGrasp:
 
     @property
     def _contacts(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float, float]:
-        """Arms [m], normals, friction and torque scale [m] of the contacts that the wrench hull is made of."""
         target, points = self.context.target, self.placed.points[touching(self.placed)]
         chosen = points[farthest_points(points, self.max_contacts)]
         normals = surface_normals(self.context.query, chosen)

@@ -212,7 +212,6 @@ def try_hypotheses(
 
 
 def _rules_needed(evidence: Evidence | None, probability: float) -> tuple[str, ...]:
-    """The rules of other shapes, of which grasps are tried on the first that there is; none where none is needed."""
     if evidence is None or probability <= HELD[1]:
         return ()
     from graspd_core.perception.reconstruct.hidden_side import other_rules
@@ -233,7 +232,6 @@ def _hold_in(
 
 
 def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
-    """The same world with other coefficients of friction, without building it anew."""
     model = copy(world.model)
     model.geom_friction[:] = friction
     return replace(world, model=model, spare=deque())
@@ -245,7 +243,6 @@ def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: 
 
 @lru_cache(maxsize=4)
 def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
-    """Scenes of other shapes that `begin_other_shape` has begun, by their rules."""
     return {}
 
 

@@ -221,12 +221,10 @@ def _best_first(
 
 
 def _at_once(threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
-    """As `one_by_one`, in several threads."""
     return results_in_order(stop, lambda item, ended: item.hold(grasp, ended), items, threads, lambda: len(items))
 
 
 def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook) -> Grasp:
-    """The grasp with the trials of the likeliest scene, and where it passes them those of what else may be true."""
     results = grasp_trials(context.trials, grasp, stop)
     if not results[-1].passed or context.hypotheses is None:
         return replace(grasp, trials=results)

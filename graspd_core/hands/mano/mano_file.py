@@ -1,10 +1,7 @@
-"""What a MANO file may name, and the numbers that its inert objects stand for: arrays, sparse matrices, expressions.
+"""A MANO model as its file gives it: template, blend shapes, weights, tree (Romero, Tzionas and Black 2017).
 
-Every other name is refused, and none is called (`runtime/inert_pickle`).
-
-A MANO model as its file gives it: template, blend shapes, weights, tree (Romero, Tzionas and Black 2017).
-
-The file is licensed and never shipped: every user brings their own from https://mano.is.tue.mpg.de.
+The file is licensed and never shipped: every user brings their own from https://mano.is.tue.mpg.de. It may name arrays,
+sparse matrices and expressions. Every other name is refused, and none is called (`runtime/inert_pickle`).
 """
 
 from __future__ import annotations
@@ -72,7 +69,6 @@ def numbers(value: Any, depth: int = 0) -> np.ndarray:
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value of Python is a number that numpy has a type for."""
     return isinstance(value, float) or (isinstance(value, int) and -(2**63) <= value < 2**63)
 
 

@@ -1,22 +1,21 @@
-"""MANO's fifteen ball joints as forty-five hinges: axes, limits, efforts, and the conversion to axis-angle and back.
+"""A MANO model as a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
 
-A body turns against its parent by `R = B Rx(flexion) Ry(abduction) Rz(twist) Bᵀ`, B being its anatomical frame at rest:
-z along the bone, x the axis about which it flexes, y = z × x. The order is that of the ISB's recommendation for finger
-joints (Wu et al. 2005, after Grood and Suntay 1983): flexion about the parent's axis, then abduction, then twist about
-the bone itself. It is exact both ways as long as abduction stays under 90°, which every limit here does.
+The methods, the metrics and the trials see a hand like any other; figures of the skinned surface come from
+`ManoHand.skinned_mesh`, the mesh that MANO itself makes of the same joint values. The hulls stand for the skin at
+rest: they do not follow the blend shapes of the pose, and at a strongly bent joint the skin bulges by a few
+millimetres against them. Contact candidates lie on the skin at rest, since hulls are fuller where it is hollow.
+
+Base frame: the model's axes, origin in the wrist joint. The wrist body carries the palm.
+
+MANO's fifteen ball joints become hinges. A body turns against its parent by `R = B Rx(flexion) Ry(abduction) Rz(twist)
+Bᵀ`, B being its anatomical frame at rest: z along the bone, x the axis about which it flexes, y = z × x. The order is
+that of the ISB's recommendation for finger joints (Wu et al. 2005, after Grood and Suntay 1983): flexion about the
+parent's axis, then abduction, then twist about the bone itself. It is exact both ways as long as abduction stays under
+90°, which every limit here does.
 
 MANO has no such frames; they are made from the joints of the shape at hand. A finger flexes towards the palm's normal,
 which is that of the plane through wrist, index and little knuckle; the thumb flexes towards a point in front of the
 palm. Which side of that plane the palm is on shows in the mean pose, whose fingers are bent.
-
-A MANO model as a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
-
-The methods, the metrics and the trials see a hand like any other; figures of the skinned surface come from
-`ManoHand.skinned_mesh`, the mesh that MANO itself makes of the same joint values. The hulls stand for the skin at rest:
-they do not follow the blend shapes of the pose, and at a strongly bent joint the skin bulges by a few millimetres
-against them. Contact candidates lie on the skin at rest, since hulls are fuller where it is hollow.
-
-Base frame: the model's axes, origin in the wrist joint. The wrist body carries the palm.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from graspd_core.errors import HandError
-from graspd_core.hands.mano import mano_hand as mano_joints
 from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
 from graspd_core.hands.mano.mano_skin import (
     Skin,
@@ -185,9 +183,7 @@ class ManoHand:
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
         """MANO's own surface at a posture, wrist closed, in the frame that the posture is in [m]."""
         skin, betas = _float64(self.data), torch.as_tensor(self.betas)[None]
-        rotations = mano_joints.rotations_from_joints(
-            torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None]
-        )
+        rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
         origin = rest(skin, betas)[1][:, 0]
         vertices, _ = skin_vertices(skin, betas, rotations, -origin)
         turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64))
@@ -210,8 +206,8 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     closed_faces(data)  # a mesh that cannot be closed is refused here, not after an hour of planning
     owner = data.weights.argmax(1)
     tips = _fingertips(vertices, joints, owner)
-    normal = mano_joints.palm_normal(data, joints)
-    frames = mano_joints.anatomical_frames(joints, tips, normal)
+    normal = palm_normal(data, joints)
+    frames = anatomical_frames(joints, tips, normal)
     hand = _bare_hand(data, vertices, joints, owner, tips, normal, frames)
     skins = _skins(hand, data, vertices, joints, owner, frames)
     hand = replace(hand, adjacent=adjacent_links(hand), skins=skins)
@@ -225,7 +221,6 @@ def _float64(data: ManoData) -> Skin:
 def _fingertips(
     vertices: Float[np.ndarray, "vertices 3"], joints: Float[np.ndarray, "16 3"], owner: Int[np.ndarray, "vertices"]
 ) -> Float[np.ndarray, "5 3"]:
-    """Of each finger's last body the vertex farthest from its joint [m]."""
     tips = []
     for body in range(3, len(BODIES), 3):
         own = vertices[owner == body]
@@ -255,16 +250,16 @@ def _bare_hand(
     mass, com, inertia = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for body, hull in hulls.items():
         mass[link_of[body]], com[link_of[body]], inertia[link_of[body]] = _inertial(hull)
-    lower, upper = mano_joints.limits()
-    opened, closed = mano_joints.postures()
+    lower, upper = limits()
+    opened, closed = postures()
     return HandModel(
         name=data.path.stem,
         urdf=str(data.path),
         **tree,
-        joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in mano_joints.HINGES),
+        joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in HINGES),
         lower=lower,
         upper=upper,
-        effort=mano_joints.efforts(joints, tips),
+        effort=efforts(joints, tips),
         velocity=np.full(count - 1, np.inf),
         open_posture=opened,
         closed_posture=closed,
@@ -311,7 +306,7 @@ def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]
         turn = frames[above].T
         offsets += [(turn @ frames[body], turn @ (joints[body] - joints[above])), *[(np.eye(3), np.zeros(3))] * 2]
         parents += [link_of[above], len(names), len(names) + 1]
-        names += [f"{BODIES[body]}_{hinge}" for hinge in mano_joints.HINGES[:2]] + [BODIES[body]]
+        names += [f"{BODIES[body]}_{hinge}" for hinge in HINGES[:2]] + [BODIES[body]]
         axes += list(np.eye(3))
         link_of.append(len(names) - 1)
     tree = {
@@ -326,7 +321,6 @@ def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]
 
 
 def _hull(data: ManoData, name: str, link: int, points: Float[np.ndarray, "points 3"]) -> Primitive:
-    """Convex hull of a body's vertices, in the body's frame."""
     if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(0)) < 3:
         raise HandError(f"{data.path}: weights: the vertices of {name} span no solid")
     hull = limited_hull(points, len(points))
@@ -334,7 +328,6 @@ def _hull(data: ManoData, name: str, link: int, points: Float[np.ndarray, "point
 
 
 def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Mass [kg], centre of mass [m] and inertia about it [kg·m²] of a hull of uniform density."""
     import trimesh
 
     solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)

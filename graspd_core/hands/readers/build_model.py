@@ -92,7 +92,6 @@ def assemble(
 
 
 def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
-    """The fields of a hand that have an entry for each actuated joint."""
     keys = ("lower", "upper", "effort", "velocity")
     limits = {key: np.array([getattr(joint, key) for joint in joints], dtype=float) for key in keys}
     middle = 0.5 * (limits["lower"] + limits["upper"])

@@ -135,7 +135,6 @@ class HandDescription:
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value of YAML is a number that a hand can have."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST <= value <= _LARGEST
 
 

@@ -134,7 +134,6 @@ def _finite(path: Path, joint: JointSpec) -> JointSpec:
 
 
 def _welded(joint: JointSpec, value: float) -> JointSpec:
-    """The joint fixed at a value."""
     fixed = replace(joint, kind="fixed", axis=np.zeros(3))
     if joint.kind == "prismatic":
         return replace(fixed, translation=joint.translation + joint.rotation @ joint.axis * value)

@@ -1,6 +1,4 @@
-"""Geoms of an MJCF file, as MuJoCo has compiled them, as primitives; errors about an element of MuJoCo's.
-
-MJCF to `HandModel`: MuJoCo reads and compiles the file, and what its model says of a hand is taken over.
+"""MJCF to `HandModel`: MuJoCo reads and compiles the file, and what its model says of a hand is taken over.
 
 MuJoCo is given what `read_xml` took, of the sections that say how a hand moves. It opens no file: meshes are read by
 graspd, in more formats, as convex hulls. What would change how the hand moves and is not read is refused by name.
@@ -297,7 +295,6 @@ def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
 
 
 def _reference(parts: _Parts, joint: int) -> float:
-    """The joint's value in which the file draws it [rad] or [m]."""
     return float(parts.model.qpos0[parts.model.jnt_qposadr[joint]])
 
 

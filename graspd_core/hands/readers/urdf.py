@@ -1,6 +1,6 @@
-"""Shapes of a URDF as primitives: boxes, spheres, cylinders and capsules as they are, meshes as convex hulls.
+"""URDF to `HandModel`: what descriptions in use get wrong is mended with a warning or refused by name.
 
-URDF to `HandModel`: what descriptions in use get wrong is mended with a warning or refused by name.
+Boxes, spheres, cylinders and capsules stay as they are; meshes become convex hulls.
 """
 
 from __future__ import annotations
@@ -245,7 +245,6 @@ def _limits(path: Path, joint: ET.Element) -> tuple[float, float, float, float]:
 
 
 def _unset_if_zero(path: Path, limit: ET.Element, key: str) -> float:
-    """A limit that is absent, zero or infinite is a placeholder."""
     if (limit.get(key) or "").strip().lower().lstrip("+") in ("inf", "infinity"):
         return np.inf
     value = float(read_numbers(path, limit, key, 1, "0")[0])

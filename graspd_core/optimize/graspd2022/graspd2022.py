@@ -439,7 +439,6 @@ def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
 
 
 def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
-    """A gradient that is zero for starts that are not finite."""
     if finite.all():
         return gradient
     return torch.where(finite.view(-1, *[1] * (gradient.dim() - 1)), gradient, torch.zeros_like(gradient))

@@ -204,7 +204,6 @@ def reaches_image_border(
 
 
 def _well_within(own: Float[np.ndarray, "own 2"], some: Float[np.ndarray, "some 2"], width: float) -> bool:
-    """Whether no point is within `width` of the hull of all, since none is of the hull of some, which lies within."""
     hull = convex_hull(some)
     return hull is not None and all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in hull.equations)
 

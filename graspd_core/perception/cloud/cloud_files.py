@@ -120,7 +120,6 @@ def read_pcd_points(path: Path) -> Points | None:
 
 
 def _refuse_false_sizes(packed: bytes, needed: int) -> None:
-    """Raise ValueError where compressed points are not what the header says: Open3D would read past their end."""
     size, unpacked = np.frombuffer(packed[:8].ljust(8, b"\0"), "<u4").tolist()
     if unpacked != needed or size > len(packed) - 8 or unpacked > _DENSEST * size:
         there = f"{size} bytes that unpack to {unpacked}, {max(len(packed) - 8, 0)} are there"
@@ -152,7 +151,6 @@ def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
 
 
 def _packed(codes: list[str], places: list[int], sizes: list[int]) -> np.dtype:
-    """Rows whose fields have `sizes` [bytes], and x, y and z of types `codes` at `places`."""
     starts = [sum(sizes[:place]) for place in places]
     return np.dtype({"names": list("xyz"), "formats": codes, "offsets": starts, "itemsize": sum(sizes)})
 

@@ -119,20 +119,17 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
 
 
 def _flat(points: Points) -> bool:
-    """Whether points are of a plane, seen with a camera's noise, and not of a slice of something round."""
     offset = points - points.mean(0)
     return bool(np.linalg.svd(offset, compute_uv=False)[2] < PLANE_NOISE * np.sqrt(len(points)))
 
 
 def _some(points: Points, viewpoint: Vector) -> Float[np.ndarray, "m 3"]:
-    """Measured points, no more than are needed; zeros and the camera's own place are what drivers fill gaps with."""
     # In any order: clouds are often sorted by place, and the first of them would be a part of the scene.
     points = points[np.random.default_rng(0).permutation(len(points))[: 2 * MOST_POINTS]]
     return points[measured(points, viewpoint)][:MOST_POINTS]
 
 
 def _surrounded(ray: Vector, others: Points) -> bool:
-    """Whether no half of the view around a ray is free of the others."""
     first = perpendicular(ray)
     offset = others - ray
     angle = np.sort(np.arctan2(offset @ np.cross(ray, first), offset @ first))
@@ -193,7 +190,6 @@ def _pixels(grid: Pixels) -> tuple[Points, Points]:
 
 
 def _cross_rows(a: Points, b: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "rows columns"]:
-    """Equations of the 3 x m matrix M, row by row, that a x (M b) = 0 asks for."""
     zero = np.zeros_like(b)
     first, second, third = (a[:, [k]] * b for k in range(3))
     rows = ([zero, -third, second], [third, zero, -first], [-second, first, zero])
@@ -201,6 +197,5 @@ def _cross_rows(a: Points, b: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "ro
 
 
 def _null(rows: Float[np.ndarray, "rows columns"]) -> tuple[Float[np.ndarray, "columns"], float]:
-    """The unit vector that comes nearest to solving all equations, and how far ahead of the next it is."""
     _, values, vectors = np.linalg.svd(rows, full_matrices=False)
     return vectors[-1], float(values[-2] / max(values[-1], 1e-12 * values[0]))

@@ -62,7 +62,6 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 def _contradicted(
     points: Points, line: Int[np.ndarray, "n"], lines: int, free_space: FreeSpace
 ) -> Bool[np.ndarray, "lines"]:
-    """Which upright lines of a wall the cameras speak against, from the points of each."""
     wrong = empty_depth(free_space, points) > free_space.slack
     return np.bincount(line, wrong, lines) > MAX_CONTRADICTED_WALL * np.bincount(line, minlength=lines)
 

@@ -68,7 +68,6 @@ def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np
 
 
 def _ways(rotation: Float[np.ndarray, "3 3"]) -> Points:
-    """Unit directions from the object to cameras above it, in the frame of the views."""
     azimuth, elevation = np.meshgrid(2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS, _ELEVATIONS)
     level = np.cos(elevation)
     way = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)

@@ -267,7 +267,6 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
 
 
 def _refuse_far(there: Float[np.ndarray, "points"]) -> None:
-    """Refuse a field that most points do not lie near the zero of; `there` is what it is at them, in cells."""
     near = float((np.abs(there) < 1.0).mean())
     if near < _MIN_NEAR:
         raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
@@ -287,13 +286,11 @@ def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> 
 
 
 def _waves(shape: tuple[int, ...]) -> list[np.ndarray]:
-    """Wave numbers [rad per cell] of a real field's spectrum along each axis, to be broadcast."""
     turns = [np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), np.fft.rfftfreq(shape[2])]
     waves = ((2 * np.pi * turn).astype(np.float32) for turn in turns)
     return list(np.meshgrid(*waves, indexing="ij", sparse=True))
 
 
 def _slope(field: Grid, at: Any, normals: Float[np.ndarray, "points 3"]) -> float:
-    """How much a field grows from cell to cell along the normals: the median over the points."""
     gradient = np.stack([at @ part.ravel() for part in np.gradient(field)], -1)
     return float(np.median((gradient * normals).sum(1)))

@@ -189,7 +189,6 @@ def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[
 
 
 def _some(view: PointCloud, most: int) -> Points:
-    """A view's measured points, some `most` of them at most; where none is, all, for the message that says so."""
     points = view.points[:: 1 + len(view.points) // most].astype(float)
     good = measured(points, view.viewpoint)
     return points[good] if good.any() else points
@@ -245,7 +244,6 @@ def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
 
 
 def _confidence(mesh: TriangleMesh, seen: Points, settings: ReconstructionConfig) -> Float[np.ndarray, "vertices"]:
-    """1 near seen points, less the farther from them."""
     from scipy.spatial import KDTree
 
     far = settings.guessed_distance

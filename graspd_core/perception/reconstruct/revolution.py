@@ -263,7 +263,6 @@ def _foot(rim, way: float, ground: float, step: float) -> Rows:
 
 
 def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpace) -> tuple[np.ndarray, np.ndarray]:
-    """What the cameras confirm of, and how much they speak against, `RING_SAMPLES` places of each row, turned."""
     ring = _ring(rows, axis, right, up, np.full(len(rows), RING_SAMPLES))
     return weigh(free_space, ring.points, ring.normals)
 

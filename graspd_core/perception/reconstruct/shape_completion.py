@@ -105,7 +105,6 @@ def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str,
 
 
 def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
-    """The images in one plane, or in two and in both."""
     images = [image(m, seen) for m in mirrors]
     if len(mirrors) == 2:
         images.append(image(mirrors[1], images[0]))

@@ -157,7 +157,6 @@ def _pick(
 
 
 def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) -> Shares:
-    """How much of the mean normal of what was seen its image cancels; what faces up is the support's to cancel."""
     side = side * np.array([1.0, 1.0, 0.0]) if standing else side
     length = max(float(np.linalg.norm(side)), 1e-9)
     return 1 - np.linalg.norm(side + linear @ side, axis=1) / (2 * length)

@@ -299,7 +299,6 @@ def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, v
 
 
 def _may_stand(piece: Points, other: Float[np.ndarray, "m 3"], support: FlatPart) -> bool:
-    """Whether a piece that ends above the support may be a thing of its own beside the other, its foot hidden."""
     height, top = support.height(piece), float(support.height(other).max())
     level = abs(float(height.max()) - top) <= LEVEL_TOPS_M
     own = np.ptp(height) > SEEN_HEIGHT_SHARE * height.max() or not level
@@ -307,13 +306,11 @@ def _may_stand(piece: Points, other: Float[np.ndarray, "m 3"], support: FlatPart
 
 
 def _touch_in_image(a: Points, b: Float[np.ndarray, "m 3"], eye: Vector, gap: float) -> bool:
-    """Whether a camera there sees less than `gap` between them, at the distance of the nearer one [m]."""
     (one, near), (other, far) = _directions(a, eye), _directions(b, eye)
     return _apart(one, other) <= gap / min(float(np.median(near)), float(np.median(far)))
 
 
 def _directions(points: Points, eye: Vector) -> tuple[Points, Float[np.ndarray, "n"]]:
-    """Unit vectors from a camera to points, and how far they are [m]."""
     away = np.linalg.norm(points - eye, axis=1).clip(1e-6)
     return (points - eye) / away[:, None], away
 
@@ -329,7 +326,6 @@ def _tree(points: Points):
 
 
 def _share_within(small: Points, large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:
-    """Share of a piece that is inside the other's convex outline on the support."""
     hull = convex_hull(large @ support.axes)
     if hull is None:
         return 0.0

@@ -134,7 +134,6 @@ def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: Segmentatio
 
 
 def _tiny(scene: VoxelScene, rows: Int[np.ndarray, "rows"], ground: Ground, settings: SegmentationConfig) -> bool:
-    """Whether a cluster is no larger than noise: a speck, or a bump of the support."""
     points = scene.mean[rows]
     if extent(points) < settings.smallest_object:
         return True

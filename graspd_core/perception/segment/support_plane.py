@@ -109,7 +109,6 @@ def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
 
 
 def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
-    """Whether the surface goes on downwards from the part's edge: a face of a body, or a flat spot on a curved one."""
     height, tolerance = part.height(scene.mean), part.tolerance(scene.mean_distance)
     below = (height < -tolerance) & (height > -EDGE_BAND_TOLERANCES * tolerance)
     below[below] = part.beneath(scene.mean[below], margin)
@@ -148,13 +147,11 @@ def stands_on(
 
 
 def _upright(part: FlatPart, thing: Points, viewpoints: Eyes) -> bool:
-    """Whether all cameras look straight down on a thing."""
     sight = viewpoints - thing.mean(0)
     return bool((sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all())
 
 
 def _clearance(part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"]) -> float:
-    """Between the plane's noise and the lowest point that is seen of a thing [m]."""
     return float((part.height(thing) - part.tolerance(distance)).min())
 
 

@@ -130,7 +130,6 @@ def _masked(scene: VoxelScene, label: Labels, many: int, mask: Bool[np.ndarray, 
 
 
 def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndarray, "things"], least: float) -> Mask:
-    """Things of which at least that share is covered, and the covered part of the others."""
     whole = [k for k in things if share[k] >= least]
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 
