@@ -11,12 +11,12 @@ import torch
 
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import finished, staged
-from graspd_core.optimize.finger_closing import CLOSE_STEPS, make_closing
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, build_problem
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Posture
+from graspd_dataset.finger_closing import CLOSE_STEPS, make_closing
 from graspd_dataset.foreign_grasps import ImportedGrasp
 
 # A joint may be so far beyond its limit [rad] or [m]: limits are rounded differently in other descriptions.

@@ -33,13 +33,13 @@ from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.sharp_features import farthest_first
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, initial_poses_of, problem_of
-from graspd_core.optimize.finger_closing import finger_of, link_gaps, make_closing, sphere_overlap
 from graspd_core.optimize.grasp_postures import ContactSet, find_contacts
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
 from graspd_core.optimize.plan_config import Method
 from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
+from graspd_dataset.finger_closing import finger_of, link_gaps, make_closing, sphere_overlap
 
 
 @dataclass(frozen=True)

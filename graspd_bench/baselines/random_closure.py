@@ -16,12 +16,12 @@ from torch import Tensor
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, allowed_of, problem_of
-from graspd_core.optimize.finger_closing import CLOSE_STEPS, Closing, link_gaps, make_closing
 from graspd_core.optimize.loop import Poses, minimise
 from graspd_core.optimize.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.optimize.plan_config import Method
 from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
+from graspd_dataset.finger_closing import CLOSE_STEPS, Closing, link_gaps, make_closing
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates
-from graspd_core.optimize.finger_closing import Closing, finger_of, link_gaps, make_closing, moved_links
 from graspd_core.optimize.grasp_postures import ContactSet, hand_distance
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, minimise
@@ -43,6 +42,7 @@ from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane, TriangleMesh
+from graspd_dataset.finger_closing import Closing, finger_of, link_gaps, make_closing, moved_links
 
 DOUBLE = torch.float64
 SETTINGS = AnnealingConfig(steps=40, close_steps=20, chains_per_grasp=4.0, directions=64)
