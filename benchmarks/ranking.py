@@ -94,15 +94,15 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
     config = load_preset(preset)
     hand = load_hand(hand_name, candidates=config.problem.fine_candidates)
     scene = thing_scene(source, rng, friction, config.resolution)
-    found = method_row(config.method).plan(PlannerInput(scene, hand, count, variant, config, Hooks()))
-    some = staged(found.problem, hand, found.poses, config)
-    grasps = finished(found.problem, hand, some)
+    task = PlannerInput(scene, hand, count, variant, config, Hooks())
+    some = staged(task.problem, hand, method_row(config.method).plan(task).poses, config)
+    grasps = finished(task.problem, hand, some)
     held = {}
     for trial in ("standard", "hard"):
         protocol = at_friction(PROTOCOLS[trial], friction)
         world = build_world(hand, scene.object, object_parts(scene.object), protocol)
         held[trial] = np.array([hold_trial(world, grasp, protocol).passed for grasp in grasps])
-    figures = ranking_figures(found.problem, some).numpy()
+    figures = ranking_figures(task.problem, some).numpy()
     partial = file.with_suffix(".partial")
     with partial.open("wb") as out:
         np.savez(out, figures=figures, object=source, hand=hand_name, preset=preset, **held)

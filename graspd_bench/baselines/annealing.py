@@ -32,8 +32,9 @@ from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.sharp_features import farthest_first
-from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
 from graspd_core.optimize.grasp_postures import ContactSet, find_contacts
+from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
@@ -366,15 +367,16 @@ def sampled_epsilon(
 def plan(task: PlannerInput) -> PlannerOutput:
     """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
     settings, hooks = task.config.settings, task.hooks
-    problem = problem_of(task)
+    problem = task.problem
     annealing = make_annealing(problem, task.hand, settings, task.seed)
-    starts = initial_poses_of(task, max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)))
+    count, restrictions = max(_FEWEST_CHAINS, round(task.count * settings.chains_per_grasp)), task.restrictions
+    starts = draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, restrictions=restrictions)
     if len(starts.joints) == 0:
-        return PlannerOutput(problem, starts)
+        return PlannerOutput(starts)
     annealed = minimise(annealing, problem, starts, hooks)
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
     if annealed.interrupted == "cancelled" or len(legal) == 0:
-        return PlannerOutput(problem, annealed.poses[legal], annealed.interrupted)
+        return PlannerOutput(annealed.poses[legal], annealed.interrupted)
     # What the deadline cut short is closed all the same: open fingers would be no grasps.
     closing = make_closing(problem, task.hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
@@ -382,7 +384,7 @@ def plan(task: PlannerInput) -> PlannerOutput:
     directions = disturbance_directions(settings.directions, task.seed).to(problem.hand.lower)
     epsilon = sampled_epsilon(problem, contact_set, directions)
     kept = min(len(epsilon), max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
-    return PlannerOutput(problem, closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)
+    return PlannerOutput(closed.poses[epsilon.topk(kept).indices], annealed.interrupted or closed.interrupted)
 
 
 METHOD = Method(__name__, AnnealingConfig, "annealing", "#009E73", "^", 8)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.model import HandModel
-from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, allowed_of, problem_of
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
 from graspd_core.optimize.loop import Poses, minimise
 from graspd_core.optimize.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.optimize.plan_config import Method
@@ -46,10 +46,10 @@ _TOUCHING, _ADVANCES = 0.0003, 60
 def plan(task: PlannerInput) -> PlannerOutput:
     """Closed hands from random sides, `count` tries a round until as many touch; a round cut short gives none."""
     settings, hand, count = task.config.settings, task.hand, task.count
-    problem = problem_of(task)
+    problem = task.problem
     closing = make_closing(problem, hand, settings.close_steps)
     least = min(settings.touching, int(hand.link_group.max()) + 1)
-    tries = allowed_of(task, draw_approaches(problem, hand, count * settings.rounds, task.seed))
+    tries = task.allowed(draw_approaches(problem, hand, count * settings.rounds, task.seed))
     kept, interrupted = tries[torch.arange(0, device=task.device)], ""
     for rows in torch.arange(len(tries.joints), device=task.device).split(count):
         if interrupted or len(kept.joints) >= count or len(rows) == 0:
@@ -60,7 +60,7 @@ def plan(task: PlannerInput) -> PlannerOutput:
             groups = touching_groups(problem, closing, hand, solution.poses, task.config.grasp_stages.touch_reach)
             good = (groups >= least) & clear_of_obstacles(problem, solution.poses)
             kept = join(kept, solution.poses[good])
-    return PlannerOutput(problem, kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
+    return PlannerOutput(kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
 
 
 def join(a: Poses, b: Poses) -> Poses:

@@ -1,13 +1,11 @@
-"""What every method shares: its input and output, the initial poses, and the problem that results are ranked in.
-
-Candidates: draw starts, minimise, make the three postures, rank. No trial is run here.
-"""
+"""Find candidates: draw starts, minimise by a method, make the three postures, rank. No trial is run here."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,7 +14,6 @@ from torch import Tensor
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
 from graspd_core.optimize.grasp_postures import approach_depth, find_contacts, find_pregrasp, self_overlap, squeeze
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses
 from graspd_core.optimize.obstacle_distance import gap_on_the_way
 from graspd_core.optimize.plan_config import PlanConfig, method_row
@@ -26,35 +23,22 @@ from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 
-
-@dataclass(frozen=True)
-class PlannerOutput:
-    """What a method ended with.
-
-    Attributes:
-        problem: scene and hand as tensors, in whose terms the poses are made into grasps.
-        poses: hand poses that the method found, at most a few times as many as asked for, in any order.
-        interrupted: why it ended early: "", "cancelled" or "deadline".
-    """
-
-    problem: Problem
-    poses: Poses
-    interrupted: str = ""
+# A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
+_DEEPEST = 0.0015
+# Poses made into grasps at once. Each takes a megabyte on the way.
+_AT_ONCE = 128
+# Cost of a candidate that would sweep through the object on its way from the retreat: it is tried after all others.
+_KNOCK_COST = 100.0
+# A score that no candidate has.
+_WORST = -1e3
+# Share of the grasps asked for that the ranking expects to hold, below which a method searches again; and how far apart
+# the seeds of two searches are: not those of two rounds.
+_LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
 
 
 @dataclass(frozen=True)
 class PlannerInput:
-    """What a method is asked for.
-
-    Attributes:
-        scene, hand: what is to be grasped by what.
-        count: grasps asked for.
-        seed: of everything that is drawn.
-        config: settings of the run.
-        hooks: how the run is followed and ended.
-        device, dtype: of the tensors.
-        restrictions: what the initial poses must allow.
-    """
+    """What a method is asked for: `count` grasps of the scene's object. `seed` is that of everything that is drawn."""
 
     scene: Scene
     hand: HandModel
@@ -66,42 +50,34 @@ class PlannerInput:
     dtype: torch.dtype = torch.float32
     restrictions: BoundRestrictions = UNRESTRICTED
 
+    @cached_property
+    def problem(self) -> Problem:
+        """Scene and hand as tensors. Every method's poses are made into grasps and ranked in this problem."""
+        scene = self.restrictions.searched(self.scene)
+        return build_problem(
+            scene, self.hand, self.config.problem, seed=self.seed, device=self.device, dtype=self.dtype
+        )
 
-def problem_of(task: PlannerInput) -> Problem:
-    """The problem in which every method's poses are made into grasps and ranked."""
-    scene = task.restrictions.searched(task.scene)
-    return build_problem(scene, task.hand, task.config.problem, seed=task.seed, device=task.device, dtype=task.dtype)
+    def allowed(self, starts: Poses) -> Poses:
+        """Return the initial poses that the restrictions allow, for a method that draws its own."""
+        if not self.restrictions.each:
+            return starts
+        turns = starts.quaternion / starts.quaternion.norm(dim=-1, keepdim=True)
+        given = (values.double().cpu().numpy() for values in (starts.translation, turns, starts.joints))
+        return starts[torch.as_tensor(self.restrictions.starts(*given), device=starts.joints.device)]
 
 
-def initial_poses_of(task: PlannerInput, count: int, fingertips: float = 0.0) -> Poses:
-    """`count` seeded poses on the object's hull; fewer, perhaps none, where the restrictions leave no more.
+@dataclass(frozen=True)
+class PlannerOutput:
+    """What a method ended with.
 
-    A share `fingertips` of them are put there with their fingertips, the others with their palms.
+    Attributes:
+        poses: hand poses that the method found, at most a few times as many as asked for, in any order.
+        interrupted: why it ended early: "", "cancelled" or "deadline".
     """
-    drawn = {"fingertips": fingertips, "restrictions": task.restrictions}
-    return draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, **drawn)
 
-
-def allowed_of(task: PlannerInput, starts: Poses) -> Poses:
-    """Those initial poses that the restrictions allow, for a method that draws its own."""
-    if not task.restrictions.each:
-        return starts
-    turns = starts.quaternion / starts.quaternion.norm(dim=-1, keepdim=True)
-    given = (values.double().cpu().numpy() for values in (starts.translation, turns, starts.joints))
-    return starts[torch.as_tensor(task.restrictions.starts(*given), device=starts.joints.device)]
-
-
-# A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
-_DEEPEST = 0.0015
-# Poses made into grasps at once; each takes a megabyte on the way.
-_AT_ONCE = 128
-# What a candidate pays that would sweep through the object on its way from the retreat: it is tried after all others.
-_KNOCK_COST = 100.0
-# A score that no candidate has.
-_WORST = -1e3
-# Share of the grasps asked for that the ranking expects to hold, below which a method searches again; and how far apart
-# the seeds of two searches are: not those of two rounds.
-_LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
+    poses: Poses
+    interrupted: str = ""
 
 
 @dataclass(frozen=True)
@@ -124,11 +100,10 @@ def find_candidates(
     dtype: torch.dtype = torch.float32,
     restrictions: BoundRestrictions = UNRESTRICTED,
 ) -> Candidates:
-    """Ranked candidates for `count` grasps by `config.method`; fewer where starts were hopeless.
+    """Return ranked candidates for `count` grasps by `config.method`. There are fewer if starts were hopeless.
 
-    Where the ranking expects too few of those asked for to hold, as many starts again are searched from: small, large
-    and long things gain by that, ordinary ones would not.
-    The restrictions shape the starts alone: who asked for them refuses candidates.
+    The search is repeated from as many other starts if the ranking expects too few grasps to hold: small, large and
+    long objects gain by that. Restrictions shape only the starts. Their caller refuses candidates.
     """
     task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
     found = _searched(task)
@@ -141,7 +116,7 @@ def find_candidates(
 
 
 def expected_to_hold(grasps: Sequence[Grasp]) -> float:
-    """How many of the grasps the ranking expects to pass the hold trial."""
+    """Return how many of the grasps the ranking expects to pass the hold trial."""
     return sum(0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps)
 
 
@@ -149,7 +124,7 @@ def _searched(task: PlannerInput) -> Candidates:
     found = method_row(task.config.method).plan(task)
     if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
         return Candidates((), found.interrupted)
-    return Candidates(assemble(found.problem, task.hand, found.poses, task.config, task.hooks.stop), found.interrupted)
+    return Candidates(assemble(task.problem, task.hand, found.poses, task.config, task.hooks.stop), found.interrupted)
 
 
 def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
@@ -159,11 +134,10 @@ def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
 def assemble(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Grasp, ...]:
-    """Three postures and a score for every pose, best first.
+    """Return grasps with three postures and a score, best first.
 
-    Poses without a balanced squeeze are dropped, and those that reach through an obstacle on their way or at its end.
-    How deep fingers press into the object is no reason: some methods press deep, and yet hold, and what cannot come
-    to its pregrasp is refused by a trial before its first step.
+    Poses without a balanced squeeze are dropped, and poses that reach through an obstacle on their way or at its end.
+    Poses whose fingers press deep into the object are kept: some methods press deep and their grasps hold.
     """
     grasps: list[Grasp] = []
     for first in range(0, len(poses.translation), _AT_ONCE):
@@ -174,7 +148,7 @@ def assemble(
 
 
 def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
-    """The grasps of staged poses with their scores, in their order."""
+    """Return the grasps of staged poses with their scores, in the same order."""
     scores = score(problem, some)
     if problem.obstacles is not None:
         ends = (some.opened.translation, some.opened.joints), (some.poses.translation, some.poses.joints)
@@ -187,7 +161,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
 def staged(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> Staged:
-    """Contacts, squeeze, pregrasp and what is known of them, for every pose, for so many as memory is there for."""
+    """Compute contacts, squeeze and pregrasp of every pose. The caller bounds the batch by its memory."""
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)

@@ -1,16 +1,12 @@
-"""Where a hand at rest touches the object, and how deep it lies in itself.
+"""Find the contacts of a hand at rest, and the other two of its postures: pregrasp and squeeze.
 
-The pregrasp: a posture near the grasp from which the hand closes without touching anything on its way.
-
-The squeeze: balanced contact forces, and the joint targets that make them.
-
-Stages by the compiled kernel: same steps as in torch, a row at a time, on as many threads as torch has.
+From the pregrasp the hand closes without touching anything on its way. The squeeze has the joint targets that make
+balanced contact forces. Where the problem can be compiled, the kernel does the same steps as torch, a row at a time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from ctypes import byref
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +20,6 @@ from graspd_core.hands.link_distance import pair_distance, solid_distance
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize import losses
 from graspd_core.optimize.kernel import builds as structs
-from graspd_core.optimize.kernel.builds import call
-from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
 from graspd_core.optimize.loop import Poses, adam_moments, pack
 from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors, obstacle_gaps
 from graspd_core.optimize.problem import OBSTACLE_MARGIN, Problem, hand_forward
@@ -33,11 +27,20 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # Contacts of one link beyond its nearest.
 _SPREAD = 2
+# Shares of the way from pregrasp to grasp that are kept clear.
+_WAY = (0.0, 0.4, 0.8)
+# What a square of travel costs: of joints per radian², of the base per metre².
+_JOINT_COST, _BASE_COST = 0.1, 2e3
+_CONE_EDGES = 8
+# Weights of an even spread of the load and of normal forces that sum to one, against balance.
+_RIDGE, _SUM = 0.5, 10.0
+# Newton's method ends at this squared slope; it takes ten steps at most, but for what is not a number.
+_CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
 
 @dataclass(frozen=True)
 class ContactSet:
-    """Where a batch of hands touches: some slots for every link, of which only the active ones count.
+    """Where a batch of hands touches: some slots for every link, of which only the active slots count.
 
     Attributes:
         link: link of each slot.
@@ -56,7 +59,7 @@ class ContactSet:
 
 @torch.no_grad()
 def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
-    """For every link its nearest candidate, the two that spread that contact farthest, and its nearest sharp point.
+    """Find the contacts of every link: its nearest candidate, two that spread the contact, its nearest sharp point.
 
     Slots within `reach` [m] of the surface are active.
     """
@@ -105,11 +108,14 @@ def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: flo
 def nearest_features(
     problem: Problem, poses: Poses
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """Which sharp point is nearest to every solid of the hand, its signed distance [m], and the gradient of that."""
+    """Return the sharp point nearest to every solid of the hand, its signed distance [m], and its gradient."""
     solids = problem.hand.solids
-    compiled = kernel_problem(problem)
-    if compiled is not None:
-        return nearest_features_compiled(compiled, poses, len(solids.link))
+    if (compiled := problem.compiled) is not None:
+        x = pack(poses).contiguous()
+        pick = torch.zeros((len(x), len(solids.link)), dtype=torch.int32)
+        distance, gradient = x.new_empty(pick.shape), x.new_zeros((*pick.shape, 3))
+        compiled.call("graspd_nearest_features", len(x), x, pick, distance, gradient)
+        return pick.long(), distance, gradient
     links, base = forward(problem.hand.kinematics, poses.joints), poses.base
     in_base = base.apply_inverse(problem.object.features)
     nearest, pick = solid_distance(solids, links, in_base).min(1)
@@ -125,45 +131,52 @@ def nearest_features(
 def self_overlap(
     problem: Problem, joints: Float[Tensor, "batch joints"], adjacent: Bool[Tensor, "links links"]
 ) -> Float[Tensor, "batch"]:
-    """Greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
+    """Return the greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
     if len(problem.hand.solids.link) == 0:
         return joints.new_zeros(len(joints))
-    compiled = kernel_problem(problem)
-    if compiled is not None:
-        return self_overlap_compiled(compiled, joints, ~adjacent[:, problem.hand.solids.link])
+    checked = ~adjacent[:, problem.hand.solids.link]
+    if (compiled := problem.compiled) is not None:
+        joints, checked = joints.contiguous(), checked.to(torch.int32).contiguous()
+        deepest = joints.new_empty(len(joints))
+        compiled.call("graspd_self_overlap", len(joints), joints, checked, deepest)
+        return deepest
     links = forward(problem.hand.kinematics, joints)
     points = place_points(problem.hand.fine.matrix, links)
     depth = -solid_distance(problem.hand.solids, links, points)
-    checked = ~adjacent[problem.hand.fine.links][:, problem.hand.solids.link]
-    return torch.where(checked, depth, 0.0).amax((-1, -2)).clamp_min(0.0)
-
-
-# Shares of the way from pregrasp to grasp that are kept clear.
-_WAY = (0.0, 0.4, 0.8)
+    return torch.where(checked[problem.hand.fine.links], depth, 0.0).amax((-1, -2)).clamp_min(0.0)
 
 
 def find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Poses, Float[Tensor, "batch"]]:
-    """A nearby posture (base shifted, never turned) from which the hand closes without sweeping through the object.
+    """Find a nearby posture, base shifted and never turned, from which the hand closes without sweeping the object.
 
-    Both the posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every
-    candidate is to be (1 − a) times the clearance away from the object, so that all that touch arrive together. All of
-    the way keeps clear of obstacles, where there are any.
+    The posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every candidate
+    is to be (1 − a) times the clearance away from the object, so that all contacts arrive together. The whole way also
+    keeps clear of obstacles.
 
     Returns:
         The postures, and the least distance on the way over what it should be there, one where all is clear.
     """
-    compiled = kernel_problem(problem)
-    if compiled is not None:
-        return find_pregrasp_compiled(compiled, poses, config, stop)
-    return _find_pregrasp(problem, poses, config, stop)
+    if (compiled := problem.compiled) is None:
+        return _find_pregrasp(problem, poses, config, stop)
+    x = pack(poses).contiguous()
+    out, share = x.new_empty(len(x), x.shape[1] - 4), x.new_empty(len(x))
+    settings = structs.Pregrasp(
+        clearance=config.clearance,
+        joint_rate=config.open_joint_rate,
+        base_rate=config.open_base_rate,
+        joint_cost=_JOINT_COST,
+        base_cost=_BASE_COST,
+        steps=config.open_steps,
+    )
+    compiled.call("graspd_find_pregrasps", settings, len(x), x, out, share, watch=lambda _: stop())
+    return Poses(out[:, :3], poses.quaternion, out[:, 3:]), share
 
 
 def _find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
 ) -> tuple[Poses, Float[Tensor, "batch"]]:
-    """`find_pregrasp` in torch."""
     start = torch.cat([poses.translation, poses.joints], -1)
     rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
     rates, cost = _rates_and_costs(problem, config)
@@ -204,13 +217,13 @@ def _find_pregrasp(
 def _rates_and_costs(
     problem: Problem, config: GraspStagesConfig
 ) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
-    """Of base translation and joints: step sizes, and what a square of travel costs."""
+    """Return the step sizes of base translation and joints, and what a square of travel costs."""
     rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), config.open_joint_rate)
     rates[3:] *= problem.hand.joint_scale
     rates[:3] = config.open_base_rate
-    cost = torch.full_like(rates, JOINT_COST)
+    cost = torch.full_like(rates, _JOINT_COST)
     cost[3:] /= problem.hand.joint_scale**2
-    cost[:3] = BASE_COST
+    cost[:3] = _BASE_COST
     return rates, cost
 
 
@@ -226,9 +239,9 @@ def _obstacle_cost(
 
 @torch.no_grad()
 def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Float[Tensor, "batch"]:
-    """How deep the hand is in the object on its straight way from the retreat to the pregrasp [m], zero where clear.
+    """Return how deep the hand is in the object on its straight way from the retreat to the pregrasp [m].
 
-    What a pregrasp itself leaves is not looked at here.
+    The way is clear where this is zero. The pregrasp itself is not looked at.
     """
     rotation = rotation_from_quaternion(pregrasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
@@ -237,16 +250,9 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
 
 
 def hand_distance(problem: Problem, base: SE3, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch points"]:
-    """Signed distance of every contact candidate to the object [m]."""
+    """Return the signed distance of every coarse contact candidate to the object [m]."""
     points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
     return sample_sdf(problem.object.sdf, base.apply(points))[0]
-
-
-_CONE_EDGES = 8
-# Weights of an even spread of the load and of normal forces that sum to one, against balance.
-_RIDGE, _SUM = 0.5, 10.0
-# Newton's method ends at this squared slope; it takes ten steps at most, but for what is not a number.
-_CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
 
 @dataclass(frozen=True)
@@ -267,7 +273,7 @@ class Squeeze:
 def squeeze(
     problem: Problem, poses: Poses, contact_set: ContactSet, effort: Float[Tensor, "joints"], config: GraspStagesConfig
 ) -> Squeeze:
-    """Forces in the friction cones with zero net wrench (non-negative least squares), as joint offsets JᵀF / kp."""
+    """Turn forces in the friction cones with zero net wrench (non-negative least squares) into offsets JᵀF / kp."""
     unit_forces, imbalance = balanced_forces(
         (contact_set.position - problem.object.center).double().cpu().numpy(),
         contact_set.normal.double().cpu().numpy(),
@@ -287,7 +293,7 @@ def squeeze(
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Float[Tensor, "batch joints"]:
-    """τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
+    """Return τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
@@ -306,7 +312,7 @@ def balanced_forces(
     length: float,
     friction: float,
 ) -> tuple[Float[np.ndarray, "batch slots 3"], Float[np.ndarray, "batch"]]:
-    """Contact forces on the object with normal components summing to one and the least net wrench.
+    """Return contact forces on the object with normal components that sum to one and the least net wrench.
 
     Args:
         arms: contact points about the centre of mass [m].
@@ -338,7 +344,7 @@ def balanced_forces(
 def _cone_edges(
     normals: Float[np.ndarray, "batch slots 3"], friction: float
 ) -> Float[np.ndarray, "batch slots edges 3"]:
-    """Forces with a normal component of one along the edges of every contact's friction cone."""
+    """Return forces with a normal component of one along the edges of every contact's friction cone."""
     angles = np.arange(_CONE_EDGES) * 2 * np.pi / _CONE_EDGES
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(-1)])
     first /= np.linalg.norm(first, axis=-1, keepdims=True).clip(1e-12)
@@ -350,7 +356,7 @@ def _cone_edges(
 def _balancing_weights(
     wrenches: Float[np.ndarray, "batch edges 6"], allowed: Bool[np.ndarray, "batch edges"]
 ) -> Float[np.ndarray, "batch edges"]:
-    """The least ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖² of x ≥ 0, exactly.
+    """Minimise ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖² over x ≥ 0, exactly.
 
     With the six wrenches and the sum as rows of G and t = (0, …, 0, 10) the dual has seven unknowns, the residual
     r = t − G x: it is the least of ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r, and x = max(Gᵀr, 0) / ridge². Newton's
@@ -378,49 +384,3 @@ def _balancing_weights(
             step[worse] /= 2
         r = r + step[:, None] * way
     return gain * (g @ r[..., None])[..., 0].clip(0.0)
-
-
-# What a square of travel costs: of joints per radian², of the base per metre².
-JOINT_COST, BASE_COST = 0.1, 2e3
-
-
-def find_pregrasp_compiled(
-    compiled: KernelProblem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
-) -> tuple[Poses, Float[Tensor, "batch"]]:
-    """`find_pregrasp` for the problem as the kernel reads it."""
-    x = pack(poses).contiguous()
-    out, share = x.new_empty(len(x), x.shape[1] - 4), x.new_empty(len(x))
-    settings = structs.Pregrasp(
-        clearance=config.clearance,
-        joint_rate=config.open_joint_rate,
-        base_rate=config.open_base_rate,
-        joint_cost=JOINT_COST,
-        base_cost=BASE_COST,
-        steps=config.open_steps,
-    )
-    arguments = len(x), x.data_ptr(), out.data_ptr(), share.data_ptr(), torch.get_num_threads()
-    call("graspd_find_pregrasps", byref(compiled.struct), byref(settings), *arguments, watch=lambda _: stop())
-    return Poses(out[:, :3], poses.quaternion, out[:, 3:]), share
-
-
-def self_overlap_compiled(
-    compiled: KernelProblem, joints: Float[Tensor, "batch joints"], checked: Bool[Tensor, "links solids"]
-) -> Float[Tensor, "batch"]:
-    """`self_overlap` of the pairs that are `checked`."""
-    joints, asked = joints.contiguous(), checked.to(torch.int32).contiguous()
-    depth = joints.new_empty(len(joints))
-    arguments = len(joints), joints.data_ptr(), asked.data_ptr(), depth.data_ptr(), torch.get_num_threads()
-    call("graspd_self_overlap", byref(compiled.struct), *arguments)
-    return depth
-
-
-def nearest_features_compiled(
-    compiled: KernelProblem, poses: Poses, solids: int
-) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """`nearest_features` for the problem as the kernel reads it."""
-    x = pack(poses).contiguous()
-    pick = torch.zeros((len(x), solids), dtype=torch.int32)
-    distance, gradient = x.new_empty(pick.shape), x.new_zeros((*pick.shape, 3))
-    found = pick.data_ptr(), distance.data_ptr(), gradient.data_ptr()
-    call("graspd_nearest_features", byref(compiled.struct), len(x), x.data_ptr(), *found, torch.get_num_threads())
-    return pick.long(), distance, gradient

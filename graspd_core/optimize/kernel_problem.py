@@ -1,11 +1,12 @@
-"""A problem as the compiled kernel reads it: plain arrays of float32 and int32 in the order that they are read in.
+"""Lay a problem out for the compiled kernel: arrays of float32 and int32 in the order in which the kernel reads them.
 
-The parts of a hand and of an object are laid out once and kept, since most requests come for the same ones.
+The parts of a hand and of an object are laid out once and kept, because most requests come for the same ones.
 """
 
 from __future__ import annotations
 
-from ctypes import Structure, addressof
+from collections.abc import Callable
+from ctypes import Structure, addressof, byref
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -17,7 +18,6 @@ from torch import Tensor
 from graspd_core.hands.kinematics import placed_points
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.optimize.kernel import builds as structs
-from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.optimize.obstacle_distance import ObstacleTensors
 from graspd_core.optimize.problem import (
     FEATURE_PAIRS,
@@ -32,25 +32,26 @@ from graspd_core.optimize.problem import (
 
 # Vectors of the widest target, and floats that it may read past the last that counts.
 _LANES = 16
+Argument = Tensor | Structure | int | float
 _KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
 
 
 @dataclass
 class Arrays:
-    """Arrays that structures point into; they live as long as this."""
+    """Arrays that structures point into. They live as long as this object."""
 
     kept: list[object] = field(default_factory=list)
 
     def floats(self, values: np.ndarray | Tensor) -> int:
-        """Address of the values as float32, aligned for vectors, with a vector of zeros behind."""
+        """Return the address of the values as float32, aligned for vectors, with a vector of zeros behind."""
         return self._keep(values, np.float32)
 
     def ints(self, values: np.ndarray | Tensor) -> int:
-        """Address of the values as int32."""
+        """Return the address of the values as int32."""
         return self._keep(values, np.int32)
 
     def rows(self, columns: np.ndarray, width: int) -> int:
-        """Address of an (n, k) array as k rows of `width` floats."""
+        """Return the address of an (n, k) array as k rows of `width` floats."""
         padded = np.zeros((columns.shape[1], width), dtype=np.float32)
         padded[:, : len(columns)] = columns.T
         return self.floats(padded)
@@ -66,23 +67,49 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class KernelProblem:
-    """What the kernel's functions are called with.
-
-    Attributes:
-        struct: the problem; it points into `arrays`.
-        arrays: its memory.
-    """
+    """A problem in the kernel's memory: `struct` points into `arrays`. Read it from `Problem.compiled`."""
 
     struct: structs.Problem
     arrays: tuple[Arrays, ...]
 
+    def call(self, function: str, *arguments: Argument, watch: Callable[[int], bool] | None = None) -> None:
+        """Call a function of the kernel with the problem, the arguments, and as many threads as torch has.
 
-def kernel_problem(problem: Problem) -> KernelProblem | None:
-    """The problem laid out for the kernel; None where torch evaluates it: no kernel, another device, float64."""
-    field = problem.object.sdf.field
-    fits = field.device.type == "cpu" and field.dtype == torch.float32 and field.numel() < 2**31
-    if not fits or min(field.shape[1:]) < 2 or kernel().library is None:
-        return None
+        Args:
+            function: name of the function.
+            arguments: tensors are passed as addresses of their values and must be contiguous.
+            watch: called from this thread every few milliseconds with the steps done. True ends the call.
+
+        Raises:
+            MemoryError: too little memory for the threads.
+        """
+        failures: list[BaseException] = []
+
+        def poll(done: int) -> int:
+            # An exception, as at Ctrl-C, cannot pass through C++: it ends the call, and is raised afterwards.
+            try:
+                return bool(watch and watch(done))
+            except BaseException as failure:
+                failures.append(failure)
+                return True
+
+        last = () if watch is None else (structs.POLL(poll),)
+        called = getattr(structs.kernel().library, function)
+        status = called(byref(self.struct), *map(_given, arguments), torch.get_num_threads(), *last)
+        if failures:
+            raise failures[0]
+        if status != 0:
+            raise MemoryError(f"{function}: too little memory")
+
+
+def _given(argument: Argument) -> object:
+    if isinstance(argument, Tensor):
+        return argument.data_ptr()
+    return byref(argument) if isinstance(argument, Structure) else argument
+
+
+def kernel_problem(problem: Problem) -> KernelProblem:
+    """Lay a problem out that the kernel can evaluate."""
     hand, hand_arrays = _hand(problem.hand)
     target, object_arrays = _object(problem.object)
     own = Arrays()

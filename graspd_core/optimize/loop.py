@@ -1,14 +1,12 @@
-"""Batches of hand poses, and the rows of numbers that solvers step.
-
-The loop that every solver shares: starts in, best iterates out; stop and deadline are obeyed within a step.
-"""
+"""Run any solver: starts in, best iterates out. Stop and deadline are obeyed within a step."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from functools import partial
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -24,7 +22,7 @@ class Poses:
 
     Attributes:
         translation: base origin in the object frame [m].
-        quaternion: base orientation, wxyz, any non-zero length.
+        quaternion: base orientation, wxyz, of any non-zero length.
         joints: [rad].
     """
 
@@ -42,17 +40,17 @@ class Poses:
 
 
 def pack(poses: Poses) -> Float[Tensor, "batch variables"]:
-    """Rows of translation, quaternion, joints."""
+    """Return rows of translation, quaternion and joints, as solvers step them."""
     return torch.cat([poses.translation, poses.quaternion, poses.joints], -1)
 
 
 def unpack(x: Float[Tensor, "batch variables"]) -> Poses:
-    """Inverse of `pack`."""
+    """Invert `pack`."""
     return Poses(x[:, :3], x[:, 3:7], x[:, 7:])
 
 
 def moved_along(poses: Poses, point: Float[Tensor, "*batch 3"]) -> Poses:
-    """The poses with their translation moved along a vector of the base frame [m]."""
+    """Move the translation of poses along a vector of the base frame [m]."""
     turned = (rotation_from_quaternion(poses.quaternion) @ point[..., None]).squeeze(-1)
     return Poses(poses.translation + turned, poses.quaternion, poses.joints)
 
@@ -64,23 +62,21 @@ _BETA1, _BETA2, _EPSILON = 0.9, 0.98, 1e-8
 
 @runtime_checkable
 class Solver(Protocol[S]):
-    """A frozen value that holds its hyper-parameters; the loop below drives it."""
+    """A frozen value that holds its hyper-parameters. `minimise` runs it for `steps` steps."""
 
     @property
-    def steps(self) -> int:
-        """Number of steps of a full run."""
-        ...
+    def steps(self) -> int: ...
 
     def init(self, problem: Problem, starts: Poses) -> S:
-        """The state before the first step."""
+        """Return the state before the first step."""
         ...
 
     def step(self, problem: Problem, state: S, index: int) -> S:
-        """One step; may drop hopeless starts."""
+        """Return the state after one step, perhaps without hopeless starts."""
         ...
 
     def best(self, state: S) -> tuple[Poses, Float[Tensor, "batch"]]:
-        """Best iterate of each start so far and its loss."""
+        """Return the best iterate of each start so far and its loss."""
         ...
 
 
@@ -93,7 +89,7 @@ class Hooks:
         stop: true ends the run within one step.
         deadline: `time.perf_counter()` value at which the run ends within one step.
         interval: least time between reports [s].
-        watch: called with the best poses so far beside every report; None where nobody looks.
+        watch: called with the best poses so far at every report; None if nobody looks.
     """
 
     report: Callable[[int, int, float], None] = field(default=lambda step, steps, loss: None)
@@ -104,14 +100,14 @@ class Hooks:
 
 
 @dataclass(frozen=True)
-class Solution(Generic[S]):
+class Solution:
     """Where a run ended.
 
     Attributes:
         poses: best iterate of every start that was kept.
-        loss: its loss; infinite where no iterate was finite.
+        loss: its loss, infinite where no iterate was finite.
         steps: steps done.
-        interrupted: why it ended early, empty when it ran to its end: "cancelled" or "deadline".
+        interrupted: why the run ended early: "", "cancelled" or "deadline".
     """
 
     poses: Poses
@@ -120,29 +116,48 @@ class Solution(Generic[S]):
     interrupted: str = ""
 
 
-def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -> Solution[S]:
-    """Run `solver` from `starts`; never raises for numerical trouble, a start that diverges just never improves."""
-    state = solver.init(problem, starts)
-    last_report = -float("inf")
-    done, interrupted = 0, ""
-    while done < solver.steps:
+@dataclass
+class Follow:
+    """Lets the caller's hooks follow a run of so many steps and end it. `reported` is a `time.perf_counter()` value."""
+
+    hooks: Hooks
+    steps: int
+    done: int = 0
+    interrupted: str = ""
+    reported: float = -float("inf")
+
+    def over(self) -> bool:
+        """Ask whether the run is to end, and note why."""
+        if self.hooks.stop():
+            self.interrupted = "cancelled"
+        elif time.perf_counter() >= self.hooks.deadline:
+            self.interrupted = "deadline"
+        return bool(self.interrupted)
+
+    def report(self, done: int, best: Callable[[], tuple[Poses, Float[Tensor, "batch"]]]) -> None:
+        """Report that so many steps are done, if the last report was long ago or all steps are done."""
         now = time.perf_counter()
-        if hooks.stop():
-            interrupted = "cancelled"
-            break
-        if now >= hooks.deadline:
-            interrupted = "deadline"
-            break
-        state = solver.step(problem, state, done)
-        done += 1
-        if now - last_report >= hooks.interval or done == solver.steps:
-            poses, loss = solver.best(state)
-            hooks.report(done, solver.steps, float(loss.min()))
-            if hooks.watch is not None:
-                hooks.watch(poses)
-            last_report = now
-    poses, loss = solver.best(state)
-    return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), done, interrupted)
+        if now - self.reported < self.hooks.interval and done != self.steps:
+            return
+        poses, loss = best()
+        self.hooks.report(done, self.steps, float(loss.min()))
+        if self.hooks.watch is not None:
+            self.hooks.watch(poses)
+        self.reported = now
+
+    def solution(self, poses: Poses, loss: Float[Tensor, "batch"]) -> Solution:
+        """Return where the run ended."""
+        return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), self.done, self.interrupted)
+
+
+def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -> Solution:
+    """Run `solver` from `starts`. A start that diverges never improves. Numerical trouble never raises."""
+    state, follow = solver.init(problem, starts), Follow(hooks, solver.steps)
+    while follow.done < solver.steps and not follow.over():
+        state = solver.step(problem, state, follow.done)
+        follow.done += 1
+        follow.report(follow.done, partial(solver.best, state))
+    return follow.solution(*solver.best(state))
 
 
 def adam_moments(

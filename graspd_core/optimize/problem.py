@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import NamedTuple
+from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -31,10 +31,14 @@ from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.mesh.sharp_features import THIN_WALLED, neighbours_together
 from graspd_core.optimize import losses
+from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.perception.scene import Scene, object_sharp_points, sample_confidence
 from graspd_core.se3 import SE3, rotation_from_quaternion
+
+if TYPE_CHECKING:
+    from graspd_core.optimize.kernel_problem import KernelProblem
 
 # How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
 _REACH_OF_TIPS = 0.1
@@ -269,6 +273,20 @@ class Problem:
     directions: Float[Tensor, "directions 6"]
     friction: float
     obstacles: ObstacleTensors | None = None
+
+    @property
+    def compiled(self) -> KernelProblem | None:
+        """The problem as the kernel reads it. None where torch evaluates it: no kernel, another device, or float64."""
+        field = self.object.sdf.field
+        fits = field.device.type == "cpu" and field.dtype == torch.float32 and field.numel() < 2**31
+        return self._in_kernel if fits and min(field.shape[1:]) > 1 and kernel().library is not None else None
+
+    @cached_property
+    def _in_kernel(self) -> KernelProblem:
+        # That module reads the tensors of this one.
+        from graspd_core.optimize.kernel_problem import kernel_problem
+
+        return kernel_problem(self)
 
 
 class Terms(NamedTuple):

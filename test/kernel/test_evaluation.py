@@ -18,7 +18,7 @@ from graspd_core.optimize.closed_form.closed_form import (
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.kernel import builds
-from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
+from graspd_core.optimize.kernel_problem import KernelProblem
 from graspd_core.optimize.loop import moved_along, pack, unpack
 from graspd_core.optimize.losses import hard_contact
 from graspd_core.optimize.problem import Problem, Terms, build_problem, evaluate, least_distance
@@ -32,9 +32,8 @@ WEIGHTS = LossWeights(3.0, 1.0, 1.0, 1.0, 0.02, 1.0)
 
 
 def compiled_of(problem: Problem) -> KernelProblem:
-    found = kernel_problem(problem)
-    assert found is not None
-    return found
+    assert problem.compiled is not None
+    return problem.compiled
 
 
 def by_torch(problem, x, radius, **look) -> Terms:
@@ -157,12 +156,12 @@ def test_what_is_not_a_number_stays_with_its_row(problem_of, rows_of, bad, where
 
 def test_torch_evaluates_what_the_kernel_does_not(problem_of, monkeypatch):
     problem = problem_of("allegro_right", "box")
-    assert kernel_problem(problem) is not None
+    assert problem.compiled is not None
     grid = problem.object.sdf
     double = replace(problem.object, sdf=grid.to("cpu", torch.float64))
-    assert kernel_problem(replace(problem, object=double)) is None
+    assert replace(problem, object=double).compiled is None
     monkeypatch.setenv("GRASPD_KERNEL", "off")
-    assert kernel_problem(problem) is None
+    assert problem.compiled is None
 
 
 @pytest.mark.parametrize("links", [1, 99])

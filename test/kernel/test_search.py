@@ -11,7 +11,6 @@ import torch
 from graspd_core.optimize.closed_form.closed_form import ClosedForm, minimise_compiled
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, rows_kept
 from graspd_core.optimize.initial_poses import draw_starts
-from graspd_core.optimize.kernel_problem import kernel_problem
 from graspd_core.optimize.loop import Hooks, Poses, Solution, minimise, pack
 
 CONFIG = ClosedFormConfig(explore_steps=12, refine_steps=8, polish_steps=10)
@@ -28,9 +27,8 @@ def starts(hands, scenes) -> Poses:
 
 
 def search(problem, starts, keep: int = 10, config=CONFIG, **hooks) -> Solution:
-    compiled = kernel_problem(problem)
-    assert compiled is not None
-    return minimise_compiled(config, keep, problem, compiled, starts, Hooks(**hooks))
+    assert problem.compiled is not None
+    return minimise_compiled(ClosedForm(config, keep), problem, problem.compiled, starts, Hooks(**hooks))
 
 
 def test_the_first_steps_are_torchs(problem, starts):

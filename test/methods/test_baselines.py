@@ -163,8 +163,12 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
     assert (found.joints <= problem.hand.upper).all()
 
 
+def task_of(scene, hand, **hooks) -> PlannerInput:
+    return PlannerInput(scene, hand, 4, 0, CONFIG, Hooks(**hooks), dtype=DOUBLE)
+
+
 def search(scene, hand, **hooks) -> PlannerOutput:
-    return plan(PlannerInput(scene, hand, 4, 0, CONFIG, Hooks(**hooks), dtype=DOUBLE))
+    return plan(task_of(scene, hand, **hooks))
 
 
 def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
@@ -175,7 +179,7 @@ def test_what_it_finds_touches_reproducibly_and_is_reported(scenes, hand):
     assert (first.interrupted, len(first.poses.joints)) == ("", 8)
     for name in ("translation", "quaternion", "joints"):
         assert torch.equal(getattr(first.poses, name), getattr(again.poses, name))
-    nearest = hand_distance(first.problem, first.poses.base, first.poses.joints).amin(-1)
+    nearest = hand_distance(task_of(scenes["cylinder"], hand).problem, first.poses.base, first.poses.joints).amin(-1)
     # Even so short a run closes most hands onto the object; the hand's 60 points may miss the very spot.
     assert (nearest < 0.005).sum() >= 6
 
@@ -204,17 +208,21 @@ CLOSURE = PlanConfig(
 )
 
 
-def close_at_random(scene, hand, *, count: int = 4, seed: int = 0, config=CLOSURE, **hooks) -> PlannerOutput:
-    return plan_closure(PlannerInput(scene, hand, count, seed, config, Hooks(**hooks), dtype=DOUBLE))
+def closure_task(scene, hand, *, count: int = 4, seed: int = 0, config=CLOSURE, **hooks) -> PlannerInput:
+    return PlannerInput(scene, hand, count, seed, config, Hooks(**hooks), dtype=DOUBLE)
+
+
+def close_at_random(scene, hand, **asked) -> PlannerOutput:
+    return plan_closure(closure_task(scene, hand, **asked))
 
 
 def test_what_it_finds_touches_with_enough_links_and_sinks_nowhere(scenes, hand):
-    found = close_at_random(scenes["cylinder"], hand, count=3)
-    closing = make_closing(found.problem, hand, 30)
+    task = closure_task(scenes["cylinder"], hand, count=3)
+    found, closing = plan_closure(task), make_closing(task.problem, hand, 30)
     assert len(found.poses.joints) == 3
-    assert link_gaps(found.problem, found.poses, closing.sphere_links)[:, 0].min() >= 0
+    assert link_gaps(task.problem, found.poses, closing.sphere_links)[:, 0].min() >= 0
     reach = CLOSURE.grasp_stages.touch_reach
-    assert (touching_groups(found.problem, closing, hand, found.poses, reach) >= 3).all()
+    assert (touching_groups(task.problem, closing, hand, found.poses, reach) >= 3).all()
 
 
 def test_approaches_come_from_all_sides_with_the_palm_facing_the_object(problem_of, hand):
@@ -278,10 +286,10 @@ def test_it_works_with_every_hand(scenes, name):
 def test_obstacles_are_kept_clear_of(hand, scenes):
     scene = scenes["cylinder"]
     low = float(scene.object.mesh.vertices[:, 2].min())
-    found = close_at_random(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), low)), hand, count=3)
-    obstacles = found.problem.obstacles
+    task = closure_task(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), low)), hand, count=3)
+    found, obstacles = plan_closure(task), task.problem.obstacles
     assert obstacles is not None
-    gaps = obstacle_gaps(obstacles, found.poses.base, forward(found.problem.hand.kinematics, found.poses.joints))
+    gaps = obstacle_gaps(obstacles, found.poses.base, forward(task.problem.hand.kinematics, found.poses.joints))
     assert len(gaps) >= 1
     assert gaps.min() >= 0
 

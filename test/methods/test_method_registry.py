@@ -22,8 +22,6 @@ from graspd_core.optimize.candidates import (
     PlannerOutput,
     expected_to_hold,
     find_candidates,
-    initial_poses_of,
-    problem_of,
 )
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
@@ -42,8 +40,8 @@ class DummyConfig:
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    problem = problem_of(task)
-    return PlannerOutput(problem, initial_poses_of(task, task.config.settings.starts))
+    count = task.config.settings.starts
+    return PlannerOutput(draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype))
 
 
 @pytest.fixture

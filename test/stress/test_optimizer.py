@@ -13,7 +13,7 @@ from torch import Tensor
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.optimize.candidates import PlannerInput, assemble, problem_of
+from graspd_core.optimize.candidates import PlannerInput, assemble
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, minimise, pack, unpack
@@ -40,7 +40,7 @@ def scene() -> Scene:
 
 
 def problem(scene: Scene, hand: HandModel, dtype: torch.dtype = torch.float32) -> Problem:
-    return problem_of(PlannerInput(scene, hand, 4, 0, PLAN, Hooks(), dtype=dtype))
+    return PlannerInput(scene, hand, 4, 0, PLAN, Hooks(), dtype=dtype).problem
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,15 @@
-"""Projected Adam on a batch of starts: its state and its step.
-
-The search of `closed_form.ClosedForm` by the compiled kernel: same schedule, same results up to rounding.
-
-Every start is stepped by itself, on as many threads as torch has (`torch.set_num_threads`). A start ends alike on one
-thread and on many, alone and in a batch.
-
-The closed-form relaxation as a solver: projected Adam on all starts, then on those that are not hopeless.
+"""Solve the closed-form relaxation: projected Adam on all starts, then on the starts that are not hopeless.
 
 Coarse to fine: the padding radius and the contact width shrink together while exploring, and stay at their end values
 while refining. The best iterate of each start is judged at the end values only, so that early, padded ones never win.
+
+`ClosedForm` steps in torch. `minimise_compiled` runs the same schedule in the compiled kernel, with the same results up
+to rounding: every start by itself, on as many threads as torch has (`torch.set_num_threads`). There a start ends alike
+on one thread and on many, alone and in a batch.
 """
 
 from __future__ import annotations
 
-import time
-from ctypes import byref
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
@@ -22,14 +17,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, initial_poses_of, problem_of
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights, drop_steps, rows_kept
+from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.kernel import builds as structs
-from graspd_core.optimize.kernel.builds import call
-from graspd_core.optimize.kernel_problem import KernelProblem, kernel_problem
-from graspd_core.optimize.loop import Hooks, Poses, Solution, adam_moments, minimise, moved_along, pack, unpack
+from graspd_core.optimize.kernel_problem import KernelProblem
+from graspd_core.optimize.loop import Follow, Hooks, Poses, Solution, adam_moments, minimise, moved_along, pack, unpack
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.problem import Problem, Terms, evaluate, least_distance
+
+# Share of the step size that is left at the end of the run.
+_FINAL_RATE = 0.05
+# Fewer rows than this are evaluated among copies of the first: products of one to three rows are summed in another
+# order than those of more, and from the last bit of a float32 a start would go another way alone than among others.
+_FEWEST_ROWS = 8
+# However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
+_FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,14 @@ class AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
     def best(self) -> tuple[Poses, Float[Tensor, "batch"]]:
-        """The best iterate of every start and its loss; the last one where none was scored."""
+        """Return the best iterate of every start and its loss, the last iterate if none was scored."""
         scored = torch.isfinite(self.best_loss)
         poses = unpack(torch.where(scored[:, None], self.best_x, self.x))
         return moved_along(poses, -self.pivot), torch.where(scored, self.best_loss, self.loss)
 
 
 def initial_state(problem: Problem, starts: Poses, radius: Float[Tensor, "batch"]) -> AdamState:
-    """The state before the first step, padded by `radius` [m]."""
+    """Return the state before the first step, padded by `radius` [m]."""
     x = pack(moved_along(starts, problem.hand.pivot))
     worst = x.new_full((len(x),), torch.inf)
     pivot = problem.hand.pivot.expand(len(x), 3)
@@ -70,7 +73,7 @@ def initial_state(problem: Problem, starts: Poses, radius: Float[Tensor, "batch"
 def adam_step(
     problem: Problem, state: AdamState, gradient: Tensor, rate: float, count: int, config: ClosedFormConfig
 ) -> AdamState:
-    """One Adam step (Kingma & Ba 2015) with per-variable rates; joints are projected onto their limits."""
+    """Take an Adam step (Kingma & Ba 2015) with per-variable rates, and project joints onto their limits."""
     mean, square, top, root = adam_moments(state.mean, state.square, gradient, count)
     rates = torch.full_like(state.x[0], config.joint_rate)
     rates[:3] = config.translation_rate
@@ -82,129 +85,7 @@ def adam_step(
     return replace(state, x=torch.cat([x[:, :3], quaternion, joints], -1), mean=mean, square=square)
 
 
-def evaluate_compiled(
-    problem: KernelProblem,
-    x: Float[Tensor, "batch variables"],
-    radius: Float[Tensor, "batch"],
-    delta: float,
-    weights: LossWeights,
-    *,
-    fine: bool = False,
-    sharp: bool = False,
-    soft: bool = True,
-) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"], Terms]:
-    """Weighted loss of every row, its gradient, and the terms; the rows are `AdamState.x`."""
-    x, radius = x.contiguous(), radius.contiguous()
-    loss, gradient, terms = torch.empty(len(x)), torch.empty_like(x), torch.empty(len(x), len(Terms._fields))
-    given = byref(problem.struct), byref(structs.Weights(**asdict(weights))), len(x), x.data_ptr(), radius.data_ptr()
-    found = loss.data_ptr(), gradient.data_ptr(), terms.data_ptr()
-    call("graspd_evaluate", *given, delta, fine, sharp, soft, *found, torch.get_num_threads())
-    return loss, gradient, Terms(*terms.T)
-
-
-def least_distance_compiled(problem: KernelProblem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
-    """Least distance of any coarse candidate to the object [m]; the rows are `AdamState.x`."""
-    x = x.contiguous()
-    distance = torch.empty(len(x))
-    arguments = byref(problem.struct), len(x), x.data_ptr(), distance.data_ptr(), torch.get_num_threads()
-    call("graspd_least_distance", *arguments)
-    return distance
-
-
-def minimise_compiled(
-    config: ClosedFormConfig, keep: int, problem: Problem, compiled: KernelProblem, starts: Poses, hooks: Hooks
-) -> Solution[AdamState]:
-    """What `loop.minimise` does with `ClosedForm(config, keep)`, for the problem as the kernel reads it.
-
-    Raises:
-        MemoryError: too little memory for the threads.
-    """
-    x = pack(moved_along(starts, problem.hand.pivot))
-    state = initial_state(problem, starts, least_distance_compiled(compiled, x).clamp(0.0, config.radius_start))
-    steps = config.explore_steps + config.refine_steps + config.polish_steps
-    follow = _Follow(hooks, steps)
-    for begin, end in pairwise(sorted({0, *drop_steps(config), steps})):
-        kept = rows_kept(config, keep, len(state.x), begin)
-        if kept < len(state.x):
-            state = state[state.loss.argsort(stable=True)[:kept]]
-        _run_steps(compiled, config, state, (begin, end), follow)
-    poses, loss = state.best()
-    return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), follow.done, follow.interrupted)
-
-
-@dataclass
-class _Follow:
-    """Lets the caller's hooks follow a run of several calls and end it.
-
-    Attributes:
-        hooks: of the caller.
-        steps: of a full run.
-        done: steps done by all rows.
-        interrupted: "", "cancelled" or "deadline".
-        reported: when, a `time.perf_counter()` value.
-    """
-
-    hooks: Hooks
-    steps: int
-    done: int = 0
-    interrupted: str = ""
-    reported: float = -float("inf")
-
-    def look(self, done: int, state: AdamState) -> bool:
-        """Report that so many steps are done; whether to stop."""
-        now = time.perf_counter()
-        if self.hooks.stop():
-            self.interrupted = "cancelled"
-        elif now >= self.hooks.deadline:
-            self.interrupted = "deadline"
-        elif done > 0 and (now - self.reported >= self.hooks.interval or done == self.steps):
-            self.hooks.report(done, self.steps, float(state.loss.min()))
-            if self.hooks.watch is not None:
-                self.hooks.watch(state.best()[0])
-            self.reported = now
-        return bool(self.interrupted)
-
-
-def _run_steps(
-    compiled: KernelProblem, config: ClosedFormConfig, state: AdamState, span: tuple[int, int], follow: _Follow
-) -> None:
-    """The steps of a span, of every row of the state, in place; returns within milliseconds of an interruption."""
-    begin, end = span
-    rows = len(state.x)
-    if rows == 0 or follow.interrupted or follow.look(begin, state):
-        return
-    pointers = structs.State(**{name: getattr(state, name).data_ptr() for name in structs.names_of(structs.State)})
-    arguments = byref(compiled.struct), byref(_schedule(config)), byref(pointers), rows, begin, end
-    call(
-        "graspd_run_steps",
-        *arguments,
-        torch.get_num_threads(),
-        watch=lambda done: follow.look(min(begin + done // rows, end - 1), state),
-    )
-    if not follow.interrupted:
-        follow.done = end
-        follow.look(end, state)
-
-
-def _schedule(config: ClosedFormConfig) -> structs.Schedule:
-    values = asdict(config)
-    same = {name: values[name] for name in structs.names_of(structs.Schedule) if name in values}
-    weights = {name: structs.Weights(**values[name]) for name in ("weights", "polish_weights")}
-    return structs.Schedule(**same | weights, soft=config.activation == "soft")
-
-
-# Share of the step size that is left at the end of the run.
-_FINAL_RATE = 0.05
-# Fewer rows than this are evaluated among copies of the first: products of one to three rows are summed in another
-# order than those of more, and from the last bit of a float32 a start would go another way alone than among others.
-_FEWEST_ROWS = 8
-
-# However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
-_FEWEST_STARTS, _FEWEST_KEPT = 16, 8
-
-
 def weighted(terms: Terms, weights: LossWeights) -> Float[Tensor, "batch"]:
-    """Weighted sum of the terms that there are."""
     present = {name: value for name, value in terms._asdict().items() if value is not None}
     return sum((getattr(weights, name) * value for name, value in present.items()), torch.zeros(()))
 
@@ -269,7 +150,7 @@ class ClosedForm:
         fine: bool,
         sharp: bool,
     ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"]]:
-        """Loss per start and its gradient; a start whose gradient is not finite stands still."""
+        """Return the loss of every start and its gradient. A start whose gradient is not finite stands still."""
         rows = len(x)
         short = max(0, _FEWEST_ROWS - rows)
         x = torch.cat([x, x[:1].expand(short, -1)]).detach().requires_grad_(True)
@@ -285,19 +166,90 @@ class ClosedForm:
         return loss[:rows], torch.where(finite[:, None], gradient, torch.zeros_like(gradient))[:rows]
 
 
-def plan(task: PlannerInput) -> PlannerOutput:
-    """The closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
-    settings = task.config.settings
-    problem = problem_of(task)
-    starts = initial_poses_of(
-        task, max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp)), settings.fingertip_starts
+def evaluate_compiled(
+    problem: KernelProblem,
+    x: Float[Tensor, "batch variables"],
+    radius: Float[Tensor, "batch"],
+    delta: float,
+    weights: LossWeights,
+    *,
+    fine: bool = False,
+    sharp: bool = False,
+    soft: bool = True,
+) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"], Terms]:
+    """Return the weighted loss of every row of `AdamState.x`, its gradient, and the terms."""
+    x, radius = x.contiguous(), radius.contiguous()
+    loss, gradient, terms = torch.empty(len(x)), torch.empty_like(x), torch.empty(len(x), len(Terms._fields))
+    given = structs.Weights(**asdict(weights)), len(x), x, radius, delta, fine, sharp, soft
+    problem.call("graspd_evaluate", *given, loss, gradient, terms)
+    return loss, gradient, Terms(*terms.T)
+
+
+def least_distance_compiled(problem: KernelProblem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
+    """Return the least distance of any coarse candidate to the object [m], for rows of `AdamState.x`."""
+    x = x.contiguous()
+    distance = torch.empty(len(x))
+    problem.call("graspd_least_distance", len(x), x, distance)
+    return distance
+
+
+def minimise_compiled(
+    solver: ClosedForm, problem: Problem, compiled: KernelProblem, starts: Poses, hooks: Hooks
+) -> Solution:
+    """Run `solver` as `loop.minimise` does, by the kernel. Raises MemoryError: too little memory for the threads."""
+    config, x = solver.config, pack(moved_along(starts, problem.hand.pivot))
+    state = initial_state(problem, starts, least_distance_compiled(compiled, x).clamp(0.0, config.radius_start))
+    follow = Follow(hooks, solver.steps)
+    for begin, end in pairwise(sorted({0, *drop_steps(config), solver.steps})):
+        kept = rows_kept(config, solver.keep, len(state.x), begin)
+        if kept < len(state.x):
+            state = state[state.loss.argsort(stable=True)[:kept]]
+        _run_steps(compiled, config, state, (begin, end), follow)
+    return follow.solution(*state.best())
+
+
+def _run_steps(
+    compiled: KernelProblem, config: ClosedFormConfig, state: AdamState, span: tuple[int, int], follow: Follow
+) -> None:
+    """Do the steps of a span in place, for every row of the state. An interruption ends it within milliseconds."""
+    (begin, end), rows = span, len(state.x)
+
+    def over(done: int) -> bool:
+        if not follow.over() and done > 0:
+            follow.report(done, lambda: (state.best()[0], state.loss))
+        return bool(follow.interrupted)
+
+    if rows == 0 or follow.interrupted or over(begin):
+        return
+    pointers = structs.State(**{name: getattr(state, name).data_ptr() for name in structs.names_of(structs.State)})
+    compiled.call(
+        "graspd_run_steps",
+        *(_schedule(config), pointers, rows, begin, end),
+        watch=lambda done: over(min(begin + done // rows, end - 1)),
     )
+    if not follow.interrupted:
+        follow.done = end
+        over(end)
+
+
+def _schedule(config: ClosedFormConfig) -> structs.Schedule:
+    values = asdict(config)
+    same = {name: values[name] for name in structs.names_of(structs.Schedule) if name in values}
+    weights = {name: structs.Weights(**values[name]) for name in ("weights", "polish_weights")}
+    return structs.Schedule(**same | weights, soft=config.activation == "soft")
+
+
+def plan(task: PlannerInput) -> PlannerOutput:
+    """Run the closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
+    settings, problem = task.config.settings, task.problem
+    count = max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp))
+    drawn = {"fingertips": settings.fingertip_starts, "restrictions": task.restrictions}
+    starts = draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, **drawn)
     if len(starts.joints) == 0:
-        return PlannerOutput(problem, starts)
+        return PlannerOutput(starts)
     solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
-    compiled = kernel_problem(problem)
-    if compiled is None:
+    if (compiled := problem.compiled) is None:
         solution = minimise(solver, problem, starts, task.hooks)
     else:
-        solution = minimise_compiled(settings, solver.keep, problem, compiled, starts, task.hooks)
-    return PlannerOutput(problem, solution.poses[torch.isfinite(solution.loss)], solution.interrupted)
+        solution = minimise_compiled(solver, problem, compiled, starts, task.hooks)
+    return PlannerOutput(solution.poses[torch.isfinite(solution.loss)], solution.interrupted)

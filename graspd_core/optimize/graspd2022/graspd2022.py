@@ -35,7 +35,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize import losses
-from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, allowed_of, initial_poses_of, problem_of
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
 from graspd_core.optimize.graspd2022.contact_dynamics import (
     FreeBody,
     contact_forces,
@@ -45,6 +45,7 @@ from graspd_core.optimize.graspd2022.contact_dynamics import (
     speed_left,
 )
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
+from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Poses, minimise, pack, unpack
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
 from graspd_core.optimize.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward, least_distance
@@ -445,19 +446,21 @@ def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
-    settings, thing = task.config.settings, task.scene.object
-    problem = problem_of(task)
+    """Run Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
+    settings, thing, problem = task.config.settings, task.scene.object, task.problem
     drawn = max(1, round(task.count * settings.initial.starts_per_grasp))
     if settings.initial.kind == "published":
         starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
-        starts = allowed_of(task, starts)
+        starts = task.allowed(starts)
     else:
-        starts = initial_poses_of(task, drawn)
+        restrictions = task.restrictions
+        starts = draw_starts(
+            task.scene, task.hand, drawn, task.seed, task.device, task.dtype, restrictions=restrictions
+        )
     if len(starts.joints) == 0:
-        return PlannerOutput(problem, starts)
+        return PlannerOutput(starts)
     body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
     solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]
     inside = replace(poses, joints=poses.joints.clamp(problem.hand.lower, problem.hand.upper))
-    return PlannerOutput(problem, inside, solution.interrupted)
+    return PlannerOutput(inside, solution.interrupted)

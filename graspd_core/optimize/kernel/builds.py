@@ -1,9 +1,7 @@
-"""The compiled kernel: which of its builds this machine can run, and why there may be none.
+"""Load the build of the compiled kernel that this machine can run, or say why there is none.
 
-`GRASPD_KERNEL` chooses: `off` for torch alone, the name of a build or the path of a library for that one, else the best
-that runs here is taken.
-
-The structures of src/layout.hpp, field by field; `builds.load` compares their sizes.
+`GRASPD_KERNEL` chooses: `off` for torch alone, or the name of a build, or the path of a library. Without it the best
+build that runs here is taken. The structures mirror src/layout.hpp, field by field. `load` compares their sizes.
 """
 
 from __future__ import annotations
@@ -11,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,6 +23,7 @@ BUILDS = {
 }
 POLL = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64)
 _INT, _FLOAT, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
+# What each function takes.
 _ARGUMENTS = {
     "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _INT, _AT, _AT, _AT, _INT],
     "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
@@ -38,13 +36,7 @@ _ARGUMENTS = {
 
 @dataclass(frozen=True)
 class Kernel:
-    """A build of the kernel, or the reason why there is none.
-
-    Attributes:
-        name: of the build, empty without one.
-        library: its functions; None: torch evaluates.
-        reason: why there is none.
-    """
+    """A build of the kernel and its functions. Without a library, torch evaluates and `reason` says why."""
 
     name: str
     library: ctypes.CDLL | None
@@ -52,7 +44,7 @@ class Kernel:
 
 
 def kernel() -> Kernel:
-    """The build that this process uses. Raises ConfigError: GRASPD_KERNEL names none."""
+    """Return the build that this process uses. Raises ConfigError: GRASPD_KERNEL names none."""
     return _kernel(os.environ.get("GRASPD_KERNEL", ""))
 
 
@@ -77,34 +69,8 @@ def _kernel(wanted: str) -> Kernel:
     return Kernel("", None, "; ".join(reasons))
 
 
-def call(function: str, *arguments: object, watch: Callable[[int], bool] | None = None) -> None:
-    """Call a function of `kernel()`.
-
-    Args:
-        watch: called from this thread every few milliseconds with the steps done; true ends the call.
-
-    Raises:
-        MemoryError: too little memory for its threads.
-    """
-    failures: list[BaseException] = []
-
-    def poll(done: int) -> int:
-        # What it raises, as at Ctrl-C, cannot pass through C++: it ends the call, and is raised behind it.
-        try:
-            return bool(watch and watch(done))
-        except BaseException as failure:
-            failures.append(failure)
-            return True
-
-    status = getattr(kernel().library, function)(*arguments, *([] if watch is None else [POLL(poll)]))
-    if failures:
-        raise failures[0]
-    if status != 0:
-        raise MemoryError(f"{function}: too little memory")
-
-
 def load(name: str) -> Kernel:
-    """One build, whether this machine has its instructions or not; without a library where it cannot be loaded."""
+    """Load one build, whether this machine has its instructions or not."""
     paths = sorted(Path(__file__).parent.glob(f"{name}.*so"))
     if not paths:
         return Kernel("", None, "not built; was there a C++ compiler when graspd was installed?")
@@ -126,7 +92,7 @@ def _load(path: Path, name: str) -> Kernel:
 
 
 def _instructions() -> frozenset[str]:
-    """Instruction sets of this machine's processor; empty where they cannot be read."""
+    """Return the instruction sets of this machine's processor, none where they cannot be read."""
     if platform.machine() != "x86_64":
         return frozenset()
     try:
@@ -136,89 +102,68 @@ def _instructions() -> frozenset[str]:
     return frozenset(next((line.split(":")[1] for line in lines if line.startswith("flags")), "").split())
 
 
-_INT_ARRAY, _FLOAT_ARRAY, _POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
-_Fields = list[tuple[str, type]]
-
-
-def _of(kind: type, names: str) -> _Fields:
+def _of(kind: type, names: str) -> list[tuple[str, type]]:
     return [(name, kind) for name in names.split()]
 
 
 class Hand(ctypes.Structure):
-    """Links and joints."""
-
     _fields_ = [
-        *_of(_INT_ARRAY, "links joints groups"),
-        *_of(_POINTER, "parent joint kind constant sine cosine slide axis multiplier shift"),
-        *_of(_POINTER, "lower upper joint_scale pivot reach"),
+        *_of(_INT, "links joints groups"),
+        *_of(_AT, "parent joint kind constant sine cosine slide axis multiplier shift"),
+        *_of(_AT, "lower upper joint_scale pivot reach"),
     ]
 
 
 class Points(ctypes.Structure):
-    """Points fixed to links."""
-
-    _fields_ = [*_of(_INT_ARRAY, "count stride runs"), *_of(_POINTER, "xyz run_start run_link group_start")]
+    _fields_ = [*_of(_INT, "count stride runs"), *_of(_AT, "xyz run_start run_link group_start")]
 
 
 class Grid(ctypes.Structure):
-    """A signed distance field."""
-
     _fields_ = [
-        ("field", _POINTER),
-        *_of(_INT_ARRAY, "nx ny nz"),
-        ("origin", _FLOAT_ARRAY * 3),
-        ("spacing", _FLOAT_ARRAY),
+        ("field", _AT),
+        *_of(_INT, "nx ny nz"),
+        ("origin", _FLOAT * 3),
+        ("spacing", _FLOAT),
     ]
 
 
 class Solids(ctypes.Structure):
-    """Boxes and round solids."""
-
-    _fields_ = [("count", _INT_ARRAY), *_of(_POINTER, "pose core radius round link group")]
+    _fields_ = [("count", _INT), *_of(_AT, "pose core radius round link group")]
 
 
 class Spheres(ctypes.Structure):
-    """Proxy spheres."""
-
-    _fields_ = [("centers", Points), *_of(_POINTER, "radius weight")]
+    _fields_ = [("centers", Points), *_of(_AT, "radius weight")]
 
 
 class Object(ctypes.Structure):
-    """The thing to grasp."""
-
     _fields_ = [
         ("grid", Grid),
-        ("confidence", _POINTER),
-        ("center", _FLOAT_ARRAY * 3),
-        ("length", _FLOAT_ARRAY),
-        ("features", _POINTER),
-        *_of(_INT_ARRAY, "feature_count feature_stride coarse_features"),
+        ("confidence", _AT),
+        ("center", _FLOAT * 3),
+        ("length", _FLOAT),
+        ("features", _AT),
+        *_of(_INT, "feature_count feature_stride coarse_features"),
     ]
 
 
 class Obstacles(ctypes.Structure):
-    """Support and neighbours."""
-
     _fields_ = [
-        *_of(_INT_ARRAY, "grids has_support"),
-        ("grid", _POINTER),
-        ("normal", _FLOAT_ARRAY * 3),
-        *_of(_FLOAT_ARRAY, "offset margin"),
+        *_of(_INT, "grids has_support"),
+        ("grid", _AT),
+        ("normal", _FLOAT * 3),
+        *_of(_FLOAT, "offset margin"),
         ("corners", Points),
         ("spheres", Points),
-        *_of(_POINTER, "corner_radius sphere_radius"),
+        *_of(_AT, "corner_radius sphere_radius"),
     ]
 
 
 class Weights(ctypes.Structure):
-    """Weights of the loss terms, in the order of `closed_form_config.LossWeights`."""
-
-    _fields_ = _of(_FLOAT_ARRAY, "wrench_resistance distance penetration self_collision posture obstacle")
+    # In the order of `closed_form_config.LossWeights`.
+    _fields_ = _of(_FLOAT, "wrench_resistance distance penetration self_collision posture obstacle")
 
 
 class Problem(ctypes.Structure):
-    """All that an evaluation reads."""
-
     _fields_ = [
         ("hand", Hand),
         ("coarse", Points),
@@ -227,33 +172,27 @@ class Problem(ctypes.Structure):
         ("spheres", Spheres),
         ("object", Object),
         ("obstacles", Obstacles),
-        *_of(_INT_ARRAY, "directions task_points feature_pairs"),
-        ("direction", _POINTER),
-        *_of(_FLOAT_ARRAY, "friction sharp_reach"),
+        *_of(_INT, "directions task_points feature_pairs"),
+        ("direction", _AT),
+        *_of(_FLOAT, "friction sharp_reach"),
     ]
 
 
 class Schedule(ctypes.Structure):
-    """How the search steps."""
-
     _fields_ = [
         ("weights", Weights),
         ("polish_weights", Weights),
-        *_of(_FLOAT_ARRAY, "delta_start delta_end radius_start translation_rate rotation_rate joint_rate"),
-        *_of(_INT_ARRAY, "explore_steps refine_steps polish_steps fine_steps soft"),
+        *_of(_FLOAT, "delta_start delta_end radius_start translation_rate rotation_rate joint_rate"),
+        *_of(_INT, "explore_steps refine_steps polish_steps fine_steps soft"),
     ]
 
 
 class State(ctypes.Structure):
-    """Rows of every start."""
-
-    _fields_ = _of(_POINTER, "x mean square radius best_x best_loss loss")
+    _fields_ = _of(_AT, "x mean square radius best_x best_loss loss")
 
 
 class Pregrasp(ctypes.Structure):
-    """How a pregrasp is sought."""
-
-    _fields_ = [*_of(_FLOAT_ARRAY, "clearance joint_rate base_rate joint_cost base_cost"), ("steps", _INT_ARRAY)]
+    _fields_ = [*_of(_FLOAT, "clearance joint_rate base_rate joint_cost base_cost"), ("steps", _INT)]
 
 
 # In the order of `graspd_sizes`.
@@ -261,5 +200,5 @@ STRUCTURES = (Hand, Points, Grid, Solids, Spheres, Object, Obstacles, Weights, P
 
 
 def names_of(structure: type[ctypes.Structure]) -> list[str]:
-    """Names of a structure's fields."""
+    """Return the names of a structure's fields."""
     return [field[0] for field in structure._fields_]
