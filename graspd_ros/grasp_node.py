@@ -12,19 +12,21 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from graspd_msgs.action import SynthesizeGrasps
-from graspd_msgs.msg import GraspRequest
+from graspd_msgs.msg import Grasp, GraspArray, GraspProgress, GraspRequest
 from graspd_msgs.srv import ListHands
+from rclpy.action.server import ActionServer, CancelResponse, RCLError, ServerGoalHandle
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -34,14 +36,13 @@ from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
-from graspd_ros.action_server import GoalServer, SynthesizeMessages
 from graspd_ros.convert import nanoseconds
 from graspd_ros.diagnostics import RECEIVED, health_message, resident_memory
 from graspd_ros.error_codes import RequestError, sentence_of
-from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
 from graspd_ros.inputs.sensor_frames import ImagePairs, SensorFrame, cloud_frame, depth_sensor_frame
-from graspd_ros.inputs.source_registry import SOURCES
-from graspd_ros.inputs.tf_listener import TransformListener
+from graspd_ros.inputs.solids import Thing, changed_things
+from graspd_ros.inputs.tf_listener import TransformListener, heard_robot
 from graspd_ros.outputs.responses import Responses
 from graspd_ros.parameters import LiveSettings, Settings, doubts
 from graspd_ros.request import Listener, Request
@@ -54,6 +55,7 @@ OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline p
 # A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
 REQUEST_DEPTH = 500
 THINGS_DEPTH = 500  # a planning scene is told of in one burst
+RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result; rclpy's 900 keep a lot in memory
 
 
 class GraspNode(Node):
@@ -77,7 +79,7 @@ class GraspNode(Node):
         self._announcing = threading.Lock()
         self._listener = TransformListener(self, TransformBuffer())
         self._pairs = ImagePairs()
-        self._things: Mapping[str, Any] = {}
+        self._things: Mapping[str, Thing] = {}
         self._request_builder = RequestBuilder(
             self._hand.name,
             self._now,
@@ -85,7 +87,7 @@ class GraspNode(Node):
             lambda target, source, at: self._listener.lookup_in_time(target, source, at, self._worker.stopping),
         )
         self._responses = Responses(self, self._hand)
-        self._planner = Planner(self._hand, self._listener.lookup_in_time, self._heard_robot(settings.arm))
+        self._planner = Planner(self._hand, self._listener.lookup_in_time, heard_robot(self, settings.arm))
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )
@@ -96,13 +98,6 @@ class GraspNode(Node):
         self.create_timer(1.0, self._on_diagnostics_due, clock=steady)
         self.create_timer(OVERDUE_PERIOD, self._end_overdue, clock=steady)
         self._worker.start()
-
-    def _heard_robot(self, arm: str) -> str:
-        if not arm:
-            return ""
-        from graspd_ros.inputs.arm_place import heard_robot
-
-        return heard_robot(self, arm)
 
     def _create_inlets(self, collision_objects: str) -> None:
         def listen(kind: type, topic: str, callback: Callable, qos: QoSProfile | int) -> None:
@@ -181,8 +176,6 @@ class GraspNode(Node):
             self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
 
     def _on_collision_object(self, message: Any) -> None:
-        from graspd_ros.inputs.collision_objects import changed_things
-
         try:
             self._things = changed_things(self._things, message)
         except Exception as error:  # whatever the message holds, the executor goes on
@@ -320,3 +313,142 @@ def _collision_object() -> type:
         told = "parameter collision_objects: moveit_msgs/CollisionObject is not installed; install it (docs/moveit.md)"
         raise ConfigError(f"{told} or leave the parameter empty") from None
     return CollisionObject
+
+
+class ActionMessages(Protocol):
+    """What one goal of an action tells its client, in the action's own messages."""
+
+    def progressed(self, message: GraspProgress) -> Any | None: ...
+    def found(self, message: Grasp) -> Any | None: ...
+    def result(self, message: GraspArray) -> Any: ...
+
+
+class SynthesizeMessages:
+    """Those of `~/synthesize`."""
+
+    def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
+        """Each report."""
+        return SynthesizeGrasps.Feedback(progress=message)
+
+    def found(self, message: Grasp) -> None:
+        """Nothing: the answer holds them all."""
+
+    def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
+        """The same as on ~/grasps."""
+        return SynthesizeGrasps.Result(result=message)
+
+
+class GoalServer:
+    """An action server, whose goals go the way of all requests.
+
+    A goal that is refused is accepted and aborted at once, so that its client is told why. Nothing here waits: the
+    worker's word starts and ends a goal, and the executor only carries it out.
+
+    Args:
+        make_messages: what a new goal tells its client.
+        submit: takes a goal's request for a listener; gives the id that the request goes by.
+        cancel: cancels a request by its id; says whether there was one.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        action: Any,
+        name: str,
+        make_messages: Callable[[], ActionMessages],
+        submit: Callable[[Any, Listener], str],
+        cancel: Callable[[str], bool],
+    ) -> None:
+        self._node = node
+        self._make_messages = make_messages
+        self._submit = submit
+        self._cancel = cancel
+        self._ids: dict[bytes, str] = {}
+        deep = QoSProfile(depth=REQUEST_DEPTH)
+        self._server = ActionServer(
+            node,
+            action,
+            name,
+            execute_callback=_no_execution,
+            handle_accepted_callback=self._on_accepted,
+            cancel_callback=self._on_cancel,
+            goal_service_qos_profile=deep,
+            result_service_qos_profile=deep,
+            cancel_service_qos_profile=deep,
+            result_timeout=RESULT_TIMEOUT,
+        )
+
+    def _on_accepted(self, handle: ServerGoalHandle) -> None:
+        key = bytes(handle.goal_id.uuid)
+        goal = Goal(self._node, handle, self._make_messages(), on_end=lambda: self._ids.pop(key, None))
+        self._ids[key] = ""
+        self._ids[key] = self._submit(handle.request, goal)
+
+    def idle(self) -> bool:
+        """Whether every goal has got its end."""
+        return not self._ids
+
+    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        request_id = self._ids.get(bytes(handle.goal_id.uuid))
+        return CancelResponse.ACCEPT if request_id and self._cancel(request_id) else CancelResponse.REJECT
+
+
+class Goal:
+    """A request's listener that tells an action client."""
+
+    def __init__(
+        self, node: Node, handle: ServerGoalHandle, messages: ActionMessages, on_end: Callable[[], object]
+    ) -> None:
+        self._node = node
+        self._messages = messages
+        self._handle = handle
+        self._on_end = on_end
+        self._answer = Future()
+        self._begun = False
+
+    def progressed(self, message: GraspProgress) -> None:
+        """Feedback; the first that is not of waiting tells that the goal is executed."""
+        if message.stage != "queued":
+            self._begin()
+        self._feed(self._messages.progressed(message))
+
+    def found(self, message: Grasp) -> None:
+        """Feedback of those actions that give grasps while others are still tried."""
+        self._begin()
+        self._feed(self._messages.found(message))
+
+    def _feed(self, feedback: Any | None) -> None:
+        if feedback is not None:
+            self._handle.publish_feedback(feedback)
+
+    def ended(self, message: GraspArray) -> None:
+        """The goal's end, and its result."""
+        self._begin()
+        self._answer.set_result(message)
+        if self._node.executor is not None:
+            self._node.executor.wake()  # it looks at the future only when something happens
+
+    def _begin(self) -> None:
+        if not self._begun:
+            self._begun = True
+            try:
+                self._handle.execute(self._conclude)
+            except RCLError:  # its client cancelled it after rclpy had looked for that: the second look finds it
+                self._handle.execute(self._conclude)
+
+    async def _conclude(self, handle: ServerGoalHandle) -> Any:
+        message: GraspArray = await self._answer  # pyright: ignore[reportAssignmentType]
+        try:
+            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+                handle.succeed()
+            elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
+                handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
+            else:
+                handle.abort()
+        finally:
+            self._on_end()
+        return self._messages.result(message)
+
+
+def _no_execution(handle: ServerGoalHandle) -> Any:
+    raise RuntimeError("a goal was executed without its own callback")

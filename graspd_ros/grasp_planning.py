@@ -14,16 +14,16 @@ from grasping_msgs.action import GraspPlanning
 from grasping_msgs.msg import Object
 
 from graspd_core import HandModel, Scene, TriangleMesh, load_scene
+from graspd_core.hands.kinematics import RETREAT
 from graspd_core.runtime.worker_process import run_isolated
+from graspd_core.types import joined
 from graspd_ros.convert import array_of
 from graspd_ros.error_codes import ErrorCode, RequestError
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.solids import bad_message, joined, mesh_shapes, plane_of, primitive_shapes, with_support
+from graspd_ros.inputs.solids import bad_message, mesh_shapes, plane_of, primitive_shapes, with_support
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Listener, Request
-
-RETREAT = 0.1  # metres
 
 
 class PlanningMessages:
@@ -50,13 +50,8 @@ class PlanningMessages:
         """Back along the way that it came: nobody says here where up is."""
         x, y, z = (array_of(message.pregrasp_pose.position) - array_of(message.grasp_pose.position)).tolist()
         back = (x, y, z) if any((x, y, z)) else (0.0, 0.0, 1.0)
-        return moveit_grasp(
-            message,
-            retreat=back,
-            retreat_frame=message.header.frame_id,
-            retreat_distance=RETREAT,
-            effort=self._hand.effort.tolist(),
-        )
+        effort, frame = self._hand.effort.tolist(), message.header.frame_id
+        return moveit_grasp(message, retreat=back, retreat_frame=frame, retreat_distance=RETREAT, effort=effort)
 
 
 def request_from_goal(
@@ -99,5 +94,5 @@ def _load(mesh: TriangleMesh, settings: Settings) -> Scene:
 def _solid(target: Object) -> TriangleMesh:
     """The object's meshes, else its primitives, in the frame of its header."""
     if target.meshes:
-        return joined(mesh_shapes(target.meshes, target.mesh_poses, "object"))
-    return joined(primitive_shapes(target.primitives, target.primitive_poses, "object"))
+        return joined(*mesh_shapes(target.meshes, target.mesh_poses, "object"))
+    return joined(*primitive_shapes(target.primitives, target.primitive_poses, "object"))

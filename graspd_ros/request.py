@@ -18,7 +18,7 @@ from graspd_ros.convert import Matrix
 from graspd_ros.parameters import Settings
 
 if TYPE_CHECKING:
-    from graspd_ros.inputs.collision_objects import Thing
+    from graspd_ros.inputs.solids import Thing
 
 MOST_ID = 128
 # `T_target_source` of two frames; may raise a TransformError.
@@ -54,7 +54,7 @@ class Request:
 
     Attributes:
         id: names the request in every answer.
-        source: name of its source (`source_registry`): mesh, cloud, latest_cloud, views or known.
+        source: name of its source (`SOURCES`): mesh, cloud, latest_cloud, views or known.
         frame: the frame that the results are told in, unless the settings name an output_frame.
         stamp: when the object was as it was given.
         settings: the parameters at the time of the request, with what the request itself asks for.

@@ -23,6 +23,8 @@ from graspd_core.types import Grasp, GraspResult, Outcome, Progress, ProgressHoo
 from graspd_core.verify.robustness import begin_in_thread
 from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
 from graspd_ros.error_codes import bad_request
+from graspd_ros.inputs.solids import among_things
+from graspd_ros.inputs.tf_listener import reach_of
 from graspd_ros.request import FrameLookup, Request
 from graspd_ros.worker import Report, WorkerEnding
 
@@ -188,12 +190,8 @@ class Planner:
             T_out_object = T_out_frame if T_out_object is None else T_out_frame @ T_out_object
         reach: tuple[Reach, ...] = ()
         if request.settings.arm:
-            from graspd_ros.inputs.arm_place import reach_of
-
             reach = (reach_of(request, seen, self._robot_description),)
         if request.things:
-            from graspd_ros.inputs.collision_objects import among_things
-
             request = among_things(request, seen)
         excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
         # What an earlier run found was not asked for these wishes, and an arm or other things may have stood elsewhere.

@@ -24,8 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from graspd_core.cli import build_parser
 from graspd_ros.grasp_node import GraspNode
-from graspd_ros.inputs.request_builder import check_request
-from graspd_ros.inputs.source_registry import source_of
+from graspd_ros.inputs.request_builder import check_request, source_of
 from graspd_ros.parameters import check_parameters
 
 ROOT = Path(__file__).parents[1]

@@ -1,9 +1,12 @@
-"""Shapes of messages: solids and meshes as triangle meshes, and the plane that an object stands on."""
+"""Shapes of messages: solids and meshes, the plane that an object stands on, and things of a planning scene.
+
+The things are obstacles of every later request, as `moveit_msgs/CollisionObject` tells of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +14,15 @@ from geometry_msgs.msg import Pose
 from shape_msgs.msg import Mesh, SolidPrimitive
 from shape_msgs.msg import Plane as PlaneMessage
 
-from graspd_core import Scene, TriangleMesh
+from graspd_core import Scene, SceneConfig, TriangleMesh, with_neighbours
+from graspd_core.config import load_scene_config
+from graspd_core.errors import TransformError
 from graspd_core.types import Plane
 from graspd_ros.convert import Matrix, moved_plane, moved_points, pose_matrix
 from graspd_ros.error_codes import RequestError, bad_request
+from graspd_ros.request import FrameLookup, Request
 
+MOST_THINGS = 1000
 # How many dimensions each kind of solid has in the message.
 _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLINDER: 2, SolidPrimitive.CONE: 2}
 
@@ -28,13 +35,6 @@ def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -
 def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
     """Boxes, spheres, cylinders and cones likewise."""
     return _placed("primitive", _primitive, shapes, poses, owner)
-
-
-def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-    """All parts as one mesh."""
-    before = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = [part.faces + count for part, count in zip(parts, before[:-1], strict=True)]
-    return TriangleMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
 def _placed(
@@ -115,3 +115,86 @@ def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[],
         return replace(scene, support=plane if above else Plane(-plane.normal, -plane.offset))
 
     return loaded
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """A thing of the planning scene.
+
+    Attributes:
+        frame: the frame of its pose.
+        T_frame_thing: its pose.
+        shapes: what it is made of, in its own frame [m].
+    """
+
+    frame: str
+    T_frame_thing: Matrix
+    shapes: tuple[TriangleMesh, ...]
+
+
+def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Thing]:
+    """Return the things by id, as a `moveit_msgs/CollisionObject` leaves them; those given stay as they are.
+
+    Raises RequestError: the message names no thing that is there, or no shape or pose that can be used.
+    """
+    name, owner, operation = message.id, f"collision object {message.id[:128]!r}", message.operation
+    operations = {message.ADD: "ADD", message.REMOVE: "REMOVE", message.APPEND: "APPEND", message.MOVE: "MOVE"}
+    if operation == message.REMOVE and not name:
+        return {}
+    if not name:
+        raise bad_message(owner, "id: empty; every thing needs one, but REMOVE, which then removes all")
+    if operation not in operations:
+        raise bad_message(owner, f"operation: {operation[0]}; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3")
+    there = things.get(name)
+    if there is None and operation in (message.REMOVE, message.MOVE):
+        raise bad_message(owner, f"{operations[operation]}: there is none; there are: {', '.join(things) or 'none'}")
+    if operation == message.REMOVE:
+        return {other: thing for other, thing in things.items() if other != name}
+    if there is None and len(things) >= MOST_THINGS:
+        raise bad_message(owner, f"{MOST_THINGS} things are kept already; REMOVE some")
+    return {**things, name: _changed(there, message, owner)}
+
+
+def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
+    if message.planes:
+        raise bad_message(owner, "planes: not taken, since they have no end; give a box, or the request's surface")
+    shapes = (
+        *primitive_shapes(message.primitives, message.primitive_poses, owner),
+        *mesh_shapes(message.meshes, message.mesh_poses, owner),
+    )
+    # MoveIt too has the appended shapes relative to the pose that the thing has.
+    if message.operation == message.APPEND and there is not None:
+        return replace(there, shapes=(*there.shapes, *shapes))
+    if not message.header.frame_id:
+        raise bad_message(owner, "header.frame_id: empty; name the frame of its pose")
+    frame, T = message.header.frame_id, pose_matrix(message.pose, f"{owner}: pose")
+    if message.operation == message.MOVE and there is not None:
+        if shapes:
+            raise bad_message(owner, "MOVE with shapes; give ADD, or no shapes")
+        return Thing(frame, T, there.shapes)
+    if not shapes:
+        raise bad_message(owner, "no primitives and no meshes; give one of them")
+    return Thing(frame, T, shapes)
+
+
+def among_things(request: Request, lookup: FrameLookup) -> Request:
+    """Return the request whose scene has its `things` about its object; none of its other fields changes.
+
+    `lookup` is of two frames when the object was seen. Raises TransformError: it does not know a thing's frame.
+    """
+    settings, load = request.settings, request.load
+    placed = {name: _thing_shapes(name, thing, request, lookup) for name, thing in request.things.items()}
+
+    def loaded() -> Scene:
+        config = load_scene_config(settings.scene_config) if settings.scene_config else SceneConfig()
+        return with_neighbours(load(), placed, config)
+
+    return replace(request, load=loaded)
+
+
+def _thing_shapes(name: str, thing: Thing, request: Request, lookup: FrameLookup) -> list[TriangleMesh]:
+    try:
+        T = request.to_object(thing.frame, thing.T_frame_thing, lookup)
+    except TransformError as error:
+        raise TransformError(f"collision object {name!r}: {error}") from None
+    return [moved_mesh(shape, T) for shape in thing.shapes]

@@ -1,4 +1,4 @@
-"""Transforms of /tf and /tf_static into a TransformBuffer, and waiting for those that come late.
+"""Transforms of /tf and /tf_static, waiting for those that come late, and where the arm stands that carries the hand.
 
 tf2_msgs comes with ROS, or from `make setup`: without it the node works, and knows no transforms.
 """
@@ -6,21 +6,29 @@ tf2_msgs comes with ROS, or from `make setup`: without it the node works, and kn
 from __future__ import annotations
 
 import time
-from typing import Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TransformStamped
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
-from graspd_core.errors import TransformError
+from graspd_core.errors import ConfigError, TransformError
 from graspd_core.transforms import TransformBuffer
 from graspd_core.types import StopHook
-from graspd_ros.convert import Matrix, matrix_of_transform, nanoseconds
+from graspd_ros.convert import Matrix, matrix_of_transform, nanoseconds, wxyz_of_matrix
+from graspd_ros.request import FrameLookup, Request
+
+if TYPE_CHECKING:
+    from graspd_core import Arm, Reach
 
 TRANSFORM_PATIENCE = 1.0  # seconds that the worker waits for a transform
+ROBOT_PATIENCE = 10.0  # seconds that the start waits for the robot
 _POLL = 0.01  # seconds between two looks at the buffer
 _COMPLAIN_AGAIN = 10.0  # seconds between two log lines about transforms that make no sense
 
@@ -52,13 +60,26 @@ class TransformListener:
         return self._buffer.lookup(target, source, nanoseconds(stamp) or None)
 
     def lookup_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> Matrix:
-        """Return the same for the worker's thread, after waiting for what comes late."""
-        return wait_for_transform(self._buffer, target, source, nanoseconds(stamp) or None, TRANSFORM_PATIENCE, stop)
+        """Return the same, waited for: transforms come later than clouds.
+
+        For a thread other than the executor's, which has to receive them meanwhile. Raises TransformError, what the
+        buffer said last, after `TRANSFORM_PATIENCE` or when `stop` says so.
+        """
+        end = time.monotonic() + TRANSFORM_PATIENCE
+        while True:
+            try:
+                return self.lookup(target, source, stamp)
+            except TransformError:
+                if time.monotonic() >= end or stop():
+                    raise
+            time.sleep(_POLL)
 
     def _take(self, message: Any, static: bool) -> None:
         for transform in message.transforms:
             try:
-                add_transform(self._buffer, transform, static)
+                header, T_parent_child = transform.header, matrix_of_transform(transform.transform)
+                stamp = nanoseconds(header.stamp)
+                self._buffer.add(header.frame_id, transform.child_frame_id, T_parent_child, stamp, static)
             except TransformError as error:
                 self._node.get_logger().warning(str(error), throttle_duration_sec=_COMPLAIN_AGAIN)
 
@@ -67,30 +88,55 @@ class TransformListener:
         self._buffer.clear()
 
 
-def add_transform(buffer: TransformBuffer, transform: TransformStamped, static: bool) -> None:
-    """Put one message into the buffer. Raises TransformError: it makes no sense."""
-    header, T_parent_child = transform.header, matrix_of_transform(transform.transform)
-    buffer.add(header.frame_id, transform.child_frame_id, T_parent_child, nanoseconds(header.stamp), static)
+def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "") -> Reach:
+    """Return the restriction, in the frame of the request's object, whose settings name the arm and its base's frame.
 
-
-def wait_for_transform(
-    buffer: TransformBuffer,
-    target: str,
-    source: str,
-    stamp: int | None,
-    timeout: float,
-    stop: StopHook = lambda: False,
-) -> Matrix:
-    """Return `T_target_source` at `stamp` [ns] (None: the newest), waited for: transforms come later than clouds.
-
-    For a thread other than the executor's, which has to receive them meanwhile. Raises TransformError, what the buffer
-    said last, after `timeout` seconds or when `stop` says so.
+    `lookup` is of two frames when the object was seen, `robot_description` the URDF of a robot that has the arm.
     """
-    end = time.monotonic() + timeout
-    while True:
-        try:
-            return buffer.lookup(target, source, stamp)
-        except TransformError:
-            if time.monotonic() >= end or stop():
-                raise
-        time.sleep(_POLL)
+    from graspd_core import Reach
+
+    settings = request.settings
+    arm = _arm(settings.arm, robot_description)
+    T = request.to_object(settings.arm_base_frame or arm.chain.base_link, np.eye(4), lookup)
+    x, y, z = map(float, T[:3, 3])
+    qw, qx, qy, qz = map(float, wxyz_of_matrix(T))
+    return Reach(arm, (x, y, z), (qw, qx, qy, qz))
+
+
+# What is known of an arm takes a tenth of a second to make, and is kept with it.
+@lru_cache(maxsize=2)
+def _arm(name: str, robot_description: str) -> Arm:
+    from graspd_core import load_arm
+
+    return load_arm(name, robot_description)
+
+
+def heard_robot(node: Node, arm: str) -> str:
+    """Return the URDF on the topic robot_description if an arm is part of that robot; else nothing is waited for.
+
+    To be called at the start, before the node is spun. Raises GraspdError: nothing came in time, or not with the arm.
+    """
+    from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
+
+    if not arm or not from_robot_description(read_arm_file(arm)[1]):
+        return ""
+    heard: list[String] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    topic = node.create_subscription(String, ROBOT_DESCRIPTION, heard.append, latched)
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end = time.monotonic() + ROBOT_PATIENCE
+    while not heard and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.1)  # in short turns, between which signals are handled
+    name = topic.topic_name
+    executor.remove_node(node)
+    executor.shutdown()
+    node.destroy_subscription(topic)
+    if not heard:
+        raise ConfigError(
+            f"parameter arm: {arm} is part of the robot on {name}, where nothing came within {ROBOT_PATIENCE:g} s; "
+            "start robot_state_publisher first, or name a file in urdf"
+        )
+    robot = str(heard[-1].data)
+    _arm(arm, robot)
+    return robot

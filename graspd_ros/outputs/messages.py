@@ -26,6 +26,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_core import HandModel
 from graspd_core.errors import ConfigError
+from graspd_core.hands.kinematics import RETREAT
 from graspd_core.hands.model import Mount, all_joint_names, all_joint_positions
 from graspd_core.types import (
     ArmPath,

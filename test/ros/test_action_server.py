@@ -13,8 +13,8 @@ from rclpy.action.client import ActionClient
 from rclpy.action.server import RCLError
 from rclpy.qos import QoSProfile
 
-from graspd_ros.action_server import Goal as OurGoal
-from graspd_ros.action_server import SynthesizeMessages
+from graspd_ros.grasp_node import Goal as OurGoal
+from graspd_ros.grasp_node import SynthesizeMessages
 
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 FEW = {"num_grasps": 1, "preset": "fast", "time_budget": 100.0}

@@ -25,9 +25,9 @@ from graspd_core.library.known_grasps import known_or_planned
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_ros import known_objects
 from graspd_ros.error_codes import ErrorCode, code_of
-from graspd_ros.inputs import source_registry
-from graspd_ros.inputs.collision_objects import Thing
+from graspd_ros.inputs import request_builder
 from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.inputs.solids import Thing
 from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, Planner
 from graspd_ros.worker import StopHook
@@ -92,7 +92,7 @@ def unread(monkeypatch: pytest.MonkeyPatch) -> None:
     def read(*_: object, **__: object) -> None:
         raise AssertionError("a mesh was read")
 
-    for module in (known_objects, source_registry):
+    for module in (known_objects, request_builder):
         monkeypatch.setattr(module, "run_isolated", read)
 
 

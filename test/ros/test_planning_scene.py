@@ -107,6 +107,6 @@ def test_without_the_messages_the_node_says_so_in_one_line(start_node, monkeypat
 
 
 def test_who_asks_for_no_scene_imports_nothing_of_it():
-    code = "import sys, graspd_ros.grasp_node; print('graspd_ros.inputs.collision_objects' in sys.modules)"
+    code = "import sys, graspd_ros.grasp_node; print('moveit_msgs' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -13,7 +13,7 @@ from graspd_core import load_hand, load_scene
 from graspd_core.arms.arm import arm_links, tip_hand
 from graspd_core.errors import TransformError
 from graspd_ros.convert import matrix_of_posture
-from graspd_ros.inputs.arm_place import reach_of
+from graspd_ros.inputs.tf_listener import reach_of
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
 from graspd_ros.request_planner import Planner

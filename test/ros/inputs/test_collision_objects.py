@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from graspd_core import load_scene
 from graspd_core.errors import GraspdError, TransformError
 from graspd_ros.error_codes import code_of
-from graspd_ros.inputs.collision_objects import MOST_THINGS, Thing, among_things, changed_things
+from graspd_ros.inputs.solids import MOST_THINGS, Thing, among_things, changed_things
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
 

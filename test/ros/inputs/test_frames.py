@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.context import Context
@@ -137,32 +138,6 @@ def test_a_moved_result_is_the_same_grasp_seen_from_elsewhere(where, how, base, 
     assert (found.score, moved.outcome) == (2.0, Outcome.SUCCEEDED)
 
 
-def test_a_transform_that_comes_late_is_waited_for():
-    buffer = TransformBuffer()
-    asked: list[int] = []
-
-    def stop() -> bool:
-        asked.append(1)
-        if len(asked) == 3:  # as the executor's thread would, between two looks
-            buffer.add("world", "camera", matrix((1.0, 0.0, 0.0), Rotation.identity()), 5, static=True)
-        return False
-
-    found = tf_listener.wait_for_transform(buffer, "world", "camera", 5, timeout=1e6, stop=stop)
-    assert found[0, 3] == 1.0
-    assert len(asked) == 3
-
-
-def test_waiting_ends_with_what_is_missing_at_the_timeout_or_when_stopped():
-    buffer = TransformBuffer()
-    buffer.add("world", "base", np.eye(4), 5, static=True)
-    begun = time.monotonic()
-    with pytest.raises(TransformError, match=r"'camera'.*base, world"):
-        tf_listener.wait_for_transform(buffer, "world", "camera", None, timeout=0.1)
-    assert time.monotonic() - begun >= 0.1
-    with pytest.raises(TransformError, match="camera"):
-        tf_listener.wait_for_transform(buffer, "world", "camera", None, timeout=1e6, stop=lambda: True)
-
-
 @pytest.fixture
 def node(monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Node]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -183,6 +158,28 @@ def test_without_tf2_msgs_the_node_says_so_once_and_goes_on(
     assert not listener.available
     assert len(list(node.subscriptions)) == before
     assert "".join(capfd.readouterr()).count("tf2_msgs is not installed") == 1
+
+
+def test_a_transform_that_comes_late_is_waited_for(node: Node, monkeypatch: pytest.MonkeyPatch):
+    buffer, asked, stamp = TransformBuffer(), [], Time(nanosec=5)
+    listener = tf_listener.TransformListener(node, buffer)
+    buffer.add("world", "base", np.eye(4), 5, static=True)
+    with pytest.raises(TransformError, match=r"'camera'.*base, world"):
+        listener.lookup_in_time("world", "camera", Time(), lambda: True)
+
+    def stop() -> bool:
+        asked.append(1)
+        if len(asked) == 3:  # as the executor's thread would, between two looks
+            buffer.add("world", "camera", matrix((1.0, 0.0, 0.0), Rotation.identity()), 5, static=True)
+        return False
+
+    assert listener.lookup_in_time("world", "camera", stamp, stop)[0, 3] == 1.0
+    assert len(asked) == 3
+    begun = time.monotonic()
+    monkeypatch.setattr(tf_listener, "TRANSFORM_PATIENCE", 0.1)
+    with pytest.raises(TransformError, match="'hand'"):
+        listener.lookup_in_time("world", "hand", stamp, lambda: False)
+    assert time.monotonic() - begun >= 0.1
 
 
 @pytest.fixture
@@ -230,18 +227,6 @@ def test_tf_of_another_process_is_heard_and_told_right(node: Node, robot: subpro
     assert "broken" not in buffer.frames()
     with pytest.raises(TransformError, match="known from"):
         buffer.lookup("world", "camera", stamp + 3600 * SECOND)
-
-
-def test_a_message_is_learnt_with_its_stamp_and_a_wrong_one_refused():
-    buffer = TransformBuffer()
-    message = TransformStamped(child_frame_id="camera")
-    message.header.frame_id = "world"
-    message.header.stamp.sec, message.header.stamp.nanosec = 3, 7
-    tf_listener.add_transform(buffer, message, static=False)
-    np.testing.assert_array_equal(buffer.lookup("world", "camera", 3 * SECOND + 7), np.eye(4))
-    message.child_frame_id = ""
-    with pytest.raises(TransformError, match="without a name"):
-        tf_listener.add_transform(buffer, message, static=False)
 
 
 def test_when_time_jumps_back_everything_is_forgotten(node: Node):

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_core.errors import MeshError
-from graspd_ros.inputs.source_registry import MOST_MESH_BYTES, resolve_mesh
+from graspd_ros.inputs.request_builder import MOST_MESH_BYTES, resolve_mesh
 
 
 @pytest.fixture

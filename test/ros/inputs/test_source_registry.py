@@ -12,8 +12,7 @@ from std_msgs.msg import Header
 
 from graspd_core import load_scene
 from graspd_ros.error_codes import ErrorCode, RequestError
-from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.source_registry import SOURCES, Source, SourceInput
+from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder, Source, SourceInput
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
 
