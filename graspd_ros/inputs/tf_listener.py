@@ -116,9 +116,11 @@ def heard_robot(node: Node, arm: str) -> str:
 
     To be called at the start, before the node is spun. Raises GraspdError: nothing came in time, or not with the arm.
     """
+    if not arm:
+        return ""
     from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
 
-    if not arm or not from_robot_description(read_arm_file(arm)[1]):
+    if not from_robot_description(read_arm_file(arm)[1]):
         return ""
     heard: list[String] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
