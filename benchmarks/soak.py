@@ -118,7 +118,7 @@ def soak(folder: Path, seconds: float) -> Record:
 
 
 def _memory(pid: int) -> float:
-    from graspd_ros.diagnostics import resident_memory
+    from graspd_ros.outputs.responses import resident_memory
 
     return resident_memory(pid) / 1e6
 

@@ -62,7 +62,7 @@ assert found.library, found.reason
 print(f"{found.name}, {found.library.graspd_lanes()} floats at once")
 """
 # What ROS is, only the ROS package knows.
-_ROS = "from graspd_ros.ros_command import probe; print(probe())"
+_ROS = "from graspd_ros.node import probe; print(probe())"
 _HANDS = """
 import torch
 torch.set_num_threads(1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
@@ -89,7 +88,7 @@ def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
 
 def matrix_of_pose(pose: Pose) -> Matrix:
     """Return a pose as a matrix. Raises TransformError: not finite, or no rotation."""
-    return _matrix(pose.position, pose.orientation)
+    return matrix_of(array_of(pose.position), wxyz_of(pose.orientation))
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
@@ -113,7 +112,8 @@ def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
 
 def matrix_of_transform(transform: Transform) -> Matrix:
     """Return a transform as a matrix. Raises TransformError: not finite, or no rotation."""
-    return _matrix(transform.translation, transform.rotation)
+    place, turn = transform.translation, transform.rotation
+    return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 
 
 def matrix_of_posture(posture: Posture) -> Matrix:
@@ -140,10 +140,6 @@ def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
-
-
-def _matrix(place: Any, turn: Quaternion) -> Matrix:
-    return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 
 
 def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarray, "n 3"]:

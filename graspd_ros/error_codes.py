@@ -4,17 +4,8 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from graspd_core.errors import (
-    CloudError,
-    ConfigError,
-    FormatError,
-    GraspdError,
-    HandError,
-    MeshError,
-    NoObjectError,
-    ResourceError,
-    TransformError,
-)
+from graspd_core import errors
+from graspd_core.errors import GraspdError
 
 
 class ErrorCode(StrEnum):
@@ -57,14 +48,14 @@ def bad_request(message: str) -> RequestError:
 
 # The first that fits: subclasses stand before their bases.
 _CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
-    (NoObjectError, ErrorCode.NO_OBJECT),
-    (CloudError, ErrorCode.BAD_CLOUD),
-    (MeshError, ErrorCode.BAD_MESH),
-    (TransformError, ErrorCode.NO_TRANSFORM),
-    (HandError, ErrorCode.WRONG_HAND),
-    (ConfigError, ErrorCode.BAD_REQUEST),
-    (FormatError, ErrorCode.BAD_LIBRARY),
-    (ResourceError, ErrorCode.OUT_OF_MEMORY),
+    (errors.NoObjectError, ErrorCode.NO_OBJECT),
+    (errors.CloudError, ErrorCode.BAD_CLOUD),
+    (errors.MeshError, ErrorCode.BAD_MESH),
+    (errors.TransformError, ErrorCode.NO_TRANSFORM),
+    (errors.HandError, ErrorCode.WRONG_HAND),
+    (errors.ConfigError, ErrorCode.BAD_REQUEST),
+    (errors.FormatError, ErrorCode.BAD_LIBRARY),
+    (errors.ResourceError, ErrorCode.OUT_OF_MEMORY),
     (MemoryError, ErrorCode.OUT_OF_MEMORY),
 )
 

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from builtin_interfaces.msg import Time
@@ -37,13 +37,12 @@ from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.convert import nanoseconds
-from graspd_ros.diagnostics import RECEIVED, health_message, resident_memory
 from graspd_ros.error_codes import RequestError, sentence_of
 from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
-from graspd_ros.inputs.sensor_frames import ImagePairs, SensorFrame, cloud_frame, depth_sensor_frame
+from graspd_ros.inputs.sensor_frames import ImagePairs, SensorFrame, Views, cloud_frame, depth_sensor_frame
 from graspd_ros.inputs.solids import Thing, changed_things
 from graspd_ros.inputs.tf_listener import TransformListener, heard_robot
-from graspd_ros.outputs.responses import Responses
+from graspd_ros.outputs.responses import RECEIVED, Responses, health_message, resident_memory
 from graspd_ros.parameters import LiveSettings, Settings, doubts
 from graspd_ros.request import Listener, Request
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
@@ -96,7 +95,8 @@ class GraspNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # health does not stop where simulated time does
         self.create_timer(1.0, self._on_diagnostics_due, clock=steady)
-        self.create_timer(OVERDUE_PERIOD, self._end_overdue, clock=steady)
+        late = lambda request: request.time_left() <= 0  # noqa: E731
+        self.create_timer(OVERDUE_PERIOD, lambda: self._worker.end_waiting(late, overdue()), clock=steady)
         self._worker.start()
 
     def _create_inlets(self, collision_objects: str) -> None:
@@ -208,7 +208,7 @@ class GraspNode(Node):
 
     def _on_reset_views(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = True, f"dropped {len(self._request_builder.views.clouds)} views"
-        self._request_builder.forget_views()
+        self._request_builder.views = Views()
         return response
 
     def _on_diagnostics_due(self) -> None:
@@ -224,9 +224,6 @@ class GraspNode(Node):
             transforms=self._listener.available,
         )
         self._diagnostics.publish(health_message(health, self._now(), resident_memory()))
-
-    def _end_overdue(self) -> None:
-        self._worker.end_waiting(lambda request: request.time_left() <= 0, overdue())
 
     # From messages to the worker.
 
@@ -306,7 +303,6 @@ class GraspNode(Node):
 
 
 def _collision_object() -> type:
-    """The message's type. Raises ConfigError: it is not installed."""
     try:
         from moveit_msgs.msg import CollisionObject
     except ImportError:
@@ -315,26 +311,16 @@ def _collision_object() -> type:
     return CollisionObject
 
 
-class ActionMessages(Protocol):
-    """What one goal of an action tells its client, in the action's own messages."""
-
-    def progressed(self, message: GraspProgress) -> Any | None: ...
-    def found(self, message: Grasp) -> Any | None: ...
-    def result(self, message: GraspArray) -> Any: ...
-
-
 class SynthesizeMessages:
-    """Those of `~/synthesize`."""
+    """What one goal of `~/synthesize` tells its client, in the action's own messages."""
 
     def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
-        """Each report."""
         return SynthesizeGrasps.Feedback(progress=message)
 
     def found(self, message: Grasp) -> None:
         """Nothing: the answer holds them all."""
 
     def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
-        """The same as on ~/grasps."""
         return SynthesizeGrasps.Result(result=message)
 
 
@@ -345,7 +331,7 @@ class GoalServer:
     worker's word starts and ends a goal, and the executor only carries it out.
 
     Args:
-        make_messages: what a new goal tells its client.
+        make_messages: what a new goal tells its client, as `SynthesizeMessages` does.
         submit: takes a goal's request for a listener; gives the id that the request goes by.
         cancel: cancels a request by its id; says whether there was one.
     """
@@ -355,7 +341,7 @@ class GoalServer:
         node: Node,
         action: Any,
         name: str,
-        make_messages: Callable[[], ActionMessages],
+        make_messages: Callable[[], Any],
         submit: Callable[[Any, Listener], str],
         cancel: Callable[[str], bool],
     ) -> None:
@@ -385,7 +371,6 @@ class GoalServer:
         self._ids[key] = self._submit(handle.request, goal)
 
     def idle(self) -> bool:
-        """Whether every goal has got its end."""
         return not self._ids
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
@@ -396,9 +381,7 @@ class GoalServer:
 class Goal:
     """A request's listener that tells an action client."""
 
-    def __init__(
-        self, node: Node, handle: ServerGoalHandle, messages: ActionMessages, on_end: Callable[[], object]
-    ) -> None:
+    def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node
         self._messages = messages
         self._handle = handle

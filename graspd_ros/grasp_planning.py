@@ -37,7 +37,6 @@ class PlanningMessages:
         """Nothing: the action has no word for it."""
 
     def found(self, message: Grasp) -> GraspPlanning.Feedback:
-        """One more."""
         self._found.append(self._grasp(message))
         return GraspPlanning.Feedback(grasps=list(self._found))
 
@@ -55,18 +54,9 @@ class PlanningMessages:
 
 
 def request_from_goal(
-    builder: RequestBuilder,
-    hand: str,
-    request_id: str,
-    settings: Settings,
-    goal: GraspPlanning.Goal,
-    listener: Listener | None = None,
+    builder: RequestBuilder, hand: str, request_id: str, settings: Settings, goal: Any, listener: Listener | None = None
 ) -> Request:
-    """What the worker works off for a goal.
-
-    Raises:
-        GraspdError: the group is no hand of this node, or the object has no shape that can be used.
-    """
+    """Return a goal's request. Raises GraspdError: not this node's hand, or the object has no shape to be used."""
     if goal.group_name not in ("", hand):
         told = f"group_name: {goal.group_name[:128]!r} is no hand here; this node plans for {hand!r}"
         raise RequestError(ErrorCode.WRONG_HAND, told)
@@ -75,7 +65,7 @@ def request_from_goal(
     if target.meshes or target.primitives:
         mesh, header = _solid(target), target.header
         load = with_support(lambda: _load(mesh, settings), plane)
-        return builder.from_loader(request_id, "grasp_planning", header, settings, load, listener)
+        return builder.from_loader(request_id, header, settings, load, listener)
     cluster = target.point_cluster
     if not cluster.data:
         raise bad_message("object", "no meshes, no primitives and no point_cluster; give one of them")
@@ -92,7 +82,6 @@ def _load(mesh: TriangleMesh, settings: Settings) -> Scene:
 
 
 def _solid(target: Object) -> TriangleMesh:
-    """The object's meshes, else its primitives, in the frame of its header."""
     if target.meshes:
         return joined(*mesh_shapes(target.meshes, target.mesh_poses, "object"))
     return joined(*primitive_shapes(target.primitives, target.primitive_poses, "object"))

@@ -69,10 +69,6 @@ def answer_known(
         if len(grasps) >= count:
             return library_result(library, grasps, count, time.perf_counter() - began), None
     scene = request.load()
-    plan |= {
-        "deadline": max(request.time_left(), 1e-3),
-        "count": count,
-        "verify": settings.verify,
-        "restrictions": restrictions,
-    }
+    plan |= {"deadline": max(request.time_left(), 1e-3), "count": count}
+    plan |= {"verify": settings.verify, "restrictions": restrictions}
     return known_or_planned(library, scene, hand, wanted=lambda grasps: unlike(grasps, excluded), **plan), scene

@@ -1,4 +1,4 @@
-"""The process: starts the node, waits for a signal, ends cleanly.
+"""The process: starts the node, waits for a signal, ends cleanly; and what the commands share with it.
 
 Ctrl-C and SIGTERM are handled here instead of by rclpy, from before the slow imports on, so that neither leaves a
 traceback at any time. Once the node runs the main thread only waits, since Python runs signal handlers nowhere else.
@@ -6,6 +6,8 @@ traceback at any time. Once the node runs the main thread only waits, since Pyth
 
 from __future__ import annotations
 
+import argparse
+import importlib.util
 import os
 import signal
 import sys
@@ -13,23 +15,90 @@ import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
-from graspd_core.errors import ConfigError
-from graspd_ros.ros_command import Parser, foreign_rclpy
+from graspd_core.errors import ConfigError, GraspdError
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
     from graspd_ros.grasp_node import GraspNode
 
+EXIT_STOPPED, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
 STOP_TIMEOUT = 2.0  # seconds that a busy worker has to notice that it must stop
 # Seconds that a thread may keep Python from others (5 ms by itself): the executor asks for it several times a message.
 SWITCH_INTERVAL = 0.001
 
-EXIT_STOPPED = 0
-EXIT_FAILED = 1
-EXIT_BAD_INPUT = 2
+
+class Parser(argparse.ArgumentParser):
+    """Raises ConfigError for an option that is not valid."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def run_command(
+    name: str,
+    args: list[str] | None,
+    parse: Callable[[list[str]], argparse.Namespace],
+    work: Callable[[argparse.Namespace, threading.Event], None],
+) -> int:
+    """Run `work` with rclpy initialised until it is done or a signal sets the event; 0 then, 2 for bad input.
+
+    `args` are without the name (None: of this process); `parse` takes those that are not for ROS.
+    """
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args, try_shutdown
+
+    stop = threading.Event()
+    _on_signal(stop.set)
+    arguments = sys.argv if args is None else [name, *args]
+    try:
+        options = parse(remove_ros_args(arguments)[1:])
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        work(options, stop)
+    except GraspdError as error:
+        sys.stderr.write(f"{name}: {error}\n")
+        return EXIT_BAD_INPUT
+    finally:
+        try_shutdown()
+    return EXIT_STOPPED
+
+
+def foreign_rclpy(file: str) -> str:
+    """One line about an rclpy that comes before the environment's own; empty where there is one rclpy only."""
+    own = next((Path(sys.prefix) / "lib").glob("python3*/site-packages/rclpy/__init__.py"), None)
+    if own is None or Path(file).resolve() == own.resolve():
+        return ""
+    where = Path(file).parents[1]
+    return f"rclpy is that of {where}, not this environment's: unset PYTHONPATH, or do not source another ROS"
+
+
+def probe() -> str:
+    """Make and destroy a node; tell the middleware. Raises what rclpy raises where ROS does not work.
+
+    `graspd doctor` asks for it in a process of its own.
+    """
+    spec = importlib.util.find_spec("rclpy")
+    if spec is not None and spec.origin and (told := foreign_rclpy(spec.origin)):
+        raise ImportError(told)
+    import rclpy
+    from geometry_msgs.msg import PoseStamped
+    from graspd_msgs.msg import GraspRequest
+    from rclpy.utilities import get_rmw_implementation_identifier
+    from sensor_msgs.msg import PointCloud2
+
+    rclpy.init()
+    node = rclpy.create_node("graspd_doctor")
+    node.create_publisher(PoseStamped, "~/probe_pose", 1)
+    node.create_publisher(PointCloud2, "~/probe_points", 1)
+    node.create_publisher(GraspRequest, "~/probe_request", 1)
+    node.destroy_node()
+    rclpy.shutdown()
+    return f"{get_rmw_implementation_identifier()}, makes a node"
 
 
 def main(args: list[str] | None = None) -> int:
@@ -82,7 +151,6 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _refuse_arguments(args: list[str]) -> None:
-    """Say what the node takes, where it is asked or is given what is not for ROS. Raises ConfigError."""
     told = "Grasps of objects that are asked for over ROS 2; its parameters are in config/graspd.yaml."
     parser = Parser(prog="graspd_node", usage="graspd_node [--ros-args -p NAME:=VALUE ...]", description=told)
     parser.parse_args(args[: args.index("--ros-args")] if "--ros-args" in args else args)
@@ -119,7 +187,6 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown
 
-    from graspd_core.errors import GraspdError
     from graspd_ros.grasp_node import GraspNode
 
     try:

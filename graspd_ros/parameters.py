@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, FormatError
-from graspd_ros.outputs.markers import GEOMETRIES, PARTS, USUAL_PARTS
+from graspd_ros.outputs.messages import GEOMETRIES, PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
@@ -39,13 +39,9 @@ def _setting(
     check: Callable[[Any], object] | None = None,
     read_only: bool = False,
 ) -> Any:
-    metadata = {
-        "description": description,
-        "range": None if low is None else (low, high),
-        "choices": tuple(choices),
-        "check": check,
-        "read_only": read_only,
-    }
+    limits = None if low is None else (low, high)
+    metadata = {"description": description, "range": limits, "choices": tuple(choices)}
+    metadata |= {"check": check, "read_only": read_only}
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -203,23 +199,16 @@ class Settings:
 
 
 class LiveSettings:
-    """A node's parameters as settings, read anew when one of them changes.
+    """A node's parameters as settings, in `now`, read anew when one of them changes.
 
-    Attributes:
-        now: the settings as they are.
-
-    Raises:
-        ConfigError: a value given at the start is not a valid choice.
-        rclpy.exceptions.ParameterException: a value of the wrong type or out of range.
+    Raises ConfigError: a value given at the start is not a valid choice; rclpy's ParameterException: of the wrong type
+    or out of range.
     """
 
     def __init__(self, node: Node) -> None:
-        fields = dataclasses.fields(Settings)
+        fields, defaults = dataclasses.fields(Settings), Settings()
         for setting in fields:
-            default = setting.default
-            if setting.default_factory is not dataclasses.MISSING:
-                default = setting.default_factory()
-            node.declare_parameter(setting.name, default, _descriptor(setting))
+            node.declare_parameter(setting.name, getattr(defaults, setting.name), _descriptor(setting))
         for setting in fields:
             _check_value(setting.name, node.get_parameter(setting.name).value)
         self._node = node
@@ -301,7 +290,6 @@ def _is_number_like(value: Any) -> bool:
 
 
 def _numbers(values: Any) -> TypeGuard[list[float]]:
-    """Whether it is an array of numbers, as ROS gives it."""
     return isinstance(values, list | tuple | array.array) and all(_is_number_like(value) for value in values)
 
 
@@ -316,7 +304,7 @@ def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
     )
     if setting.metadata["range"] is not None:
         low, high = setting.metadata["range"]
-        if isinstance(setting.default, float):
+        if _is_number(setting):
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
         else:
             descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]

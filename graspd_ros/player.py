@@ -17,7 +17,7 @@ from typing import Any
 from graspd_core.errors import BagError, ConfigError
 from graspd_core.io.bags import BagTopic, bag_topics, read_raw
 from graspd_core.transforms import SECOND
-from graspd_ros.ros_command import Parser, run_command
+from graspd_ros.node import Parser, run_command
 
 DEPTH = 10
 SETTLE = 0.3  # seconds after a match in which the first messages could still be lost

@@ -35,12 +35,9 @@ class Listener(Protocol):
 
 @dataclass(frozen=True)
 class KnownObject:
-    """An object as a request names it.
+    """An object by its name in the library or, where that is empty, by the path of its mesh file.
 
-    Attributes:
-        name: what the library calls it; empty: `path` is meant.
-        path: of its mesh file.
-        required: whether a library must know it.
+    `required` says whether a library must know it.
     """
 
     name: str
@@ -53,7 +50,6 @@ class Request:
     """One object to grasp.
 
     Attributes:
-        id: names the request in every answer.
         source: name of its source (`SOURCES`): mesh, cloud, latest_cloud, views or known.
         frame: the frame that the results are told in, unless the settings name an output_frame.
         stamp: when the object was as it was given.
@@ -97,7 +93,6 @@ class Request:
 
     @property
     def frame_out(self) -> str:
-        """The frame that the results are told in."""
         return self.settings.output_frame or self.frame
 
     def elapsed(self) -> float:
@@ -109,12 +104,9 @@ class Request:
         return self.settings.deadline - self.elapsed()
 
     def to_object(self, frame: str, T: Matrix, lookup: FrameLookup) -> Matrix:
-        """Return a pose of another frame in the object's own frame. Raises TransformError: as the look-up.
+        """Return a pose of another frame (empty: the request's) in the object's own. Raises TransformError.
 
-        Args:
-            frame: the frame of the pose; empty: that of the request.
-            T: the pose.
-            lookup: is asked only if the frame is another one than the request's.
+        `lookup` is asked only if the frame is another one than the request's.
         """
         placed = T if frame in ("", self.frame) else lookup(self.frame, frame) @ T
         return placed if self.T_frame_object is None else np.linalg.inv(self.T_frame_object) @ placed

@@ -209,12 +209,7 @@ class Planner:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _search(
-        self,
-        request: Request,
-        excluded: list[Matrix],
-        reach: tuple[Reach, ...],
-        stop: StopHook,
-        tell: ProgressHook,
+        self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, tell: ProgressHook
     ) -> tuple[GraspResult, str]:
         """A run, without grasps like those excluded, and the file that it was written to."""
         settings = request.settings
@@ -230,15 +225,9 @@ class Planner:
             result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
         else:
             scene = request.load()
-            result = plan_grasps(
-                scene,
-                self._hand,
-                count=settings.num_grasps + len(excluded),
-                verify=settings.verify,
-                deadline=max(request.time_left(), 1e-3),
-                restrictions=restrictions,
-                **plan,
-            )
+            plan |= {"deadline": max(request.time_left(), 1e-3), "restrictions": restrictions}
+            count = settings.num_grasps + len(excluded)
+            result = plan_grasps(scene, self._hand, count=count, verify=settings.verify, **plan)
         if excluded:
             result = without(result, excluded, settings.num_grasps)
         if not settings.output_dir or stop():
@@ -252,7 +241,6 @@ class Planner:
 
 
 def _ended(work: Future[Any], over: StopHook) -> bool:
-    """Wait for the end of work. False if `over` says so before."""
     while not wait([work], timeout=_POLL).done:
         if over():
             return work.done()
@@ -260,7 +248,6 @@ def _ended(work: Future[Any], over: StopHook) -> bool:
 
 
 def _placed(progress: Progress, T_out_object: Matrix | None) -> Progress:
-    """A report whose grasp is in the frame that the results are told in."""
     if progress.found is None or T_out_object is None:
         return progress
     return replace(progress, found=moved_grasp(progress.found, T_out_object))

@@ -15,7 +15,7 @@ import numpy as np
 
 from graspd_core.errors import GraspdError, HandError
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
-from graspd_ros.ros_command import Parser, run_command
+from graspd_ros.node import Parser, run_command
 
 
 def main(args: list[str] | None = None) -> int:
@@ -55,12 +55,9 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
 
 
 class Follower:
-    """Subscriptions of one node, whose newest answer a viewer shows.
+    """Subscriptions of the node `name`, whose newest answer a viewer shows.
 
     Args:
-        node: that subscribes.
-        viewer: that shows.
-        name: of the node to follow.
         scene: the object in the frame of the answers, where it is known.
         hand: a name or a path, instead of the one that answers name.
     """
@@ -121,7 +118,6 @@ class Follower:
 
 @lru_cache(maxsize=4)
 def _hand(name: str, *, named_by_message: bool) -> Any:
-    """A hand; a message may name one, but no path. Raises HandError."""
     from graspd_core import hand_names, load_hand
 
     if named_by_message and name not in hand_names():

@@ -64,10 +64,6 @@ class Admission:
     reason: str = ""
     ahead: int = 0
 
-    @property
-    def accepted(self) -> bool:
-        return self.refusal is None
-
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
@@ -111,7 +107,6 @@ class Worker(Generic[R, V]):
         self._thread = threading.Thread(target=self._loop, name="graspd_worker", daemon=True)
 
     def start(self) -> None:
-        """Start the thread; requests may be submitted before."""
         self._thread.start()
 
     def submit(self, request: R, policy: BusyPolicy) -> Admission:
@@ -182,7 +177,6 @@ class Worker(Generic[R, V]):
             return running, len(self._waiting)
 
     def alive(self) -> bool:
-        """Whether the thread still serves."""
         return self._thread.is_alive()
 
     def stopping(self) -> bool:

@@ -36,8 +36,6 @@ SHARED_NODE = {
     for name in (
         "outputs/test_messages",
         "test_action_server",
-        "test_client_example",
-        "test_faults",
         "test_hostile",
         "test_node",
         "test_node_process",

@@ -53,8 +53,6 @@ class RequestBuilder:
     Used by the executor's thread only. Frames and views are immutable, so that requests may hold on to them.
 
     Args:
-        hand: name of the hand that the node plans for.
-        now: the node's clock.
         lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
         lookup_in_time: the same for the worker's thread; waits for what comes late. None: as `lookup`.
     """
@@ -66,8 +64,8 @@ class RequestBuilder:
         self.views = Views()
         self._hand = hand
         self._now = now
-        self._lookup = lookup
-        self._lookup_in_time = lookup_in_time or lookup
+        self.lookup = lookup
+        self.lookup_in_time = lookup_in_time or lookup
         self._numbers = itertools.count(1)
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
@@ -77,18 +75,13 @@ class RequestBuilder:
 
     def forget(self) -> None:
         """Drop the newest frame and the views."""
-        self.newest = None
-        self.forget_views()
-
-    def forget_views(self) -> None:
-        """Drop the views."""
-        self.views = Views()
+        self.newest, self.views = None, Views()
 
     def add_view(self, settings: Settings) -> None:
         """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
         frame = latest_frame(self.newest, nanoseconds(self._now()), settings)
-        cloud = seen.seen_by_camera(frame, place_of(settings), self._lookup, alone=not settings.segment)
-        self.views = self.views.add(frame, cloud, settings, self._lookup)
+        cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup, alone=not settings.segment)
+        self.views = self.views.add(frame, cloud, settings, self.lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
         """Return the request for a mesh named by its path alone. Raises MeshError."""
@@ -112,56 +105,32 @@ class RequestBuilder:
         check_request(message, self._hand)
         settings = settings_of(message, settings)
         source = source_of(message)
-        given = SourceInput(
-            request_id=request_id,
-            source=source.name,
-            message=message,
-            settings=settings,
-            listener=listener,
-            newest=self.newest,
-            views=self.views,
-            now=self._now(),
-            lookup=self._lookup,
-            lookup_in_time=self._lookup_in_time,
-        )
+        given = SourceInput(request_id, source.name, message, settings, listener, self._now(), self)
         request = source.find(given)
-        return replace(
-            request,
-            steering=self._steering(message, request),
-            exclude=tuple(message.exclude),
-            exclude_poses=tuple(
-                (stamped.header.frame_id, pose_matrix(stamped.pose, "exclude_poses"))
-                for stamped in message.exclude_poses
-            ),
-        )
+        steering, exclude = self._steering(message, request), tuple(message.exclude)
+        lost = [(told.header.frame_id, pose_matrix(told.pose, "exclude_poses")) for told in message.exclude_poses]
+        return replace(request, steering=steering, exclude=exclude, exclude_poses=tuple(lost))
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
         """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
-        if not asks_for_any(message):
+        if not _asks_for_any(message):
             return None
         stamp, shown = message.header.stamp, request.shown
-        T_object_header = request.to_object(
-            message.header.frame_id, np.eye(4), lambda target, source: self._lookup(target, source, stamp)
-        )
-        steering = steering_of(message, T_object_header)
+        lookup = lambda target, source: self.lookup(target, source, stamp)  # noqa: E731
+        steering = steering_of(message, request.to_object(message.header.frame_id, np.eye(4), lookup))
         if not message.region_mask.height or shown is None:
             return lambda: steering
         return lambda: replace(steering, region=NearPoints(shown()))
 
     def from_loader(
-        self,
-        request_id: str,
-        source: str,
-        header: Header,
-        settings: Settings,
-        load: Callable[[], Scene],
-        listener: Listener | None,
+        self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
     ) -> Request:
-        """Return the request for an object in the frame of a header; an empty one is `mesh_frame`."""
+        """Return the request for the object of a GraspPlanning in the frame of a header; empty: `mesh_frame`."""
         timeless = nanoseconds(header.stamp) == 0
         stamp = self._now() if timeless else header.stamp
         frame = header.frame_id or settings.mesh_frame
-        return Request(request_id, source, frame, stamp, settings, load, listener=listener, timeless=timeless)
+        more = {"listener": listener, "timeless": timeless}
+        return Request(request_id, "grasp_planning", frame, stamp, settings, load, **more)
 
     def from_cluster(
         self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
@@ -169,32 +138,27 @@ class RequestBuilder:
         """Return the request for a cloud that shows one object. Raises RequestError: it is too large or too old."""
         frame = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
         load = self._frame_loader(settings, frame)
-        return self.from_loader(request_id, "grasp_planning", header, settings, load, listener)
+        return self.from_loader(request_id, header, settings, load, listener)
 
     def _frame_loader(self, settings: Settings, frame: SensorFrame) -> Callable[[], Scene]:
         frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
-        return frame_loader(frame, settings, place_of(settings), self._lookup_in_time)
+        return frame_loader(frame, settings, place_of(settings), self.lookup_in_time)
 
 
 def check_request(message: GraspRequest, hand: str) -> None:
-    """Refuse what no settings can make good. The source is checked where its row is looked up (`source_of`).
-
-    Raises RequestError: the field, what it holds and what is valid.
-    """
+    """Raise RequestError where no settings can make good what a field holds; `source_of` checks the source."""
     if message.id and not _ID.fullmatch(message.id):
         shown = message.id[:MOST_ID]
         raise bad_request(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
     if message.hand not in ("", hand):
-        raise RequestError(
-            ErrorCode.WRONG_HAND, f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
-        )
+        told = f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
+        raise RequestError(ErrorCode.WRONG_HAND, told)
     if message.num_grasps > MOST_GRASPS:
         raise bad_request(f"num_grasps: {message.num_grasps}; valid: 1 to {MOST_GRASPS}, 0 for the parameter")
     # Presets by path are for the node's owner: a message must not have files read.
     if message.preset not in ("", *preset_names()):
-        raise bad_request(
-            f"preset: {message.preset[:MOST_ID]!r}; valid: {', '.join(preset_names())}, empty for the parameter"
-        )
+        valid = f"{', '.join(preset_names())}, empty for the parameter"
+        raise bad_request(f"preset: {message.preset[:MOST_ID]!r}; valid: {valid}")
     if message.seed < -1:
         raise bad_request(f"seed: {message.seed}; valid: 0 or more, -1 for the parameter")
     _check_range("time_budget", message.time_budget, BUDGETS, "s, 0 for the parameter")
@@ -208,17 +172,14 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise bad_request(f"surface: with source {message.source}, whose cloud shows it; valid with MESH=1 and KNOWN=4")
     if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
         told = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
-        raise bad_request(
-            f"known_object: {message.known_object[:MOST_ID]!r} with {told}; valid with KNOWN=4, without mesh_uri"
-        )
+        name = message.known_object[:MOST_ID]
+        raise bad_request(f"known_object: {name!r} with {told}; valid with KNOWN=4, without mesh_uri")
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
-        raise bad_request(
-            f"exclude: {len(message.exclude)} ids, {len(message.exclude_poses)} poses; valid: {MOST_EXCLUDED}"
-        )
+        counts = f"{len(message.exclude)} ids, {len(message.exclude_poses)} poses"
+        raise bad_request(f"exclude: {counts}; valid: {MOST_EXCLUDED}")
 
 
 def _check_camera_and_mask(message: GraspRequest) -> None:
-    """Refuse a view point that is no place, and a mask beside another wish."""
     if message.use_view_point:
         near(message.view_point, "view_point")
     if message.target_mask.height and (message.use_target_point or message.alone):
@@ -228,7 +189,6 @@ def _check_camera_and_mask(message: GraspRequest) -> None:
 
 
 def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
-    """Refuse a mask where the source has no image for it. Raises RequestError."""
     if height and message.source not in _OF_ONE_CLOUD:
         raise bad_request(f"{name}: with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
 
@@ -252,8 +212,7 @@ def _check_range(name: str, value: float, limits: tuple[float, float], unit: str
         raise bad_request(f"{name}: {value!r}; valid: {low:g} to {high:g} {unit}")
 
 
-def asks_for_any(message: GraspRequest) -> bool:
-    """Whether a request asks for any place or direction at all."""
+def _asks_for_any(message: GraspRequest) -> bool:
     angles = message.approach_angle, message.roll, message.roll_tolerance
     masked = message.region_mask.height > 0
     return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, message.avoid))
@@ -267,6 +226,8 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
     _check(message)
     rotation = T_object_header[:3, :3]
     region, direction = _region(message, T_object_header), _direction(message)
+    boxes = zip(message.avoid, message.avoid_poses, strict=True)
+    avoid = [_box("avoid", solid, pose, T_object_header) for solid, pose in boxes]
     zero = None
     if message.use_roll and np.isfinite(direction).all() and direction:
         zero = tuple((rotation @ zero_of_roll(np.array(direction) / np.linalg.norm(direction))).tolist())
@@ -274,10 +235,7 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
         approach_direction=tuple((rotation @ direction).tolist()) if direction else None,
         approach_angle=message.approach_angle or _DEFAULTS.approach_angle,
         region=region,
-        avoid=[
-            _box("avoid", solid, pose, T_object_header)
-            for solid, pose in zip(message.avoid, message.avoid_poses, strict=True)
-        ],
+        avoid=avoid,
         roll=message.roll if message.use_roll else None,
         roll_tolerance=message.roll_tolerance or _DEFAULTS.roll_tolerance,
         roll_zero=zero,
@@ -319,57 +277,40 @@ def _region(message: GraspRequest, T_object_header: Matrix) -> Box | Sphere | No
 def _box(name: str, solid: SolidPrimitive, pose: Pose, T_object_header: Matrix) -> Box:
     valid = "BOX=1 or SPHERE=2" if name == "region" else "BOX=1"
     if solid.type != SolidPrimitive.BOX or len(solid.dimensions) != 3:
-        raise bad_request(
-            f"{name}: type {solid.type} of {len(solid.dimensions)} dimensions; valid: {valid}, 3 lengths of a box"
-        )
+        given = f"type {solid.type} of {len(solid.dimensions)} dimensions"
+        raise bad_request(f"{name}: {given}; valid: {valid}, 3 lengths of a box")
     placed = T_object_header @ pose_matrix(pose, f"{name}_pose{'s' * (name == 'avoid')}")
     return Box(placed[:3, 3], list(solid.dimensions), wxyz_of_matrix(placed))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class SourceInput:
-    """What a source may look at.
+    """What a source may look at: the checked request, and the builder with the frames it holds.
 
-    Attributes:
-        request_id: what the request goes by.
-        source: name of the source.
-        message: the request; its fields are checked.
-        settings: the parameters, with what the request asks for itself.
-        listener: who is told of it beside the topics; None where nobody is.
-        newest: the newest frame that a camera sent; None before the first.
-        views: the frames that were kept.
-        now: by the node's clock.
-        lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
-        lookup_in_time: the same for the worker's thread; waits for what comes late.
+    `settings` have what the request asks for itself.
     """
 
     request_id: str
     source: str
     message: GraspRequest
     settings: Settings
-    listener: Listener | None = None
-    newest: SensorFrame | None
-    views: Views
+    listener: Listener | None
     now: Time
-    lookup: Lookup
-    lookup_in_time: Lookup
+    builder: RequestBuilder
 
     def request(self, frame: str, stamp: Time, load: Callable[[], Scene], **fields: Any) -> Request:
         """Return the request for an object in a frame; a stamp of zero is that of now. `fields` are more of Request."""
         timeless = nanoseconds(stamp) == 0
         fields |= {"listener": self.listener, "timeless": timeless}
-        return Request(
-            self.request_id, self.source, frame, self.now if timeless else stamp, self.settings, load, **fields
-        )
+        stamp = self.now if timeless else stamp
+        return Request(self.request_id, self.source, frame, stamp, self.settings, load, **fields)
 
 
 @dataclass(frozen=True)
 class Source:
-    """One place that objects come from.
+    """One place that objects come from; its name in capitals is that of its constant in the message.
 
-    Attributes:
-        name: its name in answers; in capitals that of its constant in the message.
-        find: gives the object without reading it. Raises GraspdError: it is missing, old or out of reach.
+    `find` gives the object without reading it. Raises GraspdError: it is missing, old or out of reach.
     """
 
     name: str
@@ -454,7 +395,6 @@ def _from_known(given: SourceInput) -> Request:
 
 
 def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: KnownObject | None) -> Request:
-    """An object that is known whole, where the request says that it stands."""
     message = given.message
     header, pose = message.header, pose_matrix(message.object_pose)
     surface = plane_of(message.surface, np.linalg.inv(pose))
@@ -464,11 +404,11 @@ def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: Know
 
 
 def _from_latest_cloud(given: SourceInput) -> Request:
-    return _of_frame(given, latest_frame(given.newest, nanoseconds(given.now), given.settings))
+    return _of_frame(given, latest_frame(given.builder.newest, nanoseconds(given.now), given.settings))
 
 
 def _from_views(given: SourceInput) -> Request:
-    views, settings = given.views, given.settings
+    views, settings = given.builder.views, given.settings
     if not views.clouds:
         raise RequestError(ErrorCode.NO_CLOUD, "no view is kept: call ~/add_view while clouds come")
     point = _target(given, views.frame)
@@ -496,7 +436,7 @@ def source_of(message: GraspRequest) -> Source:
 def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     message, place = given.message, place_of(given.settings, given.message)
     point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
-    load = frame_loader(frame, given.settings, place, given.lookup_in_time, point, mask)
+    load = frame_loader(frame, given.settings, place, given.builder.lookup_in_time, point, mask)
     meant = "" if mask is not None else f"{point} {place} {given.settings.segment}"
     key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
     shown = lambda: _shown(frame, message.region_mask)  # noqa: E731
@@ -509,14 +449,13 @@ def _shown(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
 
 
 def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
-    """The point that says which object is meant, in the frame of the cloud [m]."""
     message = given.message
     if not message.use_target_point:
         return None
     point, named = near(message.target_point, "target_point"), message.header.frame_id
     if named in ("", frame):
         return point
-    return moved_points(point[None], given.lookup(frame, named, message.header.stamp))[0]
+    return moved_points(point[None], given.builder.lookup(frame, named, message.header.stamp))[0]
 
 
 def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
@@ -531,7 +470,7 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
         raise MeshError(f"the mesh path is {len(uri)} characters long; at most {MOST_PATH} are looked at")
     if not uri:
         raise MeshError(f"the mesh path is empty; give {_FORMS}")
-    allowed = allowed_roots(roots)
+    allowed = _allowed_roots(roots)
     if not allowed:
         raise MeshError(f"{uri}: no mesh may be read, since mesh_roots {list(roots)} names no directory")
     try:
@@ -548,7 +487,7 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
     return path
 
 
-def allowed_roots(roots: Sequence[str]) -> list[Path]:
+def _allowed_roots(roots: Sequence[str]) -> list[Path]:
     """The directories behind `mesh_roots`, links followed; those that do not exist are left out."""
     found = []
     for root in roots:

@@ -79,14 +79,8 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
         told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
         raise RequestError(ErrorCode.BAD_CLOUD, told)
     header = message.header
-    return SensorFrame(
-        CLOUD,
-        header.frame_id,
-        header.stamp,
-        arrived,
-        read=lambda: PointCloud(points_from_message(message), np.zeros(3)),
-        pixels=lambda: pixels_from_message(message),
-    )
+    read = lambda: PointCloud(points_from_message(message), np.zeros(3))  # noqa: E731
+    return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, lambda: pixels_from_message(message))
 
 
 def depth_sensor_frame(image: Image, info: CameraInfo, arrived: int) -> SensorFrame:
@@ -103,9 +97,7 @@ def depth_sensor_frame(image: Image, info: CameraInfo, arrived: int) -> SensorFr
 
 
 def depth_and_camera(image: Image, info: CameraInfo) -> tuple[Float[np.ndarray, "height width"], PinholeCamera]:
-    """Return a depth image [m], 0 where there is none, and its camera. Encodings 16UC1, mono16 (mm) and 32FC1 (m).
-
-    The lens' distortion was taken out of the image, as image_rect topics say: the camera is that of P.
+    """Return a depth image [m], 0 where there is none, and its camera, which is that of P: the image is rectified.
 
     Raises CloudError: no depth encoding, sizes that contradict each other, another frame, or no calibration.
     """
@@ -158,10 +150,8 @@ class ImagePairs:
 class CameraPlace:
     """Where a cloud's camera stood; nothing given: at the origin of the cloud's frame, if the cloud agrees.
 
-    Attributes:
-        view_point: in the cloud's frame [m]; goes before `sensor_frame`.
-        sensor_frame: the camera stood at the origin of this frame; it looked along z if its name ends in
-            optical_frame (REP 103).
+    `view_point`, in the cloud's frame [m], goes before `sensor_frame`, at whose origin it stood; it looked along z if
+    that name ends in optical_frame (REP 103).
     """
 
     view_point: tuple[float, float, float] | None = None
@@ -214,7 +204,7 @@ def masked_cloud(
     if mask.encoding not in ("mono8", "8UC1") or (mask.height, mask.width) != (height, width):
         raise bad_request(
             f"{name}: {mask.width} x {mask.height} {mask.encoding[:16]!r}; valid: mono8 of {width} x {height} "
-            f"pixels, as the {frame.kind} has",
+            f"pixels, as the {frame.kind} has"
         )
     if mask.step < width or len(mask.data) < (height - 1) * mask.step + width:
         told = f"{name}: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
@@ -271,11 +261,9 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
     """The points inside the workspace, one a voxel where the settings give a voxel its size."""
     points = cloud.points[within(cloud.points, settings)]
     if not len(points):
-        raise RequestError(
-            ErrorCode.BAD_CLOUD,
-            f"none of {len(cloud.points)} points lies in the workspace, roi_min={settings.roi_min} to "
-            f"roi_max={settings.roi_max}",
-        )
+        workspace = f"roi_min={settings.roi_min} to roi_max={settings.roi_max}"
+        told = f"none of {len(cloud.points)} points lies in the workspace, {workspace}"
+        raise RequestError(ErrorCode.BAD_CLOUD, told)
     inside = PointCloud(points, cloud.viewpoint, cloud.forward)
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 

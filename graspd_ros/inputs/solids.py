@@ -158,10 +158,8 @@ def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Th
 def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
     if message.planes:
         raise bad_message(owner, "planes: not taken, since they have no end; give a box, or the request's surface")
-    shapes = (
-        *primitive_shapes(message.primitives, message.primitive_poses, owner),
-        *mesh_shapes(message.meshes, message.mesh_poses, owner),
-    )
+    solids = primitive_shapes(message.primitives, message.primitive_poses, owner)
+    shapes = (*solids, *mesh_shapes(message.meshes, message.mesh_poses, owner))
     # MoveIt too has the appended shapes relative to the pose that the thing has.
     if message.operation == message.APPEND and there is not None:
         return replace(there, shapes=(*there.shapes, *shapes))

@@ -1,4 +1,4 @@
-"""Progress, answers and trajectories as messages. No message carries a NaN.
+"""Progress, answers, trajectories and markers as messages. No message carries a NaN.
 
 Metrics that were not measured are left out; other figures that are not finite are -1.
 
@@ -6,28 +6,35 @@ A trajectory has three points in time for the fingers, and the base's pose at ea
 point. A controller that interpolates by cubics (ros2_control's, where positions and velocities are given) then moves
 all joints along straight lines in step with each other, which is the way that the trial tried, and its greatest speed
 is 1.5 times the mean one of each stage; the times here account for that.
+
+Markers show in RViz the hand at its grasp, where it touches, the axes of its base link, and what it is worth. Their
+namespaces are the names of `PARTS`, so that each can be switched off; ids start at `IDS_OF_A_GRASP` times the rank.
+They stay until the next result deletes them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped
+from geometry_msgs.msg import Point, Pose, PoseStamped
 from graspd_msgs.msg import Contact as ContactMessage
 from graspd_msgs.msg import Grasp as GraspMessage
 from graspd_msgs.msg import GraspArray, GraspProgress, Metric
 from graspd_msgs.msg import TrialResult as TrialMessage
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
+from std_msgs.msg import ColorRGBA, Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from visualization_msgs.msg import Marker, MarkerArray
 
 from graspd_core import HandModel
 from graspd_core.errors import ConfigError
-from graspd_core.hands.kinematics import RETREAT
-from graspd_core.hands.model import Mount, all_joint_names, all_joint_positions
+from graspd_core.hands.kinematics import RETREAT, link_poses
+from graspd_core.hands.model import Mount, Primitive, all_joint_names, all_joint_positions
 from graspd_core.types import (
     ArmPath,
     Contact,
@@ -68,23 +75,32 @@ _SHORT = {
 
 # Greatest over mean speed of a cubic that starts and ends at rest.
 _PEAK = 1.5
+IDS_OF_A_GRASP = 1000
+GEOMETRIES = ("visual", "collision")
+# What can be shown. Of the best grasps: the hand at the grasp, before it and where its squeeze aims at (faint), its
+# contacts, the axes of its base link, its figures. Of those that failed a trial: where they are, and why they failed.
+PARTS = ("hand", "pregrasp", "squeeze", "contacts", "axes", "text", "rejected")
+USUAL_PARTS = ("hand", "contacts", "axes", "text")
+_FAINT = 0.25
+COLOURS = {
+    Verdict.VERIFIED: (0.20, 0.70, 0.30),
+    Verdict.UNVERIFIED: (0.95, 0.70, 0.15),
+    Verdict.FAILED: (0.85, 0.20, 0.20),
+}
+_AXIS_LENGTH = 0.05
+_ARROW_LENGTH = 0.03
+_TEXT_HEIGHT = 0.015
+_TEXT_ABOVE = 0.12
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a real hand may be moved; a joint's own limit holds too.
+    """How fast a real hand may be moved; a joint's own limit holds too."""
 
-    Attributes:
-        joint_speed: greatest speed of a turning joint [rad/s].
-        base_speed: greatest speed of the hand's base, and of sliding joints [m/s].
-        base_turn: greatest turning speed of the base [rad/s].
-        shortest: least time of a stage, twice and a half the trial's own [s].
-    """
-
-    joint_speed: float = 1.0
-    base_speed: float = 0.05
-    base_turn: float = 0.5
-    shortest: float = 1.0
+    joint_speed: float = 1.0  # greatest of a turning joint [rad/s]
+    base_speed: float = 0.05  # greatest of the hand's base, and of sliding joints [m/s]
+    base_turn: float = 0.5  # greatest turning speed of the base [rad/s]
+    shortest: float = 1.0  # least time of a stage, twice and a half the trial's own [s]
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -94,14 +110,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """How a request ended, in the words of a GraspArray.
-
-    Attributes:
-        status: one of the constants of GraspArray.
-        code: kind of trouble, `NONE` where there was none.
-        message: one line for people.
-        result: the run, None where there was none; its grasps are in the answer's frame.
-    """
+    """How a request ended, in the words of a GraspArray; the grasps of `result` are in the answer's frame."""
 
     status: int
     code: ErrorCode
@@ -137,10 +146,8 @@ def array_message(
         message.warnings = list(ending.result.warnings)
         if ending.result.next_view is not None:
             message.next_view = PoseStamped(header=header, pose=pose_of_matrix(ending.result.next_view))
-        message.grasps = [
-            grasp_message(grasp, rank, request_id, header, hand, pace)
-            for rank, grasp in enumerate(ending.result.grasps)
-        ]
+        ranked = enumerate(ending.result.grasps)
+        message.grasps = [grasp_message(grasp, rank, request_id, header, hand, pace) for rank, grasp in ranked]
     return message
 
 
@@ -149,7 +156,7 @@ def grasp_message(
 ) -> GraspMessage:
     """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN."""
     _check_finite(grasp, rank)
-    joints = [joint_message(posture, hand, header.stamp) for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze)]
+    pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))
     message = GraspMessage(
         header=header,
         id=f"{request_id}/{rank}",
@@ -160,18 +167,21 @@ def grasp_message(
         base_link=hand.base_link,
         pregrasp_pose=pose_of_posture(grasp.pregrasp),
         grasp_pose=pose_of_posture(grasp.grasp),
-        pregrasp_joints=joints[0],
-        grasp_joints=joints[1],
-        squeeze_joints=joints[2],
+        pregrasp_joints=pregrasp,
+        grasp_joints=closed,
+        squeeze_joints=squeeze,
         score=_number(grasp.score),
-        probability=-1.0 if grasp.probability is None else grasp.probability,
+        probability=UNMEASURED if grasp.probability is None else grasp.probability,
         metrics=[
             Metric(name=name, value=value)
             for name, value in (grasp.metrics or {}).items()
             if value is not None and math.isfinite(value)
         ],
         trials=[_trial(trial) for trial in grasp.trials],
-        contacts=[_contact(contact) for contact in grasp.contacts],
+        contacts=[
+            ContactMessage(link=c.link, position=point_of(c.position), normal=vector_of(c.normal))
+            for c in grasp.contacts
+        ],
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
@@ -201,24 +211,15 @@ def progress_message(progress: Progress, request_id: str, frame: str, stamp: Tim
     )
 
 
-def queued_message(request_id: str, frame: str, stamp: Time, ahead: int) -> GraspProgress:
-    """What a request hears that must wait its turn."""
-    header = Header(frame_id=frame, stamp=stamp)
-    return GraspProgress(header=header, request_id=request_id, stage="queued", message=f"queued: {ahead} ahead")
-
-
 def sentence(progress: Progress) -> str:
     """A progress report for people."""
     steps = f"{progress.step} of {progress.of}"
-    match progress.stage:
-        case Stage.LOAD:
-            return "reading the object"
-        case Stage.OPTIMISE:
-            return f"optimising: step {steps}, lowest loss {progress.best:.3g}"
-        case Stage.VERIFY:
-            return f"trying grasps: {steps}, {progress.verified} hold"
-        case _:
-            return f"done: {progress.verified} hold"
+    said = {
+        Stage.LOAD: "reading the object",
+        Stage.OPTIMISE: f"optimising: step {steps}, lowest loss {progress.best:.3g}",
+        Stage.VERIFY: f"trying grasps: {steps}, {progress.verified} hold",
+    }
+    return said.get(progress.stage, f"done: {progress.verified} hold")
 
 
 def fraction_of(progress: Progress) -> float:
@@ -235,36 +236,21 @@ def joint_message(posture: Posture, hand: HandModel, stamp: Time) -> JointState:
     )
 
 
-def pose_message(grasp: Grasp, frame: str, stamp: Time) -> PoseStamped:
-    """Where the hand's base link is at the grasp, in the frame that the object came in."""
-    return PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(grasp.grasp))
-
-
-def matrix_of_mount(mount: Mount) -> Matrix:
-    """Return `T_parent_base` [m]: the hand's base link in the arm's link that carries it."""
-    return matrix_of(mount.position, mount.quaternion_wxyz)
-
-
 def mount_pose(base: Posture, mount: Mount) -> Pose:
     """Return the pose of the arm's link when the hand's base link is at `base`, in the same frame."""
-    return pose_of_matrix(matrix_of_posture(base) @ np.linalg.inv(matrix_of_mount(mount)))
+    return pose_of_matrix(matrix_of_posture(base) @ np.linalg.inv(matrix_of(mount.position, mount.quaternion_wxyz)))
 
 
 def _check_finite(grasp: Grasp, rank: int) -> None:
-    postures = {"pregrasp": grasp.pregrasp, "grasp": grasp.grasp, "squeeze": grasp.squeeze}
     parts = {
         f"{name}'s {part}": getattr(posture, part)
-        for name, posture in postures.items()
+        for name, posture in zip(("pregrasp", "grasp", "squeeze"), _postures(grasp), strict=True)
         for part in ("position", "quaternion_wxyz", "joint_positions")
     }
     parts |= {f"contact of {c.link}": [*c.position, *c.normal] for c in grasp.contacts}
     wrong = [name for name, values in parts.items() if not np.isfinite(values).all()]
     if wrong:
         raise FloatingPointError(f"grasp {rank}: not finite: {', '.join(wrong)}")
-
-
-def _contact(contact: Contact) -> ContactMessage:
-    return ContactMessage(link=contact.link, position=point_of(contact.position), normal=vector_of(contact.normal))
 
 
 def _trial(trial: TrialResult) -> TrialMessage:
@@ -338,9 +324,8 @@ def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
 def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint:
     # Rounding may put a joint that rests on its limit a hair beyond it, which controllers refuse.
     positions = np.clip(posture.joint_positions, hand.lower, hand.upper)
-    return JointTrajectoryPoint(
-        positions=positions.tolist(), velocities=[0.0] * len(positions), time_from_start=duration_of(at)
-    )
+    still = [0.0] * len(positions)
+    return JointTrajectoryPoint(positions=positions.tolist(), velocities=still, time_from_start=duration_of(at))
 
 
 def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
@@ -351,7 +336,6 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
-    from graspd_core.hands.kinematics import RETREAT
 
     way = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
     times = [pace.shortest]
@@ -364,3 +348,144 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
         for positions, at in zip(path.positions, times, strict=True)
     ]
     return JointTrajectory(joint_names=list(path.joint_names), points=points)
+
+
+def result_markers(
+    grasps: Sequence[Grasp],
+    hand: HandModel,
+    frame: str,
+    stamp: Time,
+    *,
+    shown: int = 1,
+    parts: Sequence[str] = USUAL_PARTS,
+    solids: Sequence[Primitive] | None = None,
+) -> MarkerArray:
+    """Parts of the best `shown` grasps; the first marker deletes what was shown before: none leave an empty scene.
+
+    `solids` are what the hand is drawn with; None: its collision solids.
+    """
+    header = Header(frame_id=frame, stamp=stamp)
+    markers = [Marker(header=header, action=Marker.DELETEALL)]
+    for rank, grasp in enumerate(grasps):
+        made = _parts_of(grasp, rank, hand, hand.primitives if solids is None else solids) if rank < shown else {}
+        if grasp.verdict is Verdict.FAILED:
+            made["rejected"] = lambda grasp=grasp, rank=rank: _rejected(grasp, rank)
+        for namespace in parts:
+            for number, marker in enumerate(made[namespace]() if namespace in made else ()):
+                marker.header, marker.action, marker.ns = header, Marker.ADD, namespace
+                marker.id = rank * IDS_OF_A_GRASP + number
+                markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+def _parts_of(
+    grasp: Grasp, rank: int, hand: HandModel, solids: Sequence[Primitive]
+) -> dict[str, Callable[[], Iterable[Marker]]]:
+    T_frame_base, colour = matrix_of_posture(grasp.grasp), COLOURS[grasp.verdict]
+    return {
+        "hand": lambda: _hand(hand, solids, grasp.grasp, colour),
+        "pregrasp": lambda: _faint(_hand(hand, solids, grasp.pregrasp, colour)),
+        "squeeze": lambda: _faint(_hand(hand, solids, grasp.squeeze, colour)),
+        "contacts": lambda: map(_contact, grasp.contacts),
+        "axes": lambda: _axes(T_frame_base),
+        "text": lambda: [_text(grasp, rank, T_frame_base)],
+    }
+
+
+def _faint(markers: Iterable[Marker]) -> Iterator[Marker]:
+    for marker in markers:
+        marker.color.a = _FAINT
+        yield marker
+
+
+def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
+    start, end = grasp.pregrasp.position, grasp.grasp.position
+    yield _arrow(np.asarray(start), np.asarray(end), COLOURS[Verdict.FAILED])
+    text = _text(grasp, rank, matrix_of_posture(grasp.grasp))
+    text.color = _colour(COLOURS[Verdict.FAILED], 1.0)
+    yield text
+
+
+def _hand(
+    hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
+) -> Iterator[Marker]:
+    """The solids; a capsule is a cylinder and two balls."""
+    T_frame_base = matrix_of_posture(posture)
+    rotations, translations = link_poses(hand, posture.joint_positions)
+    for solid in solids:
+        T_base_link = _matrix(rotations[solid.link], translations[solid.link])
+        T = T_frame_base @ T_base_link @ _matrix(solid.rotation, solid.translation)
+        pose, size = pose_of_matrix(T), solid.size
+        if solid.kind == "hull":
+            marker = Marker(type=Marker.TRIANGLE_LIST, pose=pose, scale=vector_of((1, 1, 1)), color=_colour(colour))
+            marker.points = _corners(solid)
+            yield marker
+        elif solid.kind == "box":
+            yield _solid(Marker.CUBE, pose, 2 * np.array(size), colour)
+        elif solid.kind == "sphere":
+            yield _solid(Marker.SPHERE, pose, np.full(3, 2 * size[0]), colour)
+        else:
+            yield _solid(Marker.CYLINDER, pose, np.array([2 * size[0], 2 * size[0], 2 * size[1]]), colour)
+            if solid.kind == "capsule":
+                for end in (-size[1], size[1]):
+                    ball = pose_of_matrix(T @ _matrix(np.eye(3), np.array([0.0, 0.0, end])))
+                    yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
+
+
+# Thousands of points take tens of milliseconds to make; nobody changes them.
+@lru_cache(maxsize=256)
+def _corners(mesh: Primitive) -> list[Point]:
+    return [point_of(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
+
+
+def _contact(contact: Contact) -> Marker:
+    """An arrow that ends where the link touches and goes the way it presses: against the object's normal."""
+    tip = np.array(contact.position)
+    tail = tip + _ARROW_LENGTH * np.array(contact.normal)
+    return _arrow(tail, tip, (0.1, 0.3, 0.9))
+
+
+def _axes(T_frame_base: Matrix) -> Iterator[Marker]:
+    origin = T_frame_base[:3, 3]
+    for axis, colour in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+        yield _arrow(origin, origin + _AXIS_LENGTH * T_frame_base[:3, axis], colour)
+
+
+def _text(grasp: Grasp, rank: int, T_frame_base: Matrix) -> Marker:
+    lines = [f"#{rank} {grasp.verdict}"]
+    epsilon = (grasp.metrics or {}).get("epsilon")
+    if epsilon is not None:
+        lines.append(f"ε {epsilon:.3f}")
+    if grasp.reason:
+        lines.append(grasp.reason)
+    above = _matrix(np.eye(3), T_frame_base[:3, 3] + [0.0, 0.0, _TEXT_ABOVE])
+    return Marker(
+        type=Marker.TEXT_VIEW_FACING,
+        pose=pose_of_matrix(above),
+        scale=vector_of((0, 0, _TEXT_HEIGHT)),
+        color=_colour((1.0, 1.0, 1.0), 1.0),
+        text="\n".join(lines),
+    )
+
+
+def _solid(kind: int, pose: Pose, size: np.ndarray, colour: tuple[float, float, float]) -> Marker:
+    return Marker(type=kind, pose=pose, scale=vector_of(size), color=_colour(colour))
+
+
+def _arrow(tail: np.ndarray, tip: np.ndarray, colour: tuple[float, float, float]) -> Marker:
+    # Points are in the header's frame; RViz wants the pose beside them to be a rotation all the same.
+    marker = Marker(type=Marker.ARROW, scale=vector_of((0.004, 0.008, 0.01)), color=_colour(colour, 1.0))
+    marker.pose.orientation.w = 1.0
+    marker.points = [point_of(tail), point_of(tip)]
+    return marker
+
+
+def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Matrix:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, translation
+    return T
+
+
+def _colour(rgb: tuple[float, float, float], alpha: float = 0.8) -> ColorRGBA:
+    r, g, b = rgb
+    return ColorRGBA(r=r, g=g, b=b, a=alpha)

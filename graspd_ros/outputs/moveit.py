@@ -81,13 +81,11 @@ def moveit_grasp(
 
 
 def _posture(grasp: Grasp, points: list[Any], since: Any = None) -> JointTrajectory:
-    """Some points of the trajectory, times counted from `since`."""
     began = nanoseconds(since.time_from_start) if since else 0
     for point in points:
         set_nanoseconds(point.time_from_start, nanoseconds(point.time_from_start) - began)
-    return JointTrajectory(
-        header=grasp.trajectory.header, joint_names=list(grasp.trajectory.joint_names), points=points
-    )
+    way = grasp.trajectory
+    return JointTrajectory(header=way.header, joint_names=list(way.joint_names), points=points)
 
 
 def _translation(messages: ModuleType, direction: np.ndarray, frame: str, distance: float) -> Any:

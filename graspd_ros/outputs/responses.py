@@ -1,6 +1,7 @@
 """What becomes of a request, in messages: exactly one GraspArray for each, and events for those without graspd_msgs.
 
 Clouds that come unasked are the exception: those that gave way to a newer one before their turn are only counted.
+The node's health goes out on /diagnostics: what it counts since its start.
 """
 
 from __future__ import annotations
@@ -8,15 +9,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from graspd_msgs.msg import Grasp as GraspMessage
 from graspd_msgs.msg import GraspArray, GraspProgress
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -31,27 +38,36 @@ from graspd_core.errors import GraspdError
 from graspd_core.hands.model import Primitive
 from graspd_core.io.grasps_json import grasp_figures
 from graspd_core.types import Grasp, GraspResult, Progress, ProgressHook, Stage, Verdict
-from graspd_ros.diagnostics import ACCEPTED, SUPERSEDED, Counters
+from graspd_ros.convert import pose_of_posture
 from graspd_ros.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs import messages
-from graspd_ros.outputs.markers import result_markers
-from graspd_ros.outputs.messages import Pace
+from graspd_ros.outputs.messages import Pace, result_markers
 from graspd_ros.parameters import Settings
 from graspd_ros.request import MOST_ID, Listener, Request
 from graspd_ros.request_planner import Planned
 from graspd_ros.worker import Admission, Refusal, Report, WorkerEnding
 
+_ENDS = {
+    GraspArray.SUCCEEDED: "requests succeeded",
+    GraspArray.PARTIAL: "requests partial",
+    GraspArray.FAILED: "requests failed",
+    GraspArray.CANCELLED: "requests cancelled",
+    GraspArray.SUPERSEDED: "requests superseded",
+    GraspArray.REFUSED: "requests refused",
+}
+# What is counted since the start, by the key that tells it.
+ACCEPTED, RECEIVED, SUPERSEDED = "requests accepted", "clouds received", "clouds superseded"
+VERIFIED, FAILED = "grasps verified", "grasps failed"
 COUNT_PERIOD = 1.0  # seconds between two counts of superseded clouds, and between two complaints about clouds
 _REFUSALS = {
     Refusal.BUSY: ErrorCode.BUSY,
     Refusal.DUPLICATE: ErrorCode.DUPLICATE_ID,
     Refusal.STOPPING: ErrorCode.SHUTTING_DOWN,
 }
+_NEWER = "a newer request took its place"
 _ENDINGS = {
     WorkerEnding.CANCELLED: messages.AnswerEnding(GraspArray.CANCELLED, ErrorCode.CANCELLED, "cancelled"),
-    WorkerEnding.SUPERSEDED: messages.AnswerEnding(
-        GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, "a newer request took its place"
-    ),
+    WorkerEnding.SUPERSEDED: messages.AnswerEnding(GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, _NEWER),
 }
 
 SHOWN = {
@@ -64,6 +80,149 @@ SHOWN = {
 LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 
+@dataclass(frozen=True)
+class Health:
+    """What the node knows about itself.
+
+    Attributes:
+        running: id of the request that is worked on, empty when idle.
+        waiting: requests that wait, of at most `queue_size`.
+        counts: since the start, by the key that tells them.
+        last_latency: seconds from the last answered request to its answer, None before the first.
+        last_first_verified: seconds from that request to its first verified grasp, None where there was none.
+    """
+
+    name: str
+    hand: str
+    ready: bool
+    worker_alive: bool
+    running: str = ""
+    waiting: int = 0
+    queue_size: int = 0
+    transforms: bool = False
+    counts: Mapping[str, int] = field(default_factory=dict)
+    failed_in_a_row: int = 0
+    last_latency: float | None = None
+    last_first_verified: float | None = None
+    last_error: str = ""
+
+
+class Counters:
+    """Counts by name, and the last figures. Safe from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._last: dict[str, Any] = {}
+
+    def count(self, key: str) -> None:
+        with self._lock:
+            self._counts[key] += 1
+
+    def answered(self, message: GraspArray) -> None:
+        """Count a request that got its answer, and its grasps."""
+        with self._lock:
+            self._counts[_ENDS[message.status]] += 1
+            self._counts[VERIFIED] += sum(grasp.verdict == GraspMessage.VERIFIED for grasp in message.grasps)
+            self._counts[FAILED] += sum(grasp.verdict == GraspMessage.FAILED for grasp in message.grasps)
+            if message.status == GraspArray.FAILED:
+                self._last["failed_in_a_row"] = self._last.get("failed_in_a_row", 0) + 1
+                self._last["last_error"] = message.message
+            elif message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+                self._last["failed_in_a_row"] = 0
+
+    def planned(self, result: GraspResult, latency: float) -> None:
+        """Count a run that ended `latency` seconds after its request came."""
+        with self._lock:
+            self._last |= {"last_latency": latency, "last_first_verified": result.timing.first_verified}
+
+    def clear(self) -> None:
+        with self._lock:
+            self._counts.clear()
+            self._last.clear()
+
+    def health(self, **state: Any) -> Health:
+        with self._lock:
+            return Health(**state, counts=dict(self._counts), **self._last)
+
+
+def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
+    """Return one status; its level is for alarms, its message for people, its values for graphs.
+
+    `memory` is the resident memory of the process and its children [bytes].
+    """
+    level, message = _verdict(health)
+    status = DiagnosticStatus(
+        level=level,
+        name=f"{health.name.lstrip('/')}: grasp synthesis",
+        message=message,
+        hardware_id=health.hand,
+        values=[KeyValue(key=key, value=value) for key, value in _values(health, memory).items()],
+    )
+    return DiagnosticArray(header=Header(stamp=stamp), status=[status])
+
+
+def resident_memory(pid: int | None = None) -> int:
+    """Return what of a process (this one) and its children is in RAM [bytes]; 0 where the system does not tell.
+
+    What they share counts for each.
+    """
+    process = Path("/proc", str(pid or os.getpid()))
+    try:
+        pages = int((process / "statm").read_text().split()[1])
+        tasks = list((process / "task").iterdir())
+    except OSError:
+        return 0
+    children = [int(child) for task in tasks for child in _words(task / "children")]
+    return pages * os.sysconf("SC_PAGE_SIZE") + sum(map(resident_memory, children))
+
+
+def _words(file: Path) -> list[str]:
+    try:
+        return file.read_text().split()
+    except OSError:  # of a thread that has ended meanwhile
+        return []
+
+
+def _verdict(health: Health) -> tuple[bytes, str]:
+    """The worst that holds."""
+    if not health.worker_alive:
+        return DiagnosticStatus.ERROR, "the worker has ended: restart the node"
+    if not health.ready:
+        return DiagnosticStatus.WARN, "warming up"
+    if health.failed_in_a_row:
+        times = "the last request" if health.failed_in_a_row == 1 else f"the last {health.failed_in_a_row} requests"
+        return DiagnosticStatus.WARN, f"{times} failed: {health.last_error or 'no reason given'}"
+    if health.queue_size and health.waiting >= health.queue_size:
+        return DiagnosticStatus.WARN, f"the queue is full: {health.waiting} wait"
+    return DiagnosticStatus.OK, f"works on {health.running}" if health.running else "waits for requests"
+
+
+def _values(health: Health, memory: int) -> dict[str, str]:
+    state = "ended" if not health.worker_alive else "warming up" if not health.ready else "idle"
+
+    def counted(*keys: str) -> dict[str, str]:
+        return {key: str(health.counts.get(key, 0)) for key in keys}
+
+    return {
+        "worker": "busy" if state == "idle" and health.running else state,
+        "current request": health.running,
+        "queue length": str(health.waiting),
+        "queue size": str(health.queue_size),
+        "last latency [s]": _seconds(health.last_latency),
+        "last first verified [s]": _seconds(health.last_first_verified),
+        **counted(ACCEPTED, *_ENDS.values(), VERIFIED, FAILED),
+        "last error": health.last_error,
+        **counted(RECEIVED, SUPERSEDED),
+        "transforms heard": "yes" if health.transforms else "no: tf2_msgs is not installed",
+        "memory [MB]": f"{memory / 1e6:.0f}" if memory else "",
+    }
+
+
+def _seconds(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
 class Publishers:
     """One publisher for each type of message."""
 
@@ -71,11 +230,10 @@ class Publishers:
         self._node = node
         self._lock = threading.Lock()
         self._closed = False
+        # Latched: who is discovered after the start, or after a restart, still hears that the node is ready.
+        status = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publishers: dict[type, Any] = {
-            # Latched: who is discovered after the start, or after a restart, still hears that the node is ready.
-            String: node.create_publisher(
-                String, "~/status", QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            ),
+            String: node.create_publisher(String, "~/status", status),
             GraspProgress: node.create_publisher(GraspProgress, "~/progress", 50),
         }
         self._publishers |= {kind: self._latched(kind) for kind in LATCHED}
@@ -111,7 +269,6 @@ class Publishers:
                 self._publishers[kind] = self._latched(kind)
 
     def close(self) -> None:
-        """Publish no more."""
         with self._lock:
             self._closed = True
 
@@ -134,15 +291,12 @@ class Responses:
         self.publishers.forget()
         self.counters.clear()
 
-    # Taken or not.
-
     def admitted(self, request: Request, admission: Admission) -> None:
-        """A request was taken, or not."""
         if admission.refusal is not None:
             code, message = _REFUSALS[admission.refusal], admission.reason
-            self.publishers.tell("refused", request.id, request.source, code=code, message=message)
-            self._log().warning(f"{request.id}: refused: {message}")
-            self._end(request, messages.AnswerEnding(GraspArray.REFUSED, code, message))
+            self._refused(request.id, request.source, code, message)
+            ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
+            self._publish(self._answer(request, ending), request.listener)
         elif not request.only_newest:
             self._accepted(request, admission.ahead)
 
@@ -152,8 +306,7 @@ class Responses:
         if code is ErrorCode.INTERNAL:
             self.tell_error(request_id[:MOST_ID], source, error)
         else:
-            self.publishers.tell("refused", request_id[:MOST_ID], source, code=code, message=message)
-            self._log().warning(f"{request_id[:MOST_ID] or source}: refused: {message}")
+            self._refused(request_id[:MOST_ID], source, code, message)
         ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
         header = Header(stamp=self._now())
         self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
@@ -166,17 +319,18 @@ class Responses:
 
     def thing_not_taken(self, error: Exception) -> None:
         """A message about a thing of the planning scene that is no use; things stay as they were."""
-        code, message = code_of(error), sentence_of(error)
-        self.publishers.tell("refused", "", "collision_objects", code=code, message=message)
-        self._log().warning(f"refused: {message}")
+        self._refused("", "collision_objects", code_of(error), sentence_of(error))
+
+    def _refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
+        self.publishers.tell("refused", request_id, source, code=code, message=message)
+        self._log().warning(f"{request_id or source}: refused: {message}")
 
     def _accepted(self, request: Request, ahead: int) -> None:
         self.counters.count(ACCEPTED)
         self.publishers.tell("accepted", request.id, request.source, ahead=ahead)
         if ahead:
-            self._report(request, messages.queued_message(request.id, request.frame_out, self._now(), ahead))
-
-    # On the way.
+            header, told = Header(frame_id=request.frame_out, stamp=self._now()), f"queued: {ahead} ahead"
+            self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=told))
 
     def started(self, request: Request) -> None:
         """The worker begins; a cloud that waited for that is told of only now."""
@@ -215,8 +369,6 @@ class Responses:
         if request.listener is not None:
             request.listener.progressed(message)
 
-    # Over.
-
     def finished(self, request: Request, report: Report[Planned]) -> None:
         """A request that was taken has ended; never raises."""
         try:
@@ -231,7 +383,8 @@ class Responses:
         if report.error is not None:
             self.tell_error(request.id, request.source, report.error)
             code, message = code_of(report.error), sentence_of(report.error)
-            self._end(request, messages.AnswerEnding(GraspArray.FAILED, code, message))
+            answer = self._answer(request, messages.AnswerEnding(GraspArray.FAILED, code, message))
+            self._publish(answer, request.listener)
         elif report.ending is WorkerEnding.DONE and report.value is not None:
             self._result(request, report.value)
         elif report.ending is WorkerEnding.SUPERSEDED and request.only_newest and report.value is None:
@@ -254,7 +407,8 @@ class Responses:
         best = presentable(result)
         if best is not None:
             shown.append(messages.joint_message(best.grasp, hand, request.stamp))
-            shown.append(messages.pose_message(best, request.frame_out, request.stamp))
+            header = Header(frame_id=request.frame_out, stamp=request.stamp)
+            shown.append(PoseStamped(header=header, pose=pose_of_posture(best.grasp)))
             shown.append(next(iter(answer.grasps)).trajectory)
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
@@ -285,9 +439,6 @@ class Responses:
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
         return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, _pace(request))
 
-    def _end(self, request: Request, ending: messages.AnswerEnding) -> None:
-        self._publish(self._answer(request, ending), request.listener)
-
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
         self.counters.answered(message)
         self.publishers.publish(message)
@@ -296,8 +447,6 @@ class Responses:
                 listener.ended(message)
             except Exception as error:  # the answer is out: it must not be followed by another
                 self._log().error(f"{message.request_id}: {''.join(traceback.format_exception(error))}")
-
-    # Events.
 
     def nothing_to_cancel(self, request_id: str) -> None:
         """A cancel that came after the end, or for a request that never was: common, and no fault."""

@@ -1,4 +1,4 @@
-"""Clouds: refused, cleaned and moved; their layouts as bytes, the same as in messages (test/ros/test_pointcloud.py)."""
+"""Clouds: refused, cleaned and moved; their layouts as bytes. Messages: test/ros/inputs/test_sensor_frames.py."""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import GraspArray, GraspProgress, GraspRequest
@@ -120,6 +121,9 @@ class Client:
 
         return self.spin_until(find, "health")
 
+    def now(self) -> Time:
+        return self.node.get_clock().now().to_msg()
+
     def spin_for(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -201,6 +205,11 @@ class Client:
             return all(event["request"] in ends for event in self.events if event["event"] == "accepted")
 
         self.spin_until(ended, "end of everything")
+
+    def run(self, *command: str | Path) -> subprocess.CompletedProcess[str]:
+        """Run a Python program in this domain to its end."""
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain)}
+        return subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -360,36 +369,23 @@ def node(client: Client, shared_node: SharedNode) -> Iterator[NodeProcess]:
 
 @pytest.fixture
 def start_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
-    """Starts a node of the test's own; `ready=False` does not wait for it. `sphere.obj` and `mug.obj` are in reach."""
+    """Starts nodes of the test's own; `ready=False` does not wait. `sphere.obj` and `mug.obj` are in reach.
+
+    Nodes under namespaces stand side by side, each in a directory of its own.
+    """
     shared_node.stop()
     save_shapes(tmp_path)
     started: list[NodeProcess] = []
 
-    def start(ready: bool = True, module: Path | None = None, **parameters: Any) -> NodeProcess:
+    def start(ready: bool = True, module: Path | None = None, namespace: str = "", **parameters: Any) -> NodeProcess:
         if ready:
             started.append(start_ready(client, tmp_path, module, **parameters))
         else:
-            started.append(NodeProcess(client.domain, tmp_path, parameters, module))
+            directory = tmp_path / namespace.strip("/")
+            directory.mkdir(exist_ok=True)
+            started.append(NodeProcess(client.domain, directory, parameters, module, namespace))
         return started[-1]
 
     yield start
-    for process in started:
-        process.stop()
-
-
-@pytest.fixture
-def spawn_node(client: Client, shared_node: SharedNode, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
-    """Starts nodes under namespaces, side by side; `sphere.obj` and `mug.obj` are in the test's directory."""
-    shared_node.stop()
-    save_shapes(tmp_path)
-    started: list[NodeProcess] = []
-
-    def spawn(namespace: str, **parameters: Any) -> NodeProcess:
-        directory = tmp_path / namespace.strip("/")
-        directory.mkdir()
-        started.append(NodeProcess(client.domain, directory, parameters, namespace=namespace))
-        return started[-1]
-
-    yield spawn
     for process in started:
         process.stop()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +119,7 @@ def test_a_group_that_is_no_hand_and_an_object_without_shape_are_aborted_and_tol
 
 
 def test_the_client_of_the_docs_gets_grasps_in_a_process_of_its_own(client, planning):
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(client.domain)}
-    done = subprocess.run([sys.executable, EXAMPLE], env=environment, capture_output=True, text=True, timeout=200)
+    done = client.run(EXAMPLE)
     assert done.returncode == 0, done.stderr
     first, *_ = done.stdout.splitlines()
     assert first == "1 grasps found thus far"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped
+from geometry_msgs.msg import Point, Pose, Quaternion
 from graspd_msgs.msg import GraspArray, GraspRequest
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
@@ -17,8 +17,6 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from graspd_core.errors import GraspdError
-from graspd_core.io.bags import add_transforms
-from graspd_core.transforms import TransformBuffer
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.sensor_frames import ImagePairs, cloud_frame, depth_sensor_frame
 from graspd_ros.outputs.responses import status_line
@@ -124,25 +122,6 @@ def test_any_depth_image_is_read_or_refused_in_one_line(image: Image, info: Came
     view, _ = refused(depth_sensor_frame(image, info, 5).read)
     if view is not None:
         assert np.isfinite(view.points).all()
-
-
-def test_the_messages_that_are_changed_are_good_ones():
-    assert cloud_frame(PointCloud2(**CLOUD), 5).read().points.shape == (6, 3)
-    assert depth_sensor_frame(Image(**IMAGE), CameraInfo(**INFO), 5).read().points.shape == (6, 3)
-
-
-@settings(max_examples=60)
-@given(st.lists(st.tuples(texts, texts, floats, floats, stamps, st.booleans()), max_size=5))
-def test_any_transform_is_kept_or_named(drawn):
-    buffer = TransformBuffer()
-    for parent, child, move, turn, stamp, static in drawn:
-        item = TransformStamped(header=Header(frame_id=parent, stamp=stamp), child_frame_id=child)
-        item.transform.translation.x, item.transform.rotation.z = move, turn
-        for line in add_transforms(buffer, type("TFMessage", (), {"transforms": [item]})(), static=static):
-            assert "\n" not in line
-    for name in buffer.frames():
-        pose, _ = refused(lambda: buffer.lookup(name, buffer.frames()[0]))  # noqa: B023
-        assert pose is None or np.isfinite(pose).all()
 
 
 @pytest.mark.timeout(300)

@@ -119,12 +119,6 @@ def test_an_argument_that_is_not_for_ros_is_refused(capsys):
     assert "--ros-args" in capsys.readouterr().out
 
 
-def test_a_refused_start_is_the_status_of_the_process(start_node):
-    process = start_node(ready=False, hand="no_such_hand")
-    assert process.process.wait() == 2
-    assert "Traceback" not in process.log.read_text()
-
-
 def test_a_request_whose_work_blows_up_is_answered_and_the_next_is_served(client, start_node, shared_node):
     """The planner of this node is rigged (saboteur.py): it raises what the seed says."""
     process = start_node(module=SABOTEUR)

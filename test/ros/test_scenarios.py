@@ -176,7 +176,7 @@ def test_a_played_recording_is_grasped_in_the_world_and_the_recorded_answer_read
 
 def test_a_cloud_that_tf_does_not_lead_from_is_refused_and_the_node_lives(client, node, publish, make_cloud):
     client.set_parameters(output_frame="robot", **ONE)
-    now = client.node.get_clock().now().to_msg()
+    now = client.now()
     rig = TransformStamped(child_frame_id="rig")
     rig.header.frame_id, rig.header.stamp = "robot", now
     publish(TFMessage(transforms=[rig]), "/tf")

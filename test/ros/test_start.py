@@ -1,22 +1,31 @@
-"""What a start finds around it: another ROS, no place for logs, launch arguments, two hands on one robot."""
+"""What a start finds: another ROS, no place for logs, arguments, a robot's arm, two hands on one robot."""
 
 from __future__ import annotations
 
 import ast
+import json
 import os
 from pathlib import Path
 
 import pytest
 import rclpy
+from geometry_msgs.msg import Point, Pose
+from graspd_msgs.action import SynthesizeGrasps
+from graspd_msgs.msg import GraspArray, GraspRequest
+from rclpy.action.client import ActionClient
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Header, String
 
 from graspd_core import load_hand
 from graspd_core.errors import HandError
-from graspd_core.hands.model import all_joint_names
 from graspd_core.paths import config_dir
-from graspd_ros.node import log_directory
-from graspd_ros.ros_command import foreign_rclpy
+from graspd_ros.node import foreign_rclpy, log_directory
 
 LAUNCH = Path(__file__).parents[2] / "graspd_ros" / "launch" / "graspd.launch.py"
+pytestmark = pytest.mark.timeout(300)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+HANDS = {"left": "allegro_left", "right": "allegro_right"}
+FEW = {"num_grasps": 1, "preset": "fast", "deadline": 100.0}
 
 
 def test_an_rclpy_before_the_environments_own_is_told_in_one_line():
@@ -50,13 +59,6 @@ def test_launch_arguments_that_are_not_given_leave_the_parameter_file_as_it_is()
     assert names["given"](asked) == {"hand": "leap_right", "use_sim_time": True}
 
 
-def test_the_names_of_two_hands_differ_by_a_prefix():
-    plain, left = load_hand("barrett_like", candidates=50), load_hand("barrett_like", candidates=50, prefix="left_")
-    assert left.base_link == f"left_{plain.base_link}"
-    assert all_joint_names(left) == tuple(f"left_{name}" for name in all_joint_names(plain))
-    assert set(left.link_index) == {f"left_{name}" for name in plain.link_names}
-
-
 def test_a_hand_is_taken_out_of_a_robots_description(tmp_path):
     hand = (config_dir() / "hands" / "parallel_gripper.urdf").read_text()
     plain = load_hand("parallel_gripper", candidates=50)
@@ -73,3 +75,106 @@ def test_a_hand_is_taken_out_of_a_robots_description(tmp_path):
     (tmp_path / "hand.yaml").write_text("urdf: robot.urdf\nroot: elbow\n")
     with pytest.raises(HandError, match="root: no link 'elbow'; links: world_base, arm"):
         load_hand(tmp_path / "hand.yaml")
+
+
+def description(folder: Path, **keys: str) -> Path:
+    """The shipped arm of seven axes, its URDF left to the topic."""
+    text = (config_dir() / "arms" / "panda_like.yaml").read_text().replace("urdf: panda_like.urdf", "")
+    path = folder / "arm.yaml"
+    for key, value in keys.items():
+        text = "\n".join(line for line in text.splitlines() if not line.startswith(f"{key}:")) + f"\n{key}: {value}\n"
+    path.write_text(f"{text}\nurdf: robot_description\n")
+    return path
+
+
+@pytest.fixture
+def robot(client):
+    """What robot_state_publisher sends, once, before the node starts."""
+    publisher = client.node.create_publisher(String, "/robot_description", LATCHED)
+    publisher.publish(String(data=(config_dir() / "arms" / "panda_like.urdf").read_text()))
+    yield publisher
+    client.node.destroy_publisher(publisher)
+
+
+def told_at_the_start(start_node, arm: Path) -> list[str]:
+    node = start_node(ready=False, arm=arm)
+    node.process.wait(100)
+    status, log = node.stop()
+    assert status == 2
+    return [line for line in log.splitlines() if line.startswith("graspd_node:")]
+
+
+def test_grasps_come_with_the_joints_of_an_arm_that_was_heard(client, robot, start_node, tmp_path):
+    start_node(arm=description(tmp_path), hand="barrett_like", num_grasps=1, preset="fast", deadline=100.0)
+    place = Pose(position=Point(x=0.5, z=0.2))
+    header = Header(frame_id="base_link")
+    client.send_request(
+        id="r", source=GraspRequest.MESH, mesh_uri="sphere.obj", header=header, object_pose=place, time_budget=100.0
+    )
+    answer = client.answer("r")
+    assert answer.status == GraspArray.SUCCEEDED, answer.message
+    assert list(answer.grasps[0].arm_trajectory.joint_names) == [f"joint_{number}" for number in range(1, 8)]
+
+
+def test_a_link_that_the_robot_does_not_have_ends_the_start_with_the_choices(robot, start_node, tmp_path):
+    (told,) = told_at_the_start(start_node, description(tmp_path, tip="tool"))
+    assert "arm.yaml.tip: no link 'tool' in the URDF; links: base_link, " in told
+    (told,) = told_at_the_start(start_node, description(tmp_path, base="torso"))
+    assert "arm.yaml.base: no link 'torso' in the URDF; links: base_link, " in told
+
+
+def test_a_robot_that_never_comes_is_waited_for_so_long(start_node, tmp_path):
+    arm = description(tmp_path)
+    (told,) = told_at_the_start(start_node, arm)
+    assert told == (
+        f"graspd_node: parameter arm: {arm} is part of the robot on /robot_description, where nothing came within 10 s"
+        "; start robot_state_publisher first, or name a file in urdf"
+    )
+
+
+@pytest.fixture
+def sides(client, start_node, tmp_path):
+    """The two nodes, when both have said that they are ready."""
+    started, ready = {}, {}
+    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    heard = []
+    for side, hand in HANDS.items():
+        parameters = {"hand": hand, "hand_prefix": f"{side}_", "mesh_roots": f"[{tmp_path}]", **FEW}
+        started[side] = start_node(ready=False, namespace=f"/{side}", **parameters)
+
+        def hear(message: String, side: str = side) -> None:
+            event = json.loads(message.data)
+            if event["event"] == "ready":
+                ready[side] = event
+
+        heard.append(client.node.create_subscription(String, f"/{side}/graspd/status", hear, latched))
+    client.spin_until(lambda: len(ready) == 2, "two nodes")
+    yield tmp_path
+    for subscription in heard:
+        client.node.destroy_subscription(subscription)
+    for process in started.values():
+        assert process.stop()[0] == 0
+
+
+def test_two_nodes_of_one_domain_answer_each_for_its_own_hand(client, sides):
+    mesh = str(sides / "sphere.obj")
+    actions = {side: ActionClient(client.node, SynthesizeGrasps, f"/{side}/graspd/synthesize") for side in HANDS}
+    for action in actions.values():
+        client.spin_until(action.server_is_ready, "action server")
+    goal = SynthesizeGrasps.Goal(request=GraspRequest(id="same-id", source=GraspRequest.MESH, mesh_uri=mesh))
+    sent = {side: action.send_goal_async(goal) for side, action in actions.items()}
+    client.spin_until(lambda: all(future.done() for future in sent.values()), "answers to goals")
+    handles = {side: future.result() for side, future in sent.items()}
+    ends = {side: handle.get_result_async() for side, handle in handles.items() if handle is not None}
+    assert set(ends) == set(HANDS)
+    client.spin_until(lambda: all(future.done() for future in ends.values()), "results")
+    for side, future in ends.items():
+        answer = future.result().result.result
+        assert answer.status == GraspArray.SUCCEEDED
+        grasp = answer.grasps[0]
+        assert grasp.hand == HANDS[side]
+        assert grasp.base_link.startswith(f"{side}_")
+        assert all(name.startswith(f"{side}_") for name in grasp.trajectory.joint_names)
+        assert all(contact.link.startswith(f"{side}_") for contact in grasp.contacts)
+    for action in actions.values():
+        action.destroy()

@@ -52,9 +52,9 @@ class Bench:
 
     def run(self, *jobs: Job, policy: BusyPolicy = BusyPolicy.QUEUE) -> list[bool]:
         """Submit jobs one after another, the first with the worker idle."""
-        taken = [self.worker.submit(jobs[0], policy).accepted]
+        taken = [self.worker.submit(jobs[0], policy).refusal is None]
         assert self.started.acquire(timeout=TIMEOUT)
-        return taken + [self.worker.submit(job, policy).accepted for job in jobs[1:]]
+        return taken + [self.worker.submit(job, policy).refusal is None for job in jobs[1:]]
 
     def wait(self, count: int) -> dict[str, WorkerEnding]:
         end = time.monotonic() + TIMEOUT
@@ -77,7 +77,8 @@ def jobs(count: int, **kind) -> list[Job]:
 
 
 def test_the_queue_holds_its_size_and_refuses_the_next(bench: Bench):
-    assert bench.run(*jobs(4)) == [True, True, True, False]
+    assert bench.run(*jobs(3)) == [True, True, True]
+    assert "queue is full" in bench.worker.submit(Job("3"), BusyPolicy.QUEUE).reason
     bench.release.set()
     assert bench.wait(3) == {str(i): WorkerEnding.DONE for i in range(3)}
 
@@ -86,12 +87,12 @@ def test_reject_takes_nothing_while_busy(bench: Bench):
     assert bench.run(*jobs(2), policy=BusyPolicy.REJECT) == [True, False]
     bench.release.set()
     assert bench.wait(1) == {"0": WorkerEnding.DONE}
-    assert bench.worker.submit(Job("2"), BusyPolicy.REJECT).accepted
+    assert bench.worker.submit(Job("2"), BusyPolicy.REJECT).refusal is None
 
 
 def test_replace_supersedes_what_runs_and_waits(bench: Bench):
     bench.run(*jobs(2))
-    assert bench.worker.submit(Job("2"), BusyPolicy.REPLACE).accepted
+    assert bench.worker.submit(Job("2"), BusyPolicy.REPLACE).refusal is None
     assert bench.wait(2) == {"0": WorkerEnding.SUPERSEDED, "1": WorkerEnding.SUPERSEDED}
     bench.release.set()
     assert bench.wait(3)["2"] is WorkerEnding.DONE
@@ -140,7 +141,7 @@ def test_an_id_is_taken_once_at_a_time(bench: Bench, policy: BusyPolicy):
     assert (again.refusal, again.reason) == (Refusal.DUPLICATE, "a request 'same' is already waiting or running")
     bench.release.set()
     assert bench.wait(1) == {"same": WorkerEnding.DONE}
-    assert bench.worker.submit(Job("same"), BusyPolicy.REJECT).accepted
+    assert bench.worker.submit(Job("same"), BusyPolicy.REJECT).refusal is None
     bench.wait(2)
 
 
@@ -183,7 +184,7 @@ def test_accepted_requests_and_reports_match_one_to_one(actions):
         job = Job(str(number), only_newest=action == "newest", error=ValueError() if action == "fail" else None)
         if action == "cancel":
             bench.worker.cancel("")
-        elif bench.worker.submit(job, policy).accepted:
+        elif bench.worker.submit(job, policy).refusal is None:
             accepted.append(job.id)
     assert bench.worker.stop(TIMEOUT)
     assert Counter(name for name, _ in bench.reports) == Counter(accepted)

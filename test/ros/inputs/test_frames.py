@@ -1,4 +1,4 @@
-"""Frames: matrices of messages, results in another frame, and /tf over DDS with the real message type."""
+"""Matrices of messages, results in another frame, /tf over DDS, and where the arm stands that carries the hand."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
+import torch
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from hypothesis import given
@@ -23,11 +25,18 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 
+from graspd_core import load_hand, load_scene
+from graspd_core.arms.arm import arm_links, tip_hand
 from graspd_core.errors import TransformError
 from graspd_core.transforms import TransformBuffer
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Plane, Posture, Timing
 from graspd_ros import convert
+from graspd_ros.convert import matrix_of_posture
 from graspd_ros.inputs import tf_listener
+from graspd_ros.inputs.tf_listener import reach_of
+from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
+from graspd_ros.request_planner import Planner
 
 ROOT = Path(__file__).parents[3]
 SECOND = 1_000_000_000
@@ -65,6 +74,7 @@ for step in range(2000):
         break
     time.sleep(0.01)
 """
+SETTINGS = Settings(num_grasps=1, preset="fast", deadline=100.0, verify="none", arm="panda_like")
 
 
 def pose(xyz: tuple[float, float, float], rotation: Rotation) -> Pose:
@@ -96,11 +106,6 @@ def test_poses_and_matrices_are_inverse_to_each_other(xyz, seed):
     q = pose(xyz, rotation).orientation
     transform = Transform(translation=Vector3(x=xyz[0], y=xyz[1], z=xyz[2]), rotation=q)
     np.testing.assert_array_equal(convert.matrix_of_transform(transform), T)
-
-
-def test_the_order_of_the_quaternion_is_that_of_ros():
-    quarter_about_z = Pose(orientation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5)))
-    np.testing.assert_allclose(convert.matrix_of_pose(quarter_about_z)[:3, 0], [0, 1, 0], atol=1e-12)
 
 
 def test_a_rounded_quaternion_is_made_unit_and_a_wrong_one_refused():
@@ -252,3 +257,64 @@ def test_when_time_jumps_back_everything_is_forgotten(node: Node):
     set_time(50)
     assert listener.available
     assert buffer.frames() == ()
+
+
+def request(settings: Settings, pose: np.ndarray | None = None) -> Request:
+    return Request("r", "mesh", "map", Time(), settings, lambda: load_scene("shape:box"), T_frame_object=pose)
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    """A pose turned by a quarter about z."""
+    pose = np.eye(4)
+    pose[:2, :2], pose[:3, 3] = [[0.0, -1.0], [1.0, 0.0]], [x, y, z]
+    return pose
+
+
+def test_the_base_is_placed_in_the_frame_of_the_object():
+    asked: list[tuple[str, str]] = []
+
+    def lookup(target: str, source: str) -> np.ndarray:
+        asked.append((target, source))
+        return at(-0.5, 0.0, 0.1)
+
+    seen = reach_of(request(SETTINGS), lookup)
+    assert asked == [("map", "base_link")]
+    assert seen.position == pytest.approx((-0.5, 0.0, 0.1))
+    assert seen.quaternion_wxyz == pytest.approx((np.sqrt(0.5), 0, 0, np.sqrt(0.5)))
+    placed = reach_of(request(replace(SETTINGS, arm_base_frame="robot"), at(1.0, 2.0, 0.0)), lookup)
+    assert asked[-1] == ("map", "robot")
+    assert placed.position == pytest.approx((-2.0, 1.5, 0.1))
+    assert abs(placed.quaternion_wxyz[0]) == pytest.approx(1.0)
+    assert placed.arm is seen.arm, "what is known of an arm is kept"
+    own = reach_of(request(replace(SETTINGS, arm_base_frame="map")), lookup)
+    assert (len(asked), own.position) == (2, (0.0, 0.0, 0.0))
+
+
+def test_a_planned_grasp_has_the_arm_s_joints_in_every_frame():
+    """The object stands in `map`, the result is told in `out`: the arm's tip is where the grasp's pose says."""
+    base, object_pose, T_out_map = at(0.5, 2.0, -0.1), at(1.0, 2.0, 0.0), at(3.0, 0.0, 0.0)
+
+    def lookup(target: str, source: str, stamp: Time, stop: object) -> np.ndarray:
+        return {("map", "base_link"): base, ("out", "map"): T_out_map}[target, source]
+
+    hand = load_hand("barrett_like")
+    settings = replace(SETTINGS, hand="barrett_like", output_frame="out")
+    planned = Planner(hand, lookup).plan(request(settings, object_pose), lambda: False, lambda _: None)
+    reach = reach_of(request(settings, object_pose), lambda target, source: base)
+    for grasp in planned.result.grasps:
+        assert grasp.arm is not None
+        links = arm_links(reach.arm, torch.as_tensor(grasp.arm.at("grasp"))[None])
+        carried = links[0, reach.arm.tip].compose(tip_hand(reach.arm, hand))
+        world = T_out_map @ base
+        told = matrix_of_posture(grasp.grasp)
+        assert np.allclose(world[:3, :3] @ carried.translation.numpy() + world[:3, 3], told[:3, 3], atol=5e-4)
+        assert np.allclose(world[:3, :3] @ carried.rotation.numpy(), told[:3, :3], atol=5e-3)
+
+
+def test_a_base_that_tf_does_not_know_is_named_before_any_work():
+    def lookup(target: str, source: str, stamp: Time, stop: object) -> np.ndarray:
+        raise TransformError(f"{source} -> {target}: not connected")
+
+    asked = replace(request(SETTINGS), load=lambda: pytest.fail("the object was read"))
+    with pytest.raises(TransformError, match="base_link -> map"):
+        Planner(load_hand("barrett_like"), lookup).plan(asked, lambda: False, lambda _: None)

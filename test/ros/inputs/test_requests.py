@@ -1,32 +1,52 @@
-"""What a request must hold, and what becomes of it; no node."""
+"""From messages to requests: what is checked, where meshes may lie, the sources, and wishes for place and direction."""
 
 from __future__ import annotations
 
 import array
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
+from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
 
-from graspd_core.errors import CloudError, GraspdError, NoObjectError, ResourceError, TransformError
+from graspd_core import Box, Sphere, load_scene
+from graspd_core.errors import CloudError, GraspdError, MeshError, NoObjectError, ResourceError, TransformError
 from graspd_core.optimize.plan_config import preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_ros.convert import pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
-from graspd_ros.inputs.request_builder import RequestBuilder, check_request, settings_of
+from graspd_ros.inputs.request_builder import (
+    MOST_MESH_BYTES,
+    SOURCES,
+    RequestBuilder,
+    Source,
+    SourceInput,
+    check_request,
+    resolve_mesh,
+    settings_of,
+)
 from graspd_ros.inputs.sensor_frames import MOST_CLOUD_BYTES, MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed
 from graspd_ros.parameters import MOST_GRASPS, Settings
+from graspd_ros.request import Request
 
 NOW = Time(sec=1000)
 HAND = "allegro_right"
 FAR = Pose(position=Point(x=math.inf))
+# A quarter turn about x: the object's z is the header's −y.
+LYING = Pose(position=Point(x=0.5), orientation=Quaternion(x=np.sqrt(0.5), w=np.sqrt(0.5)))
+BOX, BALL = SolidPrimitive.BOX, SolidPrimitive.SPHERE
+DOWN = Vector3(z=-1.0)
+SEEN = Time(sec=999)
+SCANNER = 9
 
 
 def intake(lookup=lambda target, source, stamp: np.eye(4)) -> RequestBuilder:
@@ -289,3 +309,229 @@ def test_what_was_lost_and_which_object_it_was_of_reach_the_worker(tmp_path):
     assert "exclude: 257 ids, 0 poses; valid: 256" in str(refusal(exclude=["a/0"] * 257))
     with pytest.raises(RequestError, match="exclude_poses: position"):
         intake().from_message("u", settings, GraspRequest(**mesh, exclude_poses=[PoseStamped(pose=FAR)]))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    root = tmp_path / "root"
+    (root / "sub dir").mkdir(parents=True)
+    (root / "mug.obj").write_text("")
+    (root / "sub dir" / "cup.obj").write_text("")
+    (tmp_path / "secret.obj").write_text("")
+    (root / "link.obj").symlink_to(tmp_path / "secret.obj")
+    (root / "inner.obj").symlink_to(root / "mug.obj")
+    return root
+
+
+def test_every_form_finds_the_file(root: Path, monkeypatch: pytest.MonkeyPatch):
+    prefix = root / "prefix"
+    share = prefix / "share" / "things"
+    share.mkdir(parents=True)
+    (share / "pan.obj").write_text("")
+    (prefix / "share" / "ament_index" / "resource_index" / "packages").mkdir(parents=True)
+    (prefix / "share" / "ament_index" / "resource_index" / "packages" / "things").write_text("")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(prefix))
+    mug, cup = root / "mug.obj", root / "sub dir" / "cup.obj"
+    found = {
+        "mug.obj": mug,
+        "./sub dir/../mug.obj": mug,
+        " mug.obj\n": mug,
+        str(mug): mug,
+        f"file://{mug}": mug,
+        f"file://localhost{root}/sub%20dir/cup.obj": cup,
+        "inner.obj": mug,
+        "package://things/pan.obj": share / "pan.obj",
+    }
+    assert {uri: resolve_mesh(uri, [str(root)]) for uri in found} == found
+    assert resolve_mesh("package://things/pan.obj", ["package://things"]) == share / "pan.obj"
+
+
+@pytest.mark.parametrize(
+    ("uri", "culprit"),
+    [
+        ("", "empty"),
+        ("../secret.obj", "outside the allowed mesh_roots"),
+        ("link.obj", "outside the allowed mesh_roots"),
+        ("file:///etc/hostname", "outside the allowed mesh_roots"),
+        ("/etc/hostname", "outside the allowed mesh_roots"),
+        ("file://elsewhere/mug.obj", "unknown form"),
+        ("https://elsewhere/mug.obj", "unknown form"),
+        ("package://nothing/mug.obj", "'nothing' is not installed"),
+        ("missing.obj", "no such file"),
+        ("sub dir", "a directory"),
+        ("mug\0.obj", "not a usable path"),
+        ("m" * 300, "not a usable path"),
+        ("m" * 5000, "5000 characters long"),
+    ],
+)
+def test_what_may_not_be_read_is_refused_by_name(root: Path, uri: str, culprit: str):
+    with pytest.raises(MeshError) as refused:
+        resolve_mesh(uri, [str(root)])
+    assert culprit in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_without_a_usable_root_nothing_may_be_read(root: Path):
+    with pytest.raises(MeshError, match="names no directory"):
+        resolve_mesh("mug.obj", [str(root / "nowhere"), "package://nothing"])
+
+
+PARTS = st.sampled_from(["..", ".", "root", "sub dir", "mug.obj", "secret.obj", "link.obj", "", "/", "~", "%2e%2e"])
+
+
+@given(st.sampled_from(["", "file://", "file:///", "package://"]), st.lists(PARTS, max_size=8))
+def test_no_spelling_leads_out(tmp_path_factory: pytest.TempPathFactory, scheme: str, parts: list[str]):
+    base = tmp_path_factory.getbasetemp() / "spellings"
+    root = base / "root"
+    if not root.exists():
+        (root / "sub dir").mkdir(parents=True)
+        (root / "mug.obj").write_text("")
+        (base / "secret.obj").write_text("")
+        (root / "link.obj").symlink_to(base / "secret.obj")
+    try:
+        found = resolve_mesh(scheme + "/".join(parts), [str(root)])
+    except MeshError:
+        return
+    assert found == root / "mug.obj"
+
+
+def test_a_mesh_too_large_to_read_is_refused_before_it_is_read(root: Path):
+    with (root / "huge.obj").open("wb") as file:
+        file.truncate(MOST_MESH_BYTES + 1)
+    with pytest.raises(MeshError, match="at most 100 MB"):
+        resolve_mesh("huge.obj", [str(root)])
+
+
+def solid(kind: int, *sizes: float) -> SolidPrimitive:
+    return SolidPrimitive(type=kind, dimensions=list(sizes))
+
+
+def request(tmp_path, lookup=lambda *_: np.eye(4), **fields) -> Request:
+    (tmp_path / "can.obj").touch()
+    message = GraspRequest(source=GraspRequest.MESH, mesh_uri=str(tmp_path / "can.obj"), **fields)
+    builder = RequestBuilder("allegro_right", lambda: Time(sec=1), lookup)
+    return builder.from_message("r", Settings(mesh_roots=[str(tmp_path)]), message)
+
+
+def test_a_request_that_asks_for_nothing_has_no_wishes(tmp_path):
+    assert request(tmp_path).steering is None
+    assert request(tmp_path, object_pose=LYING, region=SolidPrimitive(), region_pose=LYING).steering is None
+
+
+def test_wishes_come_to_the_frame_of_the_object(tmp_path):
+    asked = request(
+        tmp_path,
+        object_pose=LYING,
+        approach_direction=DOWN,
+        approach_angle=0.3,
+        use_roll=True,
+        roll=1.0,
+        region=solid(BALL, 0.1),
+        region_pose=Pose(position=Point(x=0.5, z=0.2)),
+        avoid=[solid(BOX, 0.1, 0.2, 0.3)],
+        avoid_poses=[Pose(position=Point(x=0.6))],
+    ).steering
+    assert asked is not None
+    found = asked()
+    # Header's −z is the object's −y; the header's x, from which a vertical approach's roll is measured, stays.
+    assert np.allclose(np.asarray(found.approach_direction), [0, -1, 0])
+    assert found.roll_zero is not None
+    assert np.allclose(np.asarray(found.roll_zero), [1, 0, 0])
+    assert (found.approach_angle, found.roll, found.roll_tolerance) == (0.3, 1.0, np.pi / 12)
+    assert isinstance(found.region, Sphere)
+    assert np.allclose(np.asarray(found.region.center), [0, 0.2, 0])
+    (box,) = found.avoid
+    assert np.allclose(np.asarray(box.center), [0.1, 0, 0])
+    # The box's edges lie along the header's axes.
+    assert np.allclose(box.rotation @ [0, 0, 1], [0, 1, 0])
+    assert box.size == (0.1, 0.2, 0.3)
+
+
+def test_wishes_in_another_frame_than_the_cloud_go_by_tf():
+    from sensor_msgs.msg import PointCloud2
+
+    T = np.eye(4)
+    T[:3, :3] = [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    builder = RequestBuilder("allegro_right", lambda: Time(sec=1), lambda target, source, stamp: T)
+    cloud = PointCloud2(header=Header(frame_id="camera", stamp=Time(sec=1)))
+    for frame, direction in (("map", [0, -1, 0]), ("camera", [0, 0, -1]), ("", [0, 0, -1])):
+        message = GraspRequest(header=Header(frame_id=frame), cloud=cloud, approach_direction=DOWN)
+        steering = builder.from_message("r", Settings(), message).steering
+        assert steering is not None
+        assert np.allclose(np.asarray(steering().approach_direction), direction)
+
+
+def test_a_box_may_be_the_region(tmp_path):
+    steering = request(tmp_path, region=solid(BOX, 0.1, 0.1, 0.1)).steering
+    assert steering is not None
+    assert isinstance(steering().region, Box)
+
+
+@pytest.mark.parametrize(
+    ("fields", "culprit"),
+    [
+        ({"approach_direction": Vector3(x=float("nan"))}, "approach_direction: .*3 finite numbers"),
+        ({"approach_angle": 0.5}, "approach_angle: it needs approach_direction"),
+        ({"approach_direction": DOWN, "approach_angle": -0.5}, "approach_angle: -0.5 rad; valid: above 0"),
+        ({"approach_direction": DOWN, "approach_angle": 4.0}, "approach_angle: 4 rad; valid: above 0"),
+        ({"approach_direction": DOWN, "approach_angle": float("nan")}, "approach_angle: nan"),
+        ({"approach_direction": DOWN, "roll": 0.5}, "roll: use_roll is false"),
+        ({"use_roll": True}, "roll: needs approach_direction"),
+        ({"approach_direction": DOWN, "use_roll": True, "roll": float("inf")}, "roll: inf"),
+        ({"region": solid(BOX, 0.1)}, "region: type 1 of 1 dimensions; valid: BOX=1 or SPHERE=2"),
+        ({"region": solid(BALL, 0.1, 0.1)}, "region: 2 dimensions; valid: the radius of a SPHERE"),
+        ({"region": solid(BALL, -0.1)}, "sphere radius: -0.1 m; valid: above 0"),
+        ({"region": solid(SolidPrimitive.CONE, 0.1, 0.1)}, "region: type 4 of 2 dimensions"),
+        ({"region": solid(BALL, 0.1), "region_pose": Pose(position=Point(x=float("inf")))}, "region_pose: position"),
+        ({"region_mask": Image(height=1)}, "region_mask: with source 1; valid with CLOUD=0"),
+        ({"region_mask": Image(height=1), "region": solid(BALL, 0.1)}, "region_mask: region is given too"),
+        ({"avoid": [solid(BOX, 1, 1, 1)]}, "avoid: 1 boxes, 0 poses; valid: one avoid_poses for each, at most 64"),
+        ({"avoid": [solid(BALL, 1)], "avoid_poses": [Pose()]}, "avoid: type 2 of 1 dimensions; valid: BOX=1"),
+        ({"avoid": [solid(BOX, 1, 0, 1)], "avoid_poses": [Pose()]}, "box size: .*three lengths above 0"),
+    ],
+)
+def test_wishes_that_make_no_sense_are_refused_by_name(tmp_path, fields, culprit):
+    with pytest.raises(GraspdError, match=culprit) as refused:
+        request(tmp_path, **fields)
+    assert code_of(refused.value) is ErrorCode.BAD_REQUEST
+
+
+@pytest.fixture
+def builder() -> RequestBuilder:
+    return RequestBuilder("parallel_gripper", lambda: NOW, lambda target, source, stamp: np.eye(4))
+
+
+def test_every_constant_of_the_message_has_its_row():
+    names = {name for name in dir(GraspRequest) if name.isupper() and not name.endswith("__DEFAULT")} - {"SLOT_TYPES"}
+    assert {source.name.upper(): number for number, source in SOURCES.items()} == {
+        name: getattr(GraspRequest, name) for name in names
+    }
+
+
+def test_a_source_without_a_row_is_refused_and_the_rows_are_named(builder, monkeypatch: pytest.MonkeyPatch):
+    request = GraspRequest(source=SCANNER)
+    with pytest.raises(
+        RequestError, match=r"source: 9; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3, KNOWN=4$"
+    ) as refused:
+        builder.from_message("r", Settings(), request)
+    assert refused.value.code is ErrorCode.BAD_REQUEST
+    monkeypatch.setitem(SOURCES, 7, replace(SOURCES[GraspRequest.CLOUD], name="lidar"))
+    with pytest.raises(RequestError, match=r"LIDAR=7$"):
+        builder.from_message("r", Settings(), request)
+
+
+def test_a_source_is_one_row(builder, monkeypatch: pytest.MonkeyPatch):
+    scene, given = load_scene("shape:box", resolution=16), []
+
+    def from_scanner(asked: SourceInput) -> Request:
+        given.append((asked.message, asked.settings.num_grasps, asked.now))
+        return asked.request("scanner", SEEN, lambda: scene)
+
+    monkeypatch.setitem(SOURCES, SCANNER, Source("scanner", from_scanner))
+    message = GraspRequest(source=SCANNER, num_grasps=3, header=Header(frame_id="map"))
+    request = builder.from_message("r", Settings(), message)
+    assert given == [(message, 3, NOW)]
+    assert (request.source, request.frame, request.stamp, request.timeless) == ("scanner", "scanner", SEEN, False)
+    assert request.T_frame_object is None
+    assert request.settings.num_grasps == 3
+    assert request.load() is scene

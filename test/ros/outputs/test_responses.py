@@ -1,8 +1,11 @@
-"""What is published of a request that has ended: everything or one error, and exactly one answer."""
+"""Answers, events, poses, joint values and health."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -12,9 +15,13 @@ import pytest
 import rclpy
 import rclpy.node
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import GraspArray
+from hypothesis import given
+from hypothesis import strategies as st
 from rclpy.context import Context
+from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import MarkerArray
 
 from graspd_core.errors import MeshError
@@ -33,8 +40,9 @@ from graspd_core.types import (
     TrialResult,
     Verdict,
 )
+from graspd_ros.convert import pose_of_posture
 from graspd_ros.outputs import messages, responses
-from graspd_ros.outputs.responses import Responses
+from graspd_ros.outputs.responses import Health, Responses, health_message, resident_memory
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
 from graspd_ros.request_planner import Planned, overdue
@@ -48,6 +56,7 @@ NOT_A_NUMBER = {
     "squeeze's joint_positions": {"squeeze": replace(POSTURE, joint_positions=np.full(16, np.inf))},
     "contact of tip": {"contacts": (Contact("tip", (0.0, np.nan, 0.0), (0.0, 0.0, 1.0)),)},
 }
+GOOD = Health(name="/graspd", hand="allegro_right", ready=True, worker_alive=True, queue_size=4)
 
 
 def load_scene() -> Scene:
@@ -152,13 +161,11 @@ def a_result(*grasps: Grasp) -> GraspResult:
     return GraspResult(Outcome.TOO_FEW, grasps, Timing(total=1.0), seed=0, method="closed_form")
 
 
-def test_the_pose_names_its_frame_and_turns_wxyz_to_xyzw():
-    message = messages.pose_message(a_grasp(Verdict.VERIFIED), "camera", Time(sec=7))
-    assert message.header.frame_id == "camera"
-    assert message.header.stamp.sec == 7
-    orientation = message.pose.orientation
+def test_a_pose_turns_wxyz_to_xyzw():
+    pose = pose_of_posture(a_grasp(Verdict.VERIFIED).grasp)
+    orientation = pose.orientation
     assert (orientation.w, orientation.x, orientation.y, orientation.z) == (0.5, 0.1, -0.7, 0.5)
-    assert (message.pose.position.x, message.pose.position.y, message.pose.position.z) == (1.0, 2.0, 3.0)
+    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
 
 
 def test_the_joint_state_names_its_joints_and_carries_positions_only():
@@ -184,13 +191,7 @@ def test_a_grasp_known_to_be_bad_is_not_presented():
 
 
 def test_every_event_is_one_line_of_json_without_nan():
-    odd = {
-        "a": float("nan"),
-        "b": [np.float32(1.5), np.inf],
-        "c": {"d": np.int64(3)},
-        "e": "two\nlines",
-        "f": Stage.LOAD,
-    }
+    odd = {"a": np.nan, "b": [np.float32(1.5), np.inf], "c": {"d": np.int64(3)}, "e": "two\nlines", "f": Stage.LOAD}
     line = responses.status_line(odd)
     assert "\n" not in line
     assert json.loads(line) == {"a": None, "b": [1.5, None], "c": {"d": 3}, "e": "two\nlines", "f": "load"}
@@ -203,3 +204,82 @@ def test_every_event_is_one_line_of_json_without_nan():
         {"name": "hold", "passed": True, "displacement": 0.002, "rotation": 0.01, "reason": ""}
     ]
     assert summary["outcome"] == "too_few"
+
+
+def status(health: Health, memory: int = 300_000_000) -> DiagnosticStatus:
+    message = health_message(health, Time(sec=9), memory)
+    assert message.header.stamp.sec == 9
+    (found,) = message.status
+    return found
+
+
+def values(health: Health, memory: int = 300_000_000) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status(health, memory).values}
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "said"),
+    [
+        ({}, DiagnosticStatus.OK, "waits for requests"),
+        ({"running": "mesh-3"}, DiagnosticStatus.OK, "works on mesh-3"),
+        ({"ready": False}, DiagnosticStatus.WARN, "warming up"),
+        ({"waiting": 4}, DiagnosticStatus.WARN, "the queue is full: 4 wait"),
+        ({"waiting": 3}, DiagnosticStatus.OK, "waits for requests"),
+        ({"queue_size": 0}, DiagnosticStatus.OK, "waits for requests"),
+        ({"failed_in_a_row": 1, "last_error": "no such file"}, DiagnosticStatus.WARN, "the last request failed: no su"),
+        ({"failed_in_a_row": 3}, DiagnosticStatus.WARN, "the last 3 requests failed"),
+        ({"counts": {"requests failed": 9}}, DiagnosticStatus.OK, "waits for requests"),  # long past
+        ({"worker_alive": False, "ready": False}, DiagnosticStatus.ERROR, "restart the node"),
+    ],
+)
+def test_the_level_is_that_of_the_worst_that_holds(change: dict, level: bytes, said: str):
+    found = status(dataclasses.replace(GOOD, **change))
+    assert found.level == level
+    assert said in found.message
+
+
+def test_every_field_is_told():
+    """Change one field at a time: something in the message changes with it."""
+    other = {int: 7, bool: False, str: "other", float: 1.25, dict: {"clouds received": 1}}
+    before = status(GOOD)
+    # diagnostic_aggregator groups by what comes before the colon
+    assert (before.name, before.hardware_id) == ("graspd: grasp synthesis", "allegro_right")
+    for field in dataclasses.fields(Health):
+        value = getattr(GOOD, field.name)
+        changed = other[float] if value is None else other[type(value)]
+        changed = not value if isinstance(value, bool) else changed
+        assert status(dataclasses.replace(GOOD, **{field.name: changed})) != before, field.name
+
+
+def test_figures_are_readable_and_absent_where_unknown():
+    found = values(
+        dataclasses.replace(GOOD, last_latency=2.34567, counts={"grasps verified": 12, "clouds superseded": 5})
+    )
+    assert found["last latency [s]"] == "2.346"
+    assert found["last first verified [s]"] == ""
+    assert (found["grasps verified"], found["clouds superseded"]) == ("12", "5")
+    assert found["memory [MB]"] == "300"
+    assert values(GOOD, memory=0)["memory [MB]"] == ""
+
+
+WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS strings end at a zero
+
+
+@given(st.builds(Health, name=WORDS, hand=WORDS, running=WORDS, last_error=WORDS))
+def test_any_health_goes_through_the_middleware(health: Health):
+    message = health_message(health, Time(), 1)
+    assert deserialize_message(serialize_message(message), DiagnosticArray) == message
+
+
+def test_memory_is_that_of_a_process_and_its_children():
+    # In fresh processes: the heap of this one depends on the tests before.
+    holds = "ballast = b'x' * 60_000_000; print(flush=True); input()"
+    starts = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {holds!r}])"
+    with subprocess.Popen([sys.executable, "-c", starts], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        memory = resident_memory(child.pid)
+        assert 65_000_000 < memory < 120_000_000  # two interpreters beside it
+        assert resident_memory() > memory + 10_000_000
+        child.communicate(b"\n")
+    assert resident_memory(child.pid) == 0

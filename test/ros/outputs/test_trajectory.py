@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 from std_msgs.msg import Header
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
 from graspd_core.arms.arm_paths import STAGE_ROWS
 from graspd_core.errors import ConfigError
@@ -28,13 +28,12 @@ from graspd_core.perception.scene import object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import ArmPath, Grasp, Posture
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_ros.convert import matrix_of_pose
+from graspd_ros.convert import matrix_of, matrix_of_pose
 from graspd_ros.outputs.messages import (
     Pace,
     arm_trajectory,
     base_poses,
     grasp_message,
-    matrix_of_mount,
     stage_times,
     trajectory_of,
 )
@@ -169,33 +168,20 @@ def test_the_arms_link_is_where_the_mount_puts_it(mounted: HandModel, carried: G
         (message.grasp_pose, message.mount_grasp_pose),
     ):
         # T_frame_parent · T_parent_base is the base link's pose again.
-        again = matrix_of_pose(parent) @ matrix_of_mount(MOUNT)
+        again = matrix_of_pose(parent) @ matrix_of(MOUNT.position, MOUNT.quaternion_wxyz)
         np.testing.assert_allclose(again, matrix_of_pose(base), atol=1e-12)
     # By mounted: the base's z is turned by the quaternion (0.5, 0.5, -0.5, 0.5) onto -y; 3 cm back along it.
     z = matrix_of_pose(message.grasp_pose)[:3, 2]
     at = message.mount_grasp_pose.position
     np.testing.assert_allclose([at.x, at.y, at.z], np.array([0.1, -0.2, 0.25]) - 0.03 * z, atol=1e-12)
-
-
-def test_a_floating_hand_names_no_link(mounted: HandModel, carried: Grasp) -> None:
-    message = grasp_message(
-        carried, 0, "r", Header(frame_id="camera"), dataclasses.replace(mounted, mount=None), Pace()
-    )
-    assert message.mount_link == ""
+    floating = dataclasses.replace(mounted, mount=None)
+    assert grasp_message(carried, 0, "r", Header(frame_id="camera"), floating, Pace()).mount_link == ""
 
 
 def test_all_movable_joints_are_in_every_message(mounted: HandModel, carried: Grasp) -> None:
     message = grasp_message(carried, 0, "r", Header(frame_id="camera", stamp=Time()), mounted, Pace())
-    names = [
-        "f1_spread",
-        "f1_proximal",
-        "f1_distal",
-        "f2_spread",
-        "f2_proximal",
-        "f2_distal",
-        "f3_proximal",
-        "f3_distal",
-    ]
+    names = [f"f{finger}_{joint}" for finger in (1, 2, 3) for joint in ("spread", "proximal", "distal")]
+    names.remove("f3_spread")
     assert list(message.grasp_joints.name) == names
     # Controllers refuse joints that have no command of their own.
     assert list(message.trajectory.joint_names) == list(mounted.joint_names)
@@ -233,10 +219,6 @@ def grasp_with(step: float) -> Grasp:
     return Grasp(before, there, there, arm=ArmPath(NAMES, positions, STAGE_ROWS))
 
 
-def at(point: JointTrajectoryPoint) -> float:
-    return point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
-
-
 @pytest.mark.parametrize("step", [0.0, 0.02, 0.2])
 def test_no_joint_and_no_hand_is_faster_than_asked(step: float):
     grasp, pace = grasp_with(step), Pace(joint_speed=0.5, base_speed=0.1, shortest=0.2)
@@ -244,7 +226,7 @@ def test_no_joint_and_no_hand_is_faster_than_asked(step: float):
     trajectory = arm_trajectory(grasp, grasp.arm, pace)
     assert list(trajectory.joint_names) == list(NAMES)
     assert np.allclose([point.positions for point in trajectory.points], grasp.arm.positions)
-    times = np.array([at(point) for point in trajectory.points])
+    times = np.array(seconds(trajectory))
     assert times[0] == pytest.approx(pace.shortest)
     assert step / np.diff(times).min() <= 0.5
     stages = np.diff(times[list(STAGE_ROWS)])

@@ -1,4 +1,4 @@
-"""Clouds that are not in their camera's frame: whose place counts, what is refused, and which object a mask means."""
+"""Layouts of clouds and depth images, their cameras, and where a cloud's camera stood."""
 
 from __future__ import annotations
 
@@ -9,22 +9,159 @@ import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspRequest
-from sensor_msgs.msg import Image, PointCloud2, PointField
+from hypothesis import given
+from hypothesis import strategies as st
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_msgs.msg import Header
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError, TransformError
+from graspd_core.io.bags import camera_from_message, points_from_message
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.sensor_frames import CameraPlace, cloud_frame, place_of, seen_by_camera
+from graspd_ros.inputs.sensor_frames import (
+    CameraPlace,
+    ImagePairs,
+    cloud_frame,
+    depth_and_camera,
+    place_of,
+    seen_by_camera,
+)
 from graspd_ros.parameters import Settings
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 OPTICAL, BASE = "camera_depth_optical_frame", "base_link"
 NOW = Time(sec=1000)
 HEIGHT = float(np.ptp(make_shape("bottle").vertices[:, 2]))
+SECOND = 1_000_000_000
+DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+
+
+def header(stamp: int = 0, frame: str = "camera") -> Header:
+    return Header(frame_id=frame, stamp=Time(sec=stamp // SECOND, nanosec=stamp % SECOND))
+
+
+def image(depth: np.ndarray, encoding: str, big: bool = False, padding: int = 0, stamp: int = 0) -> Image:
+    """An image of depth in metres, rows padded with bytes that mean nothing."""
+    pixels = depth * 1000 if DTYPES[encoding] == "u2" else depth
+    pixels = np.round(pixels) if DTYPES[encoding] == "u2" else pixels
+    rows = pixels.astype((">" if big else "<") + DTYPES[encoding]).view(np.uint8).reshape(len(depth), -1)
+    rows = np.hstack([rows, np.full((len(depth), padding), 0xEE, np.uint8)])
+    return Image(
+        header=header(stamp),
+        height=depth.shape[0],
+        width=depth.shape[1],
+        encoding=encoding,
+        is_bigendian=int(big),
+        step=rows.shape[1],
+        data=array.array("B", rows.tobytes()),
+    )
+
+
+def calibration(width: int = 64, height: int = 48, stamp: int = 0, **fields) -> CameraInfo:
+    k = [60.0, 0.0, 31.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0]
+    p = [50.0, 0.0, 30.0, 0.0, 0.0, 50.0, 20.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    values = {"k": k, "p": p, "d": [0.1, -0.05, 0.001, 0.002, 0.0], "distortion_model": "plumb_bob", **fields}
+    return CameraInfo(header=header(stamp), width=width, height=height, **values)
+
+
+@pytest.mark.parametrize("encoding", sorted(DTYPES))
+@pytest.mark.parametrize("big", [False, True])
+def test_a_depth_image_and_its_camera_are_read_and_must_be_of_one_frame(encoding: str, big: bool):
+    depth = np.random.default_rng(0).integers(0, 8000, (5, 7)) / 1000
+    message = image(depth, encoding, big, padding=3)
+    found, camera = depth_and_camera(message, calibration(7, 5))
+    np.testing.assert_allclose(found, depth, atol=1e-6)
+    assert (camera.width, camera.height) == (7, 5)
+    message.header.frame_id = "elsewhere"
+    with pytest.raises(CloudError, match=r"'elsewhere'.*'camera'"):
+        depth_and_camera(message, calibration(7, 5))
+
+
+def test_a_rectified_image_has_the_camera_of_p_and_no_distortion():
+    camera = camera_from_message(calibration(), rectified=True)
+    assert (camera.fx, camera.cx, camera.cy, camera.distortion) == (50.0, 30.0, 20.0, ())
+    raw = camera_from_message(calibration())
+    assert (raw.fx, raw.cx, raw.cy) == (60.0, 31.5, 23.5)
+    assert raw.distortion == (0.1, -0.05, 0.001, 0.002, 0.0)
+    # Without P, which simple drivers leave empty, K stands in.
+    assert camera_from_message(calibration(p=[0.0] * 12), rectified=True).fx == 60.0
+
+
+def test_images_and_calibrations_of_one_stamp_find_each_other_in_any_order():
+    pairs = ImagePairs()
+    first, second = image(np.ones((1, 1)), "16UC1", stamp=SECOND), image(np.ones((1, 1)), "16UC1", stamp=2 * SECOND)
+    assert pairs.add(first) is None
+    assert pairs.add(calibration(stamp=2 * SECOND)) is None
+    found = pairs.add(calibration(stamp=SECOND))
+    assert found is not None
+    assert found[0] is first
+    assert found[1].header.stamp.sec == 1
+    found = pairs.add(second)
+    assert found is not None
+    assert (found[0], found[1].header.stamp.sec) == (second, 2)
+
+
+def test_stamps_pair_within_the_slop_only():
+    pairs = ImagePairs(slop=0.01)
+    assert pairs.add(calibration(stamp=SECOND)) is None
+    assert pairs.add(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_001)) is None
+    assert pairs.add(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_000)) is not None
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=80))
+def test_memory_is_bounded_and_no_image_is_given_out_twice(arrivals: list[tuple[bool, int]]):
+    pairs = ImagePairs(slop=0.001, capacity=3)
+    given_out: list[Image] = []
+    for is_image, tick in arrivals:
+        stamp = tick * SECOND // 30
+        message = image(np.ones((1, 1)), "16UC1", stamp=stamp) if is_image else calibration(1, 1, stamp=stamp)
+        pair = pairs.add(message)
+        assert len(pairs) <= 6
+        if pair is not None:
+            assert pair[0].header.stamp == pair[1].header.stamp
+            assert not any(pair[0] is image for image in given_out)
+            given_out.append(pair[0])
+
+
+def encode(points: np.ndarray, order: str, formats: list[str], offsets: list[int], step: int, row_padding: int):
+    """A cloud message of `points [height, width, 3]` with the given layout; the padding holds junk."""
+    height, width, _ = points.shape
+    row_step = width * step + row_padding
+    data = np.full(height * row_step, 0xAB, dtype=np.uint8)
+    for axis in range(3):
+        view = np.ndarray((height, width), order + formats[axis], data, offsets[axis], (row_step, step))
+        view[...] = points[..., axis]
+    kinds = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64}
+    fields = [
+        PointField(name=n, offset=o, datatype=kinds[f], count=1)
+        for n, o, f in zip("xyz", offsets, formats, strict=True)
+    ]
+    return PointCloud2(
+        height=height,
+        width=width,
+        fields=[PointField(name="rgb", offset=0, datatype=PointField.UINT32, count=1), *reversed(fields)],
+        is_bigendian=order == ">",
+        point_step=step,
+        row_step=row_step,
+        data=array.array("B", data.tobytes()),
+    )
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("formats", "offsets"),
+    [(["f4", "f4", "f4"], [0, 4, 8]), (["f8", "f4", "f8"], [12, 5, 21]), (["f4"] * 3, [8, 4, 0])],
+)
+def test_the_fields_of_a_message_are_read_where_it_says(order, formats, offsets):
+    """Any layout is drawn, and broken ones are refused, in test/pointcloud: here the message's fields are named."""
+    points = np.random.default_rng(0).normal(size=(3, 4, 3)).astype("f4").astype(float)
+    np.testing.assert_array_equal(
+        points_from_message(encode(points, order, formats, offsets, 32, 5)), points.reshape(-1, 3)
+    )
 
 
 @pytest.fixture(scope="module")
