@@ -17,8 +17,8 @@ from graspd_core.hands.library import hand_hash
 from graspd_core.mesh.shapes import object_hash, object_sources, thing_name
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.planning.plan_grasps import check_request
+from graspd_dataset.dataset_store import SCHEMA_VERSION
 
-FORMAT, SCHEMA_VERSION = "graspd/dataset", 1
 Measured = Literal["verified", "all", "none"]
 MEASURED: tuple[str, ...] = get_args(Measured)
 # Hexadecimal digits of a key: 128 bits.

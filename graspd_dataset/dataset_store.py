@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 
 from graspd_core.errors import FormatError, GraspdError
 from graspd_core.runtime.disk_cache import save_bytes
-from graspd_dataset.blocks import FORMAT, SCHEMA_VERSION
 
+FORMAT, SCHEMA_VERSION = "graspd/dataset", 1
 # Key of graspd's own part of the metadata.
 _METADATA = b"graspd"
 

@@ -17,7 +17,7 @@ from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
-from graspd_core.types import AuditCount, Grasp, GraspMetrics, Progress, StopHook, TrialResult, Verdict
+from graspd_core.types import Grasp, GraspMetrics, Progress, StopHook, TrialResult, Verdict
 from graspd_core.verify import verification
 from graspd_core.verify.hold_trial import displaced, pose_errors
 from graspd_core.verify.prepared_grasp import make_metrics_context
@@ -159,7 +159,7 @@ def test_what_waits_to_be_measured_is_never_more_than_the_threads(number, candid
     context, grasps = candidates
     torch.set_num_threads(number)
     held = TrialResult("hold", True, 0.0, 0.0, "")
-    monkeypatch.setattr(verification, "audited_trials", lambda *_: ((held,), AuditCount()))
+    monkeypatch.setattr(verification, "grasp_trials", lambda *_: (held,))
     monkeypatch.setattr(verification, "measure", slow)
     tried = run_trials(Run(time.perf_counter(), None, count, None), context, grasps, 3, 0)
     assert len(ended) == sum(grasp.metrics is not None for grasp in tried.grasps) == 3
