@@ -165,7 +165,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
     Adjacent links are never near each other; a link without candidates and solids is infinitely far from all.
     """
-    placed = hand_forward(problem, problem.hand.fine, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(problem, problem.hand.fine, poses)
     count = placed.links.translation.shape[1]
     gaps = [_least(sample_sdf(problem.object.sdf, placed.points)[0], problem.hand.fine.links, count)]
     if len(problem.object.features) and len(problem.hand.solids.link):

@@ -272,7 +272,7 @@ class Annealing:
     def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
         """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
         poses = self.poses(x)
-        placed = hand_forward(problem, problem.hand.coarse, poses.translation, poses.quaternion, poses.joints)
+        placed = hand_forward(problem, problem.hand.coarse, poses)
         points = placed.base.apply(place_points(self.contacts, placed.links))
         outward = place_points(self.normals, placed.links) @ placed.base.rotation.transpose(-1, -2)
         distance, normal = sample_sdf(problem.object.sdf, torch.cat([placed.points, points], 1))
@@ -310,7 +310,7 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
     stands = Poses(
         problem.object.center[None], torch.eye(4).to(problem.hand.lower)[:1], tensor(hand.open_posture)[None]
     )
-    opened = hand_forward(problem, problem.hand.coarse, stands.translation, stands.quaternion, stands.joints)
+    opened = hand_forward(problem, problem.hand.coarse, stands)
     return Annealing(
         config=config,
         seed=seed,

@@ -33,6 +33,7 @@ from graspd_core.library.grasp_library import (
     strict_enough,
 )
 from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.optimize.loop import Poses
 from graspd_core.optimize.obstacle_distance import gap_on_the_way, make_obstacle_tensors
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
@@ -326,14 +327,15 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)
 
-    def ends(stage: str) -> tuple[torch.Tensor, torch.Tensor]:
-        postures: list[Posture] = [getattr(grasp, stage) for grasp in grasps]
-        return _rows([p.position for p in postures]), _rows([p.joint_positions for p in postures])
-
     turns = _rows([grasp.grasp.quaternion_wxyz for grasp in grasps])
+
+    def ends(stage: str) -> Poses:
+        postures: list[Posture] = [getattr(grasp, stage) for grasp in grasps]
+        return Poses(_rows([p.position for p in postures]), turns, _rows([p.joint_positions for p in postures]))
+
     kinematics = make_kinematics(hand, dtype=torch.float64)
     ways = [("pregrasp", "grasp"), ("grasp", "squeeze")]
-    gaps = [gap_on_the_way(obstacles, kinematics, turns, ends(a), ends(b), NEAR) for a, b in ways]
+    gaps = [gap_on_the_way(obstacles, kinematics, ends(a), ends(b), NEAR) for a, b in ways]
     return torch.stack(gaps).amin(0).numpy()
 
 

@@ -151,8 +151,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
     """Return the grasps of staged poses with their scores, in the same order."""
     scores = score(problem, some)
     if problem.obstacles is not None:
-        ends = (some.opened.translation, some.opened.joints), (some.poses.translation, some.poses.joints)
-        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, some.poses.quaternion, *ends)
+        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)
         knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     return _grasps(hand, some, scores)

@@ -20,7 +20,7 @@ from graspd_core.hands.link_distance import pair_distance, solid_distance
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize import losses
 from graspd_core.optimize.kernel import builds as structs
-from graspd_core.optimize.loop import Poses, adam_moments, pack
+from graspd_core.optimize.loop import Distances, Joints, Poses, Rows, Values, adam_moments, pack
 from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors, obstacle_gaps
 from graspd_core.optimize.problem import OBSTACLE_MARGIN, Problem, hand_forward
 from graspd_core.se3 import SE3, rotation_from_quaternion
@@ -64,7 +64,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
     Slots within `reach` [m] of the surface are active.
     """
     points = problem.hand.fine
-    placed = hand_forward(problem, points, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(problem, points, poses)
     distance, normal = sample_sdf(problem.object.sdf, placed.points)
     links = torch.unique(points.links)
     members = points.links[None, :] == links[:, None]
@@ -128,9 +128,7 @@ def nearest_features(
 
 
 @torch.no_grad()
-def self_overlap(
-    problem: Problem, joints: Float[Tensor, "batch joints"], adjacent: Bool[Tensor, "links links"]
-) -> Float[Tensor, "batch"]:
+def self_overlap(problem: Problem, joints: Joints, adjacent: Bool[Tensor, "links links"]) -> Values:
     """Return the greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
     if len(problem.hand.solids.link) == 0:
         return joints.new_zeros(len(joints))
@@ -148,7 +146,7 @@ def self_overlap(
 
 def find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool] = lambda: False
-) -> tuple[Poses, Float[Tensor, "batch"]]:
+) -> tuple[Poses, Values]:
     """Find a nearby posture, base shifted and never turned, from which the hand closes without sweeping the object.
 
     The posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every candidate
@@ -176,7 +174,7 @@ def find_pregrasp(
 
 def _find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
-) -> tuple[Poses, Float[Tensor, "batch"]]:
+) -> tuple[Poses, Values]:
     start = torch.cat([poses.translation, poses.joints], -1)
     rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
     rates, cost = _rates_and_costs(problem, config)
@@ -186,10 +184,10 @@ def _find_pregrasp(
     # Where the grasp itself sinks in, the way out starts from that depth.
     wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
 
-    def way_to(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch variables"]:
+    def way_to(x: Rows) -> Float[Tensor, "way_batch variables"]:
         return (remaining * x + (1 - remaining) * start).flatten(0, 1)
 
-    def distances(x: Float[Tensor, "batch variables"]) -> Float[Tensor, "way_batch points"]:
+    def distances(x: Rows) -> Float[Tensor, "way_batch points"]:
         way = way_to(x)
         return hand_distance(problem, SE3(rotation, way[:, :3]), way[:, 3:])
 
@@ -228,17 +226,14 @@ def _rates_and_costs(
 
 
 def _obstacle_cost(
-    obstacles: ObstacleTensors,
-    problem: Problem,
-    rotation: Float[Tensor, "batch 3 3"],
-    x: Float[Tensor, "batch variables"],
-) -> Float[Tensor, "batch"]:
+    obstacles: ObstacleTensors, problem: Problem, rotation: Float[Tensor, "batch 3 3"], x: Rows
+) -> Values:
     gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.hand.kinematics, x[:, 3:]))
     return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
 
 
 @torch.no_grad()
-def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Float[Tensor, "batch"]:
+def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Values:
     """Return how deep the hand is in the object on its straight way from the retreat to the pregrasp [m].
 
     The way is clear where this is zero. The pregrasp itself is not looked at.
@@ -249,7 +244,7 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
     return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
 
 
-def hand_distance(problem: Problem, base: SE3, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch points"]:
+def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
     """Return the signed distance of every coarse contact candidate to the object [m]."""
     points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
     return sample_sdf(problem.object.sdf, base.apply(points))[0]
@@ -292,7 +287,7 @@ def squeeze(
 
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
-) -> Float[Tensor, "batch joints"]:
+) -> Joints:
     """Return τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)

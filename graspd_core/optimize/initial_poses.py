@@ -1,9 +1,12 @@
-"""Seeded starts: the palm, fingers open, or the half-closed fingertips at a random point of the object's hull."""
+"""Draw seeded starts: the palm, fingers open, or the half-closed fingertips at a random point of the object's hull.
+
+Starts that are aimed come from a wanted direction, rolled as wanted, to a wanted part of the object.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,11 +17,11 @@ from graspd_core.hands.fingers import find_fingers, placed_tips
 from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_kinematics, points_in_base
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.optimize.loop import Poses
+from graspd_core.optimize.loop import Joints, Poses, Positions, Values
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
-from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions, StartPool, aimed, open_joints, uniform
+from graspd_core.optimize.restrictions import UNRESTRICTED, Aim, BoundRestrictions
 from graspd_core.perception.scene import Scene
-from graspd_core.se3 import SE3, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
+from graspd_core.se3 import SE3, aligning_rotation, normalize, quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
 
 # Tilt of the palm against the hull's normal [rad]; how far the palm is put from the object [m].
@@ -34,6 +37,36 @@ _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
 _MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
 # The slab of the object that a hand closes around [m].
 _SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
+# Spread of the joints, and how near to its axis a palm stays off the surface [m].
+_JOINT_NOISE, _PALM_RADIUS = 0.1, 0.04
+# Starts use this share of the cone and of the tolerance of the roll, because the search turns them a little.
+_INNER = 0.8
+
+
+@dataclass(frozen=True)
+class StartPool:
+    """Hands that starts are chosen from, object frame.
+
+    Attributes:
+        grip: the point of the hand that is put to the object, base frame: middle of the palm or of the fingertips [m].
+        standoff: distance of the grip from the object [m].
+        middle: the grip's position [m].
+        rotation: orientation of the base.
+        translation: origin of the base [m].
+        joints: [rad].
+        depth: how far the wanted place lies behind what the palm meets first [m], 0 if no place is wanted.
+    """
+
+    grip: Float[Tensor, "batch 3"]
+    standoff: Float[Tensor, "batch"]
+    middle: Float[Tensor, "batch 3"]
+    rotation: Float[Tensor, "batch 3 3"]
+    translation: Float[Tensor, "batch 3"]
+    joints: Float[Tensor, "batch joints"]
+    depth: Float[Tensor, "batch"]
+
+    def __getitem__(self, rows: Tensor) -> StartPool:
+        return StartPool(*(values[rows] for values in vars(self).values()))
 
 
 def draw_starts(
@@ -47,15 +80,15 @@ def draw_starts(
     fingertips: float = 0.0,
     restrictions: BoundRestrictions = UNRESTRICTED,
 ) -> Poses:
-    """`count` seeded starts with the palm on the object's convex hull, preferring places that the hand can span.
+    """Draw `count` seeded starts with the palm on the object's convex hull, at places that the hand can span.
 
-    After the published initialisation of Grasp'D (a random surface point, palm towards it, random roll), but on the
-    hull, so that no palm starts inside a hollow, and with place and roll drawn in favour of narrow cross-sections.
-    About a share `fingertips` of them has fingers half closed and the middle between the fingertips there in place of
-    the palm: what is low on a table or small is within no open hand's reach.
-    Where there are obstacles, hands that would reach into them, or could not have come there, are drawn last.
-    Restrictions have starts drawn until there are enough that they allow, or `_MOST_POOLS` times as many were drawn:
-    then there are fewer than `count`, perhaps none.
+    This follows the published initialisation of Grasp'D (a random surface point, palm towards it, random roll). Points
+    are on the hull, so that no palm starts inside a hollow. Place and roll favour narrow cross-sections.
+    A share `fingertips` of the starts has half-closed fingers, and the middle between the fingertips in place of the
+    palm: an open hand does not reach what is small or low on a table.
+    Hands that would reach into obstacles, or could not have come there, are drawn last.
+    With restrictions, starts are drawn until enough are allowed, or `_MOST_POOLS` times as many were drawn: then there
+    are fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -65,7 +98,7 @@ def draw_starts(
 
     def draw(seed: int) -> StartPool:
         drawn = _draw_pool(hull, hand, pool, seed, generator, fingertips)
-        return drawn if restrictions.aim is None else aimed(drawn, restrictions.aim, surface, hand, generator)
+        return drawn if restrictions.aim is None else _aimed(drawn, restrictions.aim, surface, hand, generator)
 
     drawn = _allowed(draw, pool, seed, restrictions) if restrictions.each else draw(seed)
     blocked = torch.zeros(len(drawn.joints), dtype=torch.float64)
@@ -76,7 +109,7 @@ def draw_starts(
 
     half_width = half_widths(surface, drawn.middle, drawn.rotation, hand)
     # Gumbel noise makes the best `count` a draw without replacement with weights exp(−half width / scale).
-    gumbel = -torch.log(-torch.log(uniform(1e-12, 1.0, len(drawn.joints), generator)))
+    gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
     preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE - blocked / _DEPTH_SCALE
     chosen = preference.topk(min(count, len(preference))).indices
     return Poses(
@@ -89,31 +122,81 @@ def draw_starts(
 def _draw_pool(
     hull: TriangleMesh, hand: HandModel, count: int, seed: int, generator: torch.Generator, fingertips: float
 ) -> StartPool:
-    """Hands that face random points of the hull, rolled at random: open, or at those points with their fingertips."""
+    """Draw hands that face random points of the hull, rolled at random: open, or there with their fingertips."""
     points, normals = surface_samples(hull, count, seed)
     outward = torch.as_tensor(normals)
     tilt_axis = torch.linalg.cross(outward, torch.randn(count, 3, generator=generator, dtype=torch.float64))
     tilt_axis = tilt_axis / tilt_axis.norm(dim=-1, keepdim=True)
-    tilt = uniform(-_TILT, _TILT, count, generator)
+    tilt = _uniform(-_TILT, _TILT, count, generator)
     facing = (rotation_from_axis_angle(tilt_axis, tilt) @ outward[..., None]).squeeze(-1)
     rotation = aligning_rotation(torch.as_tensor(hand.palm_normal), -facing)
-    rotation = rotation_from_axis_angle(facing, uniform(-np.pi, np.pi, count, generator)) @ rotation
-    standoff = uniform(*_PALM_STANDOFF, count, generator)
+    rotation = rotation_from_axis_angle(facing, _uniform(-np.pi, np.pi, count, generator)) @ rotation
+    standoff = _uniform(*_PALM_STANDOFF, count, generator)
     grip = torch.as_tensor(hand.palm_center).repeat(count, 1)
-    joints = open_joints(hand, count, generator)
+    joints = _open_joints(hand, count, generator)
     if fingertips:
-        some = uniform(0.0, 1.0, count, generator) < fingertips
-        share = torch.where(some, uniform(*_SHARE_CLOSED, count, generator), 0.0)[:, None]
+        some = _uniform(0.0, 1.0, count, generator) < fingertips
+        share = torch.where(some, _uniform(*_SHARE_CLOSED, count, generator), 0.0)[:, None]
         joints = joints + share * (torch.as_tensor(hand.closed_posture) - joints)
-        standoff = torch.where(some, uniform(*_TIP_STANDOFF, count, generator), standoff)
+        standoff = torch.where(some, _uniform(*_TIP_STANDOFF, count, generator), standoff)
         grip[some] = between_fingertips(hand, joints[some])
     middle = torch.as_tensor(points) + standoff[:, None] * outward
     translation = middle - (rotation @ grip[..., None]).squeeze(-1)
     return StartPool(grip, standoff, middle, rotation, translation, joints, torch.zeros(count, dtype=torch.float64))
 
 
+def _uniform(low: float, high: float, count: int, generator: torch.Generator) -> Float[Tensor, "count"]:
+    return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
+
+
+def _open_joints(hand: HandModel, count: int, generator: torch.Generator) -> Float[Tensor, "count joints"]:
+    spread = torch.as_tensor(hand.upper - hand.lower)
+    noise = _JOINT_NOISE * (torch.rand(count, len(spread), generator=generator, dtype=torch.float64) - 0.5)
+    joints = torch.as_tensor(hand.open_posture) + noise * spread
+    return joints.clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
+
+
+def _aimed(
+    pool: StartPool, aim: Aim, surface: Float[Tensor, "points 3"], hand: HandModel, generator: torch.Generator
+) -> StartPool:
+    """Turn and move the hands of a pool as `aim` wants. Joints stay.
+
+    A palm, or the middle between fingertips, faces a wanted place and stands off the `surface` points about its line.
+    """
+    count, rotation = len(pool.joints), pool.rotation
+    if aim.direction is not None:
+        axis = torch.as_tensor(aim.direction).expand(count, 3)
+        least = float(np.cos(_INNER * aim.angle))
+        tilted = torch.acos(_uniform(least, 1.0, count, generator).clamp(-1.0, 1.0))
+        square = normalize(torch.linalg.cross(axis, torch.randn(count, 3, generator=generator, dtype=torch.float64)))
+        approach = (rotation_from_axis_angle(square, tilted) @ axis[..., None]).squeeze(-1)
+        rotation = aligning_rotation(torch.as_tensor(hand.approach), approach)
+        turn = _uniform(-np.pi, np.pi, count, generator)
+        rotation = rotation_from_axis_angle(approach, turn) @ rotation
+    if aim.roll is not None:
+        approach = rotation @ torch.as_tensor(hand.approach)
+        turn = aim.roll.missing(approach, rotation)
+        turn = turn + _INNER * _uniform(-aim.roll.tolerance, aim.roll.tolerance, count, generator)
+        rotation = rotation_from_axis_angle(approach, turn) @ rotation
+    places = surface if aim.places is None else torch.as_tensor(aim.places)
+    faced = places[torch.randint(len(places), (count,), generator=generator)]
+    facing = rotation @ torch.as_tensor(hand.palm_normal)
+    depth = _standing_off(faced, facing, surface)
+    middle = faced - (depth + pool.standoff)[:, None] * facing
+    translation = middle - (rotation @ pool.grip[..., None]).squeeze(-1)
+    depth = torch.zeros_like(depth) if aim.places is None else depth
+    return replace(pool, middle=middle, rotation=rotation, translation=translation, depth=depth)
+
+
+def _standing_off(places: Positions, facing: Positions, surface: Float[Tensor, "points 3"]) -> Values:
+    away = surface[None] - places[:, None]
+    back = -(away * facing[:, None]).sum(-1)
+    near = (away + back[..., None] * facing[:, None]).norm(dim=-1) < _PALM_RADIUS
+    return torch.where(near, back, 0.0).amax(-1).clamp_min(0.0)
+
+
 def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restrictions: BoundRestrictions) -> StartPool:
-    """Of the hands that are drawn by seed those that the restrictions allow, until there are `wanted`."""
+    """Draw hands, seed after seed, until the restrictions allow `wanted` of them."""
     kept: list[StartPool] = []
     for again in range(_MOST_POOLS):
         drawn = draw(seed + again * _POOL_SEED_STEP)
@@ -126,12 +209,10 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
     return StartPool(*(torch.cat(values)[:wanted] for values in columns))
 
 
-def raise_clear(
-    obstacles: ObstacleTensors, base: SE3, links: SE3
-) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
-    """Origins of hands moved off the support, within bounds; and how deep they reach into anything [m].
+def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
+    """Move origins of hands off the support, within bounds, and return how deep the hands reach into anything [m].
 
-    They are looked at where they are moved to and drawn back from there; `links` are the link poses in the base frame.
+    The depth is that at the new place and drawn back from there. `links` are the link poses in the base frame.
     """
     translation = base.translation
     if obstacles.normal is not None:
@@ -143,7 +224,7 @@ def raise_clear(
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """How deep the best of `count` starts is in the scene's obstacles, there or at its retreat [m]; 0 without any."""
+    """Return how deep the best of `count` starts is in the obstacles, there or at its retreat [m], 0 without any."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0
@@ -153,14 +234,11 @@ def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: Bou
 
 
 def half_widths(
-    surface: Float[Tensor, "points 3"],
-    middle: Float[Tensor, "batch 3"],
-    rotation: Float[Tensor, "batch 3 3"],
-    hand: HandModel,
-) -> Float[Tensor, "batch"]:
-    """How far the object reaches from a hand's middle along the direction in which the fingers close [m].
+    surface: Float[Tensor, "points 3"], middle: Positions, rotation: Float[Tensor, "batch 3 3"], hand: HandModel
+) -> Values:
+    """Return how far the object reaches from a hand's middle along the direction in which the fingers close [m].
 
-    Only the slab of the object counts that the fingers close around: a hand's breadth wide, and as deep as they reach.
+    Only the slab between the fingers counts: as wide as a hand, and as deep as the fingers reach.
     """
     normal = torch.as_tensor(hand.palm_normal)
     closing = torch.as_tensor(closing_axis(hand))
@@ -173,15 +251,15 @@ def half_widths(
 
 
 def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
-    """Unit direction in the palm plane along which the fingertips travel most from open to closed, base frame."""
+    """Return the unit direction in the palm plane along which the fingertips travel most in closing, base frame."""
     tips = [int(np.flatnonzero(hand.link_group == group)[-1]) for group in hand.fingertip_groups]
     travel = (link_poses(hand, hand.closed_posture)[1] - link_poses(hand, hand.open_posture)[1])[tips]
     in_plane = travel - np.outer(travel @ hand.palm_normal, hand.palm_normal)
     return np.linalg.svd(in_plane)[2][0]
 
 
-def between_fingertips(hand: HandModel, joints: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch 3"]:
-    """The middle between the fingertips that close from one side and those from the other, base frame [m]."""
+def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
+    """Return the middle between the fingertips that close from one side and from the other, base frame [m]."""
     fingers = find_fingers(hand)
     travel = placed_tips(hand, fingers, hand.closed_posture) - placed_tips(hand, fingers, hand.open_posture)
     along = torch.as_tensor(travel @ closing_axis(hand))
@@ -192,7 +270,7 @@ def between_fingertips(hand: HandModel, joints: Float[Tensor, "batch joints"]) -
 
 
 def convex_hull(mesh: TriangleMesh) -> TriangleMesh:
-    """Convex hull of a mesh; a flat mesh, which has none, is returned as it is."""
+    """Return the convex hull of a mesh, or the mesh if it is flat and has none."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:

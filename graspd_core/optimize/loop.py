@@ -6,14 +6,25 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import SE3, rotation_from_quaternion
+
+if TYPE_CHECKING:
+    from graspd_core.optimize.problem import Problem
+
+# Arrays of a batch: a value of every start, a row of its variables, its base position [m], its joints [rad] or [m],
+# points of its hand [m] and their distances [m].
+Values = Float[Tensor, "batch"]
+Rows = Float[Tensor, "batch variables"]
+Positions = Float[Tensor, "batch 3"]
+Joints = Float[Tensor, "batch joints"]
+Points = Float[Tensor, "batch points 3"]
+Distances = Float[Tensor, "batch points"]
 
 
 @dataclass(frozen=True)
@@ -39,12 +50,12 @@ class Poses:
         return Poses(self.translation[rows], self.quaternion[rows], self.joints[rows])
 
 
-def pack(poses: Poses) -> Float[Tensor, "batch variables"]:
+def pack(poses: Poses) -> Rows:
     """Return rows of translation, quaternion and joints, as solvers step them."""
     return torch.cat([poses.translation, poses.quaternion, poses.joints], -1)
 
 
-def unpack(x: Float[Tensor, "batch variables"]) -> Poses:
+def unpack(x: Rows) -> Poses:
     """Invert `pack`."""
     return Poses(x[:, :3], x[:, 3:7], x[:, 7:])
 
@@ -75,7 +86,7 @@ class Solver(Protocol[S]):
         """Return the state after one step, perhaps without hopeless starts."""
         ...
 
-    def best(self, state: S) -> tuple[Poses, Float[Tensor, "batch"]]:
+    def best(self, state: S) -> tuple[Poses, Values]:
         """Return the best iterate of each start so far and its loss."""
         ...
 
@@ -134,7 +145,7 @@ class Follow:
             self.interrupted = "deadline"
         return bool(self.interrupted)
 
-    def report(self, done: int, best: Callable[[], tuple[Poses, Float[Tensor, "batch"]]]) -> None:
+    def report(self, done: int, best: Callable[[], tuple[Poses, Values]]) -> None:
         """Report that so many steps are done, if the last report was long ago or all steps are done."""
         now = time.perf_counter()
         if now - self.reported < self.hooks.interval and done != self.steps:
@@ -145,7 +156,7 @@ class Follow:
             self.hooks.watch(poses)
         self.reported = now
 
-    def solution(self, poses: Poses, loss: Float[Tensor, "batch"]) -> Solution:
+    def solution(self, poses: Poses, loss: Values) -> Solution:
         """Return where the run ended."""
         return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), self.done, self.interrupted)
 
@@ -160,17 +171,7 @@ def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -
     return follow.solution(*solver.best(state))
 
 
-def adam_moments(
-    mean: Float[Tensor, "batch variables"],
-    square: Float[Tensor, "batch variables"],
-    gradient: Float[Tensor, "batch variables"],
-    count: int,
-) -> tuple[
-    Float[Tensor, "batch variables"],
-    Float[Tensor, "batch variables"],
-    Float[Tensor, "batch variables"],
-    Float[Tensor, "batch variables"],
-]:
+def adam_moments(mean: Rows, square: Rows, gradient: Rows, count: int) -> tuple[Rows, Rows, Rows, Rows]:
     """Return Adam's moments after step number `count`, from one (Kingma & Ba 2015, §2).
 
     Returns:

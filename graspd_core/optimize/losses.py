@@ -19,6 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from graspd_core.optimize.loop import Distances, Joints, Points, Values
+
 # Floor of the squared tangential speed, relative to the unit disturbance: keeps the square root differentiable.
 _TANGENT_FLOOR = 1e-6
 
@@ -38,11 +40,7 @@ def disturbance_directions(count: int, seed: int, dtype: torch.dtype = torch.flo
 
 
 def wrench_support(
-    arms: Float[Tensor, "batch points 3"],
-    normals: Float[Tensor, "batch points 3"],
-    activation: Float[Tensor, "batch points"],
-    directions: Float[Tensor, "directions 6"],
-    friction: float,
+    arms: Points, normals: Points, activation: Distances, directions: Float[Tensor, "directions 6"], friction: float
 ) -> Float[Tensor, "batch directions"]:
     """Support h_k of the soft grasp wrench space in each direction; force closure is h_k > 0 for all k.
 
@@ -77,30 +75,24 @@ _MILLIMETRE = 0.001
 _SUPPORT_FLOOR = 1e-3
 
 
-def soft_contact(
-    distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"], delta: float
-) -> Float[Tensor, "batch points"]:
+def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
     """Contact activation s = exp(−|φ − r| / δ): one on the padded surface, never with a zero gradient off it."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
-def hard_contact(
-    distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"], delta: float
-) -> Float[Tensor, "batch points"]:
+def hard_contact(distance: Distances, radius: Values, delta: float) -> Distances:
     """The ablation of `soft_contact`: one within δ of the padded surface, zero elsewhere, without any gradient."""
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
-def wrench_resistance(
-    support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0
-) -> Float[Tensor, "batch"]:
+def wrench_resistance(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Values:
     """Soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst disturbance is resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()
     count = support.shape[-1]
     return (torch.logsumexp(sharpness * resisted, -1) - torch.log(torch.tensor(float(count)))) / sharpness
 
 
-def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Float[Tensor, "batch"]:
+def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Values:
     """Distance of each group of links from the padded surface, either side, saturating beyond the group's reach [m].
 
     Groups with a long reach (fingertips) are drawn from afar, the others only finish a contact that is already near.
@@ -109,17 +101,15 @@ def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) ->
     return (size * reach / (size + reach)).mean(-1) / _CENTIMETRE
 
 
-def penetration(distance: Float[Tensor, "batch points"], radius: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+def penetration(distance: Distances, radius: Values) -> Values:
     """Depth below the padded surface: sum of squares in mm², tempered to grow linearly for deep points."""
     depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
     return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
 
 
 def self_collision(
-    centers: Float[Tensor, "batch spheres 3"],
-    radii: Float[Tensor, "spheres"],
-    weight: Float[Tensor, "spheres spheres"],
-) -> Float[Tensor, "batch"]:
+    centers: Float[Tensor, "batch spheres 3"], radii: Float[Tensor, "spheres"], weight: Float[Tensor, "spheres spheres"]
+) -> Values:
     """Overlap of proxy spheres of non-adjacent links [mm²]: depth as (R² − d²) / 2R, exact where spheres just touch.
 
     `weight` is 1 / 2R [1/m] for each checked pair, R the sum of its radii, once, and zero for every other.
@@ -133,9 +123,7 @@ def self_collision(
     return (depth * depth).sum(-1) / 10.0
 
 
-def posture(
-    joints: Float[Tensor, "batch joints"], lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]
-) -> Float[Tensor, "batch"]:
+def posture(joints: Joints, lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]) -> Values:
     """Squared distance of the joints from mid-range, in half ranges."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     return (((joints - middle) / half) ** 2).sum(-1)

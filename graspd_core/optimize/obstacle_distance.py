@@ -1,4 +1,4 @@
-"""Room for the hand: how far it is from what the object stands on and from the things around it.
+"""Measure the hand's distance from what the object stands on and from the obstacles around it.
 
 A solid is convex, so it is clear of a half-space exactly when its extreme points are: boxes and hulls by their corners,
 spheres and capsules by their ends less their radius, cylinders by points of their rims. Against neighbours the
@@ -9,6 +9,7 @@ the corners. Gradients are exact but for that of the neighbours' interpolated di
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.hands.surface_points import outermost
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
+from graspd_core.optimize.loop import Distances, Points, Poses, Values
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
@@ -57,10 +59,11 @@ class ObstacleTensors:
     approach: Float[Tensor, "3"]
 
 
+@lru_cache(maxsize=8)
 def make_obstacle_tensors(
     scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype
 ) -> ObstacleTensors | None:
-    """The scene's obstacles as this hand meets them; None where it meets none, so that nothing is ever evaluated."""
+    """Lay the obstacles out as this hand meets them, None if it meets none. Kept for the last few scenes and hands."""
     obstacles = [n for n in scene.obstacles if _in_reach(n, scene, hand)]
     if scene.support is None and not obstacles:
         return None
@@ -92,7 +95,7 @@ def _in_reach(neighbour: Obstacle, scene: Scene, hand: HandModel) -> bool:
 
 
 def hand_reach(hand: HandModel) -> float:
-    """Distance from the middle of the palm to the farthest point of the open hand [m]."""
+    """Return the distance from the middle of the palm to the farthest point of the open hand [m]."""
     corners, radii, links = extreme_points(hand)
     rotations, translations = link_poses(hand, hand.open_posture)
     placed = np.einsum("pij,pj->pi", rotations[links], corners) + translations[links]
@@ -102,19 +105,16 @@ def hand_reach(hand: HandModel) -> float:
 def extreme_points(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
-    """Points in link frames [m] and radii [m] of balls whose convex hull is each solid, and their links."""
+    """Return points in link frames [m] and radii [m] of balls whose convex hull is each solid, and their links."""
     solids = extreme_points_of_solids(hand)
     points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
     return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """For each solid of the hand the points of `extreme_points` and their radius [m], and its link."""
-    found = []
-    for primitive in hand.primitives:
-        at, radius = _extremes(primitive)
-        found.append((at @ primitive.rotation.T + primitive.translation, radius, primitive.link))
-    return found
+    """Return for each solid of the hand the points of `extreme_points` and their radius [m], and its link."""
+    found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
+    return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 
 
 def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
@@ -134,9 +134,9 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
 
 
 def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Float[Tensor, "batch gaps"]:
-    """Signed distances [m] of the hand's points to every obstacle, negative inside; link poses in the base frame.
+    """Return signed distances [m] of the hand's points to every obstacle. Link poses are in the base frame.
 
-    A gap to a thing that is at least `wide` may be given as `wide`.
+    Distances are negative inside. One of at least `wide` may be given as `wide`.
     """
     corners = base.apply(place_points(obstacles.corner_matrix, links))
     gaps = []
@@ -150,10 +150,8 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
     return torch.cat(gaps, -1)
 
 
-def _gaps_to(
-    sdf: GridSDF, points: Float[Tensor, "batch points 3"], radii: Float[Tensor, "points"], wide: float
-) -> Float[Tensor, "batch points"]:
-    """Gaps of balls to one thing. Of dozens of things about an object each has few balls near: these are sampled."""
+def _gaps_to(sdf: GridSDF, points: Points, radii: Float[Tensor, "points"], wide: float) -> Distances:
+    """Return gaps of balls to one obstacle. Only the balls near its grid are sampled, which are few of all."""
     off_grid = (points.detach() - (sdf.origin + sdf.half)).abs() - sdf.half
     near = (off_grid < (radii + wide)[:, None]).all(-1)
     gaps = points.new_full(near.shape, wide)
@@ -164,22 +162,17 @@ def _gaps_to(
 
 @torch.no_grad()
 def gap_on_the_way(
-    obstacles: ObstacleTensors,
-    kinematics: Kinematics,
-    quaternion: Float[Tensor, "batch 4"],
-    pregrasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
-    grasp: tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch joints"]],
-    wide: float = WIDE,
-) -> Float[Tensor, "batch"]:
-    """Least signed distance [m] of the hand to any obstacle, from the retreat over the pregrasp to the grasp.
+    obstacles: ObstacleTensors, kinematics: Kinematics, pregrasp: Poses, grasp: Poses, wide: float = WIDE
+) -> Values:
+    """Return the least signed distance [m] of the hand to any obstacle, from the retreat over pregrasp to grasp.
 
-    It is negative inside; one of at least `wide` may be given as `wide`. `pregrasp` and `grasp` are base translations
-    and joints; the base is turned alike in both.
+    It is negative inside. One of at least `wide` may be given as `wide`. The base has one orientation in both poses.
     """
-    rotation = rotation_from_quaternion(quaternion)
-    begun = [drawn_back(pregrasp[0], rotation, obstacles.approach, RETREAT * share) for share in RETREAT_SHARES]
-    way = [(at, pregrasp[1]) for at in begun]
-    way += [(a * pregrasp[0] + (1 - a) * grasp[0], a * pregrasp[1] + (1 - a) * grasp[1]) for a in _WAY_SHARES]
+    rotation = rotation_from_quaternion(grasp.quaternion)
+    begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
+    way = [(at, pregrasp.joints) for at in begun]
+    ends = (pregrasp.translation, grasp.translation), (pregrasp.joints, grasp.joints)
+    way += [tuple(a * before + (1 - a) * after for before, after in ends) for a in _WAY_SHARES]
     placed = [(SE3(rotation, at), forward(kinematics, joints)) for at, joints in way]
     gaps = [obstacle_gaps(obstacles, base, links, wide).amin(-1) for base, links in placed]
     return torch.stack(gaps).amin(0)

@@ -32,10 +32,11 @@ from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.mesh.sharp_features import THIN_WALLED, neighbours_together
 from graspd_core.optimize import losses
 from graspd_core.optimize.kernel.builds import kernel
+from graspd_core.optimize.loop import Distances, Points, Poses, Values
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.perception.scene import Scene, object_sharp_points, sample_confidence
-from graspd_core.se3 import SE3, rotation_from_quaternion
+from graspd_core.se3 import SE3
 
 if TYPE_CHECKING:
     from graspd_core.optimize.kernel_problem import KernelProblem
@@ -330,16 +331,9 @@ class HandPlacement(NamedTuple):
     points: Float[Tensor, "batch points 3"]
 
 
-def hand_forward(
-    problem: Problem,
-    points: PointSet,
-    translation: Float[Tensor, "batch 3"],
-    quaternion: Float[Tensor, "batch 4"],
-    joints: Float[Tensor, "batch joints"],
-) -> HandPlacement:
-    """Where links and contact candidates are, for a batch of poses."""
-    base = SE3(rotation_from_quaternion(quaternion), translation)
-    links = forward(problem.hand.kinematics, joints)
+def hand_forward(problem: Problem, points: PointSet, poses: Poses) -> HandPlacement:
+    """Compute where links and contact candidates are, for a batch of poses."""
+    base, links = poses.base, forward(problem.hand.kinematics, poses.joints)
     return HandPlacement(base, links, base.apply(place_points(points.matrix, links)))
 
 
@@ -366,13 +360,13 @@ def _nearest_of_group(
 
 def _wrench_resistance(
     problem: Problem,
-    points: Float[Tensor, "batch points 3"],
-    distance: Float[Tensor, "batch points"],
-    normal: Float[Tensor, "batch points 3"],
+    points: Points,
+    distance: Distances,
+    normal: Points,
     *,
-    radius: Float[Tensor, "batch"],
+    radius: Values,
     activate: Callable[..., Tensor],
-) -> Float[Tensor, "batch"]:
+) -> Values:
     """The loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
     near = (distance.detach() - radius[:, None]).abs().topk(min(TASK_POINTS, distance.shape[-1]), largest=False).indices
     rows = torch.arange(len(near), device=near.device)[:, None]
@@ -387,10 +381,8 @@ def _wrench_resistance(
 
 def evaluate(
     problem: Problem,
-    translation: Float[Tensor, "batch 3"],
-    quaternion: Float[Tensor, "batch 4"],
-    joints: Float[Tensor, "batch joints"],
-    radius: Float[Tensor, "batch"],
+    poses: Poses,
+    radius: Values,
     delta: float,
     *,
     fine: bool = False,
@@ -405,7 +397,7 @@ def evaluate(
         activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
     """
     points = problem.hand.fine if fine else problem.hand.coarse
-    placed = hand_forward(problem, points, translation, quaternion, joints)
+    placed = hand_forward(problem, points, poses)
     distance, normal = sample_sdf(problem.object.sdf, placed.points)
     gap = (distance - radius[:, None])[:, points.groups].amin(-1)
     sunk = losses.penetration(distance, radius)
@@ -428,17 +420,12 @@ def evaluate(
         ),
         penetration=sunk,
         self_collision=losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight),
-        posture=losses.posture(joints, problem.hand.lower, problem.hand.upper),
+        posture=losses.posture(poses.joints, problem.hand.lower, problem.hand.upper),
         obstacle=obstacle,
     )
 
 
-def least_distance(
-    problem: Problem,
-    translation: Float[Tensor, "batch 3"],
-    quaternion: Float[Tensor, "batch 4"],
-    joints: Float[Tensor, "batch joints"],
-) -> Float[Tensor, "batch"]:
-    """Least distance of any coarse contact candidate to the object [m]."""
-    placed = hand_forward(problem, problem.hand.coarse, translation, quaternion, joints)
+def least_distance(problem: Problem, poses: Poses) -> Values:
+    """Return the least distance of any coarse contact candidate to the object [m]."""
+    placed = hand_forward(problem, problem.hand.coarse, poses)
     return sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.optimize.grasp_postures import ContactSet, Squeeze
-from graspd_core.optimize.loop import Poses
+from graspd_core.optimize.loop import Poses, Values
 from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import rotation_from_quaternion
 
@@ -47,7 +47,7 @@ class Staged(NamedTuple):
     overlap: Float[Tensor, "batch"]
 
 
-def score(problem: Problem, staged: Staged) -> Float[Tensor, "batch"]:
+def score(problem: Problem, staged: Staged) -> Values:
     """Log-odds that a candidate passes the hold trial, less what the trial forgives and a real hand does not.
 
     A finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself and one that presses on nothing cost; no
@@ -59,7 +59,7 @@ def score(problem: Problem, staged: Staged) -> Float[Tensor, "batch"]:
     return odds - (_depth(staged) - 2.0).clamp_min(0.0) - 10.0 * (staged.overlap / 0.001 - 1.0).clamp_min(0.0)
 
 
-def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Float[Tensor, "batch"]:
+def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Values:
     """Log-odds of passing the hold trial, by a network as `benchmarks/ranking.py` fits it."""
     x = ((figures - network["mean"]) / network["deviation"]).clamp(-FARTHEST, FARTHEST)
     for layer in range(2):
@@ -114,16 +114,16 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
     return torch.nan_to_num(torch.stack(columns, -1).double().cpu())
 
 
-def _depth(staged: Staged) -> Float[Tensor, "batch"]:
+def _depth(staged: Staged) -> Values:
     return (-staged.contact_set.distance.amin(-1)).clamp_min(0.0) / 0.001
 
 
-def _links_touching(contact_set: ContactSet) -> Float[Tensor, "batch"]:
+def _links_touching(contact_set: ContactSet) -> Values:
     members = contact_set.link[None] == torch.unique(contact_set.link)[:, None]
     return (contact_set.active[:, None] & members).any(-1).sum(-1).to(contact_set.distance)
 
 
-def _spread(rows: Float[Tensor, "batch slots 3"], count: Float[Tensor, "batch"]) -> Float[Tensor, "3 batch"]:
+def _spread(rows: Float[Tensor, "batch slots 3"], count: Values) -> Float[Tensor, "3 batch"]:
     squares = torch.linalg.eigvalsh(rows.transpose(1, 2) @ rows / count[:, None, None])
     return squares.clamp_min(0.0).T
 

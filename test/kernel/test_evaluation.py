@@ -38,7 +38,7 @@ def compiled_of(problem: Problem) -> KernelProblem:
 
 def by_torch(problem, x, radius, **look) -> Terms:
     poses = moved_along(unpack(x), -problem.hand.pivot)
-    return evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, DELTA, **look)
+    return evaluate(problem, poses, radius, DELTA, **look)
 
 
 def gradient_of(problem, x, radius, weights: LossWeights, **look) -> torch.Tensor:
@@ -120,7 +120,7 @@ def test_least_distance(problem_of, rows_of):
     problem = problem_of("allegro_right", "mug")
     x = rows_of("allegro_right", "mug", problem)
     poses = moved_along(unpack(x), -problem.hand.pivot)
-    expected = least_distance(problem, poses.translation, poses.quaternion, poses.joints)
+    expected = least_distance(problem, poses)
     assert least_distance_compiled(compiled_of(problem), x).tolist() == pytest.approx(expected.tolist(), abs=1e-6)
 
 

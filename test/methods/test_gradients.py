@@ -13,7 +13,7 @@ from torch import Tensor
 
 from graspd_core.optimize import losses
 from graspd_core.optimize.initial_poses import draw_starts
-from graspd_core.optimize.loop import Poses, pack
+from graspd_core.optimize.loop import Poses, pack, unpack
 from graspd_core.optimize.problem import Terms, evaluate
 
 ROOT = Path(__file__).parents[2]
@@ -79,7 +79,7 @@ def random_poses(hand, scene, count: int, dtype: torch.dtype = torch.float64) ->
 
 
 def terms_at(problem, x: Tensor, fine: bool) -> Terms:
-    return evaluate(problem, x[:, :3], x[:, 3:7], x[:, 7:], x.new_full((len(x),), RADIUS), DELTA, fine=fine, sharp=fine)
+    return evaluate(problem, unpack(x), x.new_full((len(x),), RADIUS), DELTA, fine=fine, sharp=fine)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ hand, scene = load_hand("allegro_right", candidates=80), load_scene("shape:box",
 settings = ProblemConfig(candidates=60, features=24, directions=12, friction=0.5)
 problem = build_problem(scene, hand, settings, seed=0, dtype=torch.float64)
 p = draw_starts(scene, hand, 2, 0, "cpu", torch.float64)
-arguments = (problem, p.translation, p.quaternion, p.joints, torch.zeros(2, dtype=torch.float64), 0.004)
+arguments = (problem, p, torch.zeros(2, dtype=torch.float64), 0.004)
 traced = torch.compile(evaluate, backend="eager", fullgraph=True)
 for fine in (False, True):
     look = {"fine": fine, "sharp": fine}

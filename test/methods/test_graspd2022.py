@@ -31,7 +31,7 @@ from graspd_core.optimize.graspd2022.graspd2022 import (
     published_starts,
 )
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
-from graspd_core.optimize.loop import Hooks, minimise, pack
+from graspd_core.optimize.loop import Hooks, minimise, pack, unpack
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, preset_names
 from graspd_core.optimize.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
@@ -177,7 +177,7 @@ def test_published_starts_face_the_surface_from_ten_centimetres(problem, scenes,
     assert distance.numpy() == pytest.approx(np.full(6, 0.1), abs=5e-3)
     assert ((facing * normal).sum(-1) < -0.95).all()
     assert torch.equal(starts.joints, torch.as_tensor(hand.open_posture).expand(6, -1))
-    placed = hand_forward(problem, problem.hand.coarse, starts.translation, starts.quaternion, starts.joints)
+    placed = hand_forward(problem, problem.hand.coarse, starts)
     assert (sample_sdf(problem.object.sdf, placed.points)[0] > 0).all()
 
 
@@ -229,9 +229,7 @@ def test_desired_forces_of_the_cone_stay_in_it(problem, starts, solver_of):
         before = state
         state = solver.step(problem, state, index)
     p = before.pose.value
-    normals = sample_sdf(
-        problem.object.sdf, hand_forward(problem, problem.hand.coarse, p[:, :3], p[:, 3:7], p[:, 7:]).points
-    )[1]
+    normals = sample_sdf(problem.object.sdf, hand_forward(problem, problem.hand.coarse, unpack(p)).points)[1]
     assert state.forces.value.abs().max() > 0
     kept = into_cone(state.forces.value, normals, 0.8)
     assert kept.numpy() == pytest.approx(state.forces.value.numpy(), abs=1e-9)
@@ -247,7 +245,7 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
     state = solver.step(problem, state, SHORT.level_set.coarse_steps)
     assert torch.isfinite(state.best_loss).all()
     by_code = solver_of(changed(SHORT, level_set__schedule="code")).init(problem, starts).radius
-    placed = hand_forward(problem, problem.hand.coarse, starts.translation, starts.quaternion, starts.joints)
+    placed = hand_forward(problem, problem.hand.coarse, starts)
     nearest = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)
     assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
     # A state is never changed in place.

@@ -102,9 +102,7 @@ def test_the_loss_is_that_of_the_poses_returned(problem, starts):
     with torch.no_grad():
         terms = evaluate(
             problem,
-            p.translation,
-            p.quaternion,
-            p.joints,
+            p,
             torch.zeros_like(solution.loss),
             CONFIG.delta_end,
             fine=True,

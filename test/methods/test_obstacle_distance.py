@@ -18,7 +18,7 @@ from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import find_candidates
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.initial_poses import draw_starts
-from graspd_core.optimize.loop import Hooks, pack
+from graspd_core.optimize.loop import Hooks, Poses, pack, unpack
 from graspd_core.optimize.obstacle_distance import (
     WIDE,
     gap_on_the_way,
@@ -107,7 +107,7 @@ def test_a_free_object_pays_nothing(hand, scenes):
     free = problem(scenes["box"], hand)
     assert (free.obstacles, free.object.confidence) == (None, None)
     starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
-    terms = evaluate(free, starts.translation, starts.quaternion, starts.joints, torch.zeros(3, dtype=DOUBLE), 0.004)
+    terms = evaluate(free, starts, torch.zeros(3, dtype=DOUBLE), 0.004)
     assert terms.obstacle is None
     # A wall that no hand on the object could touch is no obstacle either.
     far = hand_reach(hand) + RETREAT + 0.05
@@ -117,7 +117,7 @@ def test_a_free_object_pays_nothing(hand, scenes):
 
 def test_obstacles_leave_the_other_terms_alone(hand, scenes):
     starts = draw_starts(scenes["box"], hand, 4, 0, "cpu", DOUBLE)
-    arguments = (starts.translation, starts.quaternion, starts.joints, torch.zeros(4, dtype=DOUBLE), 0.004)
+    arguments = (starts, torch.zeros(4, dtype=DOUBLE), 0.004)
     free = evaluate(problem(scenes["box"], hand), *arguments)
     among = evaluate(problem(beside(on_table(scenes["box"]), 0.1), hand), *arguments)
     for name in free._fields[:-1]:
@@ -133,7 +133,7 @@ def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, f
 
     def term(y: torch.Tensor) -> torch.Tensor:
         look = partial(evaluate, fine=fine, sharp=fine)
-        obstacle = look(built, y[:, :3], y[:, 3:7], y[:, 7:], y.new_zeros(len(y)), 0.01).obstacle
+        obstacle = look(built, unpack(y), y.new_zeros(len(y)), 0.01).obstacle
         assert obstacle is not None
         return obstacle
 
@@ -146,7 +146,7 @@ def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, f
 
 def test_trust_scales_what_a_contact_counts(hand, scenes):
     x = draw_starts(scenes["box"], hand, 4, 0, "cpu", DOUBLE)
-    arguments = (x.translation, x.quaternion, x.joints, torch.zeros(4, dtype=DOUBLE), 0.02)
+    arguments = (x, torch.zeros(4, dtype=DOUBLE), 0.02)
     ones = torch.ones_like(scenes["box"].sdf.field[0])
     known = evaluate(problem(scenes["box"], hand), *arguments)
     seen = evaluate(problem(replace(scenes["box"], confidence=ones), hand, confidence_floor=0.4), *arguments)
@@ -196,11 +196,10 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
         for posture in (grasp.pregrasp, grasp.grasp):
             assert lowest(hand, posture, scene.support) > -0.0016
         ends = [
-            (torch.as_tensor(p.position)[None], torch.as_tensor(p.joint_positions)[None])
+            Poses(*(torch.as_tensor(x)[None] for x in (p.position, grasp.grasp.quaternion_wxyz, p.joint_positions)))
             for p in (grasp.pregrasp, grasp.grasp)
         ]
-        quaternion = torch.as_tensor(grasp.grasp.quaternion_wxyz)[None]
-        assert -float(gap_on_the_way(obstacles, kinematics, quaternion, ends[0], ends[1])) < 0.0016
+        assert -float(gap_on_the_way(obstacles, kinematics, ends[0], ends[1])) < 0.0016
 
 
 SETTINGS = ProblemConfig(candidates=200, features=24)

@@ -90,7 +90,7 @@ def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
     assert (sample_sdf(sound.object.sdf, at)[0] < -0.02).all()
     solution = minimise(ClosedForm(PLAN.settings, BATCH), sound, inside, Hooks())
     poses = solution.poses
-    placed = hand_forward(sound, sound.hand.fine, poses.translation, poses.quaternion, poses.joints)
+    placed = hand_forward(sound, sound.hand.fine, poses)
     depth = -sample_sdf(sound.object.sdf, placed.points)[0].amin(-1)
     # As deep as starts outside end: a millimetre or two.
     assert (depth < 0.003).all()

@@ -22,7 +22,19 @@ from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.kernel_problem import KernelProblem
-from graspd_core.optimize.loop import Follow, Hooks, Poses, Solution, adam_moments, minimise, moved_along, pack, unpack
+from graspd_core.optimize.loop import (
+    Follow,
+    Hooks,
+    Poses,
+    Rows,
+    Solution,
+    Values,
+    adam_moments,
+    minimise,
+    moved_along,
+    pack,
+    unpack,
+)
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.problem import Problem, Terms, evaluate, least_distance
 
@@ -55,14 +67,14 @@ class AdamState:
     def __getitem__(self, rows: Tensor) -> AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
-    def best(self) -> tuple[Poses, Float[Tensor, "batch"]]:
+    def best(self) -> tuple[Poses, Values]:
         """Return the best iterate of every start and its loss, the last iterate if none was scored."""
         scored = torch.isfinite(self.best_loss)
         poses = unpack(torch.where(scored[:, None], self.best_x, self.x))
         return moved_along(poses, -self.pivot), torch.where(scored, self.best_loss, self.loss)
 
 
-def initial_state(problem: Problem, starts: Poses, radius: Float[Tensor, "batch"]) -> AdamState:
+def initial_state(problem: Problem, starts: Poses, radius: Values) -> AdamState:
     """Return the state before the first step, padded by `radius` [m]."""
     x = pack(moved_along(starts, problem.hand.pivot))
     worst = x.new_full((len(x),), torch.inf)
@@ -85,7 +97,7 @@ def adam_step(
     return replace(state, x=torch.cat([x[:, :3], quaternion, joints], -1), mean=mean, square=square)
 
 
-def weighted(terms: Terms, weights: LossWeights) -> Float[Tensor, "batch"]:
+def weighted(terms: Terms, weights: LossWeights) -> Values:
     present = {name: value for name, value in terms._asdict().items() if value is not None}
     return sum((getattr(weights, name) * value for name, value in present.items()), torch.zeros(()))
 
@@ -108,7 +120,7 @@ class ClosedForm:
 
     def init(self, problem: Problem, starts: Poses) -> AdamState:
         with torch.no_grad():
-            nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
+            nearest = least_distance(problem, starts)
         return initial_state(problem, starts, nearest.clamp(0.0, self.config.radius_start))
 
     def step(self, problem: Problem, state: AdamState, index: int) -> AdamState:
@@ -137,19 +149,12 @@ class ClosedForm:
         )
         return replace(adam_step(problem, state, gradient, rate, index + 1, config), loss=loss)
 
-    def best(self, state: AdamState) -> tuple[Poses, Float[Tensor, "batch"]]:
+    def best(self, state: AdamState) -> tuple[Poses, Values]:
         return state.best()
 
     def value_and_gradient(
-        self,
-        problem: Problem,
-        x: Float[Tensor, "batch variables"],
-        radius: Float[Tensor, "batch"],
-        delta: float,
-        *,
-        fine: bool,
-        sharp: bool,
-    ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"]]:
+        self, problem: Problem, x: Rows, radius: Values, delta: float, *, fine: bool, sharp: bool
+    ) -> tuple[Values, Rows]:
         """Return the loss of every start and its gradient. A start whose gradient is not finite stands still."""
         rows = len(x)
         short = max(0, _FEWEST_ROWS - rows)
@@ -158,7 +163,7 @@ class ClosedForm:
         poses = moved_along(unpack(x), -problem.hand.pivot)
         activate = soft_contact if self.config.activation == "soft" else hard_contact
         looked = {"fine": fine, "sharp": sharp, "activate": activate}
-        terms = evaluate(problem, poses.translation, poses.quaternion, poses.joints, radius, delta, **looked)
+        terms = evaluate(problem, poses, radius, delta, **looked)
         loss = weighted(terms, self.config.polish_weights if sharp else self.config.weights)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         finite = torch.isfinite(gradient).all(-1) & torch.isfinite(loss)
@@ -168,15 +173,15 @@ class ClosedForm:
 
 def evaluate_compiled(
     problem: KernelProblem,
-    x: Float[Tensor, "batch variables"],
-    radius: Float[Tensor, "batch"],
+    x: Rows,
+    radius: Values,
     delta: float,
     weights: LossWeights,
     *,
     fine: bool = False,
     sharp: bool = False,
     soft: bool = True,
-) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch variables"], Terms]:
+) -> tuple[Values, Rows, Terms]:
     """Return the weighted loss of every row of `AdamState.x`, its gradient, and the terms."""
     x, radius = x.contiguous(), radius.contiguous()
     loss, gradient, terms = torch.empty(len(x)), torch.empty_like(x), torch.empty(len(x), len(Terms._fields))
@@ -185,7 +190,7 @@ def evaluate_compiled(
     return loss, gradient, Terms(*terms.T)
 
 
-def least_distance_compiled(problem: KernelProblem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
+def least_distance_compiled(problem: KernelProblem, x: Rows) -> Values:
     """Return the least distance of any coarse candidate to the object [m], for rows of `AdamState.x`."""
     x = x.contiguous()
     distance = torch.empty(len(x))

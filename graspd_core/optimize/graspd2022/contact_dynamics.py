@@ -25,6 +25,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from graspd_core.optimize.loop import Distances, Points
+
 # Floor of the squared tangential speed [m²/s²]: a micrometre a second is no motion.
 _SLIP_FLOOR = 1e-12
 
@@ -50,8 +52,8 @@ def leaky_min(x: Float[Tensor, "*shape"], leak: float) -> Float[Tensor, "*shape"
 
 
 def contact_forces(
-    height: Float[Tensor, "batch points"],
-    normals: Float[Tensor, "batch points 3"],
+    height: Distances,
+    normals: Points,
     velocities: Float[Tensor, "simulations 3"],
     *,
     stiffness: float,
@@ -119,7 +121,7 @@ def make_body(
 
 
 def net_wrench(
-    forces: Float[Tensor, "batch points simulations 3"], arms: Float[Tensor, "batch points 3"]
+    forces: Float[Tensor, "batch points simulations 3"], arms: Points
 ) -> tuple[Float[Tensor, "batch simulations 3"], Float[Tensor, "batch simulations 3"]]:
     """Sum of forces [N] and of their torques Σ r × f [N·m] for every simulation; `arms` from the centre of mass [m]."""
     # Σ rᵢ fⱼ in one matrix product; the torque is what is antisymmetric in it.

@@ -46,19 +46,19 @@ from graspd_core.optimize.graspd2022.contact_dynamics import (
 )
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
 from graspd_core.optimize.initial_poses import draw_starts
-from graspd_core.optimize.loop import Poses, minimise, pack, unpack
+from graspd_core.optimize.loop import Points, Poses, Rows, Values, minimise, pack, unpack
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
 from graspd_core.optimize.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward, least_distance
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import EPSILON, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
 
+# A variable of every start.
+Variable = Float[Tensor, "batch *shape"]
+# Forces on the object [N], or wrenches, at every point in every simulation.
+Forces = Float[Tensor, "batch points simulations components"]
 
-def actual(
-    forces: Float[Tensor, "batch points simulations 3"],
-    arms: Float[Tensor, "batch points 3"],
-    length: float,
-    components: int,
-) -> Float[Tensor, "batch points simulations components"]:
+
+def actual(forces: Float[Tensor, "batch points simulations 3"], arms: Points, length: float, components: int) -> Forces:
     """Contact forces as what desired ones are compared with: forces (3), or wrenches with torques over `length` (6)."""
     if components == 3:
         return forces
@@ -66,21 +66,14 @@ def actual(
     return torch.cat([forces, torques], -1)
 
 
-def physics(
-    desired: Float[Tensor, "batch points simulations components"],
-    supplied: Float[Tensor, "batch points simulations components"],
-) -> Float[Tensor, "batch"]:
+def physics(desired: Forces, supplied: Forces) -> Values:
     """L_phys: squared differences of desired and supplied forces, over all points and simulations [N²]."""
     difference = (desired - supplied).flatten(1)
     return (difference * difference).sum(-1)
 
 
 def motion_left(
-    body: FreeBody,
-    forces: Float[Tensor, "batch points simulations components"],
-    arms: Float[Tensor, "batch points 3"],
-    velocities: Float[Tensor, "simulations 3"],
-    time_step: float,
+    body: FreeBody, forces: Forces, arms: Points, velocities: Float[Tensor, "simulations 3"], time_step: float
 ) -> Float[Tensor, "batch simulations"]:
     """Squared speed of the object after one step, over the mean of its squares before (one: nothing was stopped).
 
@@ -97,7 +90,7 @@ def motion_left(
 
 @torch.no_grad()
 def into_cone(
-    forces: Float[Tensor, "batch points simulations 3"], normals: Float[Tensor, "batch points 3"], friction: float
+    forces: Float[Tensor, "batch points simulations 3"], normals: Points, friction: float
 ) -> Float[Tensor, "batch points simulations 3"]:
     """The nearest forces that only push on a surface with outward `normals`, within Coulomb friction."""
     along = -(forces * normals[:, :, None]).sum(-1)
@@ -129,23 +122,19 @@ class Adamax:
     top: Float[Tensor, "batch *shape"]
 
 
-def adamax(value: Float[Tensor, "batch *shape"]) -> Adamax:
+def adamax(value: Variable) -> Adamax:
     """The state before the first step."""
     return Adamax(value, torch.zeros_like(value), torch.zeros_like(value))
 
 
-def adamax_step(
-    state: Adamax, gradient: Float[Tensor, "batch *shape"], rate: float, count: int, memory: float = 0.999
-) -> Adamax:
+def adamax_step(state: Adamax, gradient: Variable, rate: float, count: int, memory: float = 0.999) -> Adamax:
     """The state after step number `count`, from one; a negative rate climbs. `memory` keeps that share of `top`."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     top = torch.maximum(memory * state.top, gradient.abs())
     return Adamax(torch.addcdiv(state.value, mean, top + _EPSILON, value=-rate / (1 - _BETA1**count)), mean, top)
 
 
-def adam_step(
-    state: Adamax, gradient: Float[Tensor, "batch *shape"], rate: float, count: int, memory: float = 0.999
-) -> Adamax:
+def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory: float = 0.999) -> Adamax:
     """The state after Adam's step number `count`, from one (Kingma & Ba 2015, §2); `memory` is its β2."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     squares = torch.lerp(gradient * gradient, state.top, memory)
@@ -183,7 +172,7 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
     translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
     joints = torch.as_tensor(hand.open_posture).expand(len(points), -1)
     drawn = Poses(*(x.to(problem.hand.lower) for x in (translation, quaternion_from_rotation(rotation), joints)))
-    placed = hand_forward(problem, problem.hand.coarse, drawn.translation, drawn.quaternion, drawn.joints)
+    placed = hand_forward(problem, problem.hand.coarse, drawn)
     touching = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1) <= 0
     return drawn[touching.int().argsort(stable=True)[:count]]
 
@@ -279,7 +268,7 @@ class Graspd2022:
         radius = x.new_full((len(x),), config.level_set.radius_start)
         if config.level_set.schedule == "code":
             with torch.no_grad():
-                nearest = least_distance(problem, starts.translation, starts.quaternion, starts.joints)
+                nearest = least_distance(problem, starts)
                 radius = (nearest - config.level_set.clearance).clamp_min(0.0)
         worst = x.new_full((len(x),), torch.inf)
         return RelaxedState(
@@ -325,13 +314,7 @@ class Graspd2022:
         return stepped
 
     def slope(
-        self,
-        problem: Problem,
-        state: RelaxedState,
-        index: int,
-        radius: Float[Tensor, "batch"],
-        *,
-        pose_only: bool = False,
+        self, problem: Problem, state: RelaxedState, index: int, radius: Values, *, pose_only: bool = False
     ) -> Slope:
         """Cost, broken constraints and the Lagrangian's gradients at an iterate, against the level set φ = `radius`."""
         bounds = self.config.constraints
@@ -352,9 +335,7 @@ class Graspd2022:
         fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
         return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
 
-    def moved(
-        self, problem: Problem, pose: Adamax, gradient: Float[Tensor, "batch variables"], when: tuple[int, int]
-    ) -> Adamax:
+    def moved(self, problem: Problem, pose: Adamax, gradient: Rows, when: tuple[int, int]) -> Adamax:
         """The pose after a move, `when` the index of the step and the turn in it.
 
         All moments follow the gradient, also those of variables whose turn it is not: so it is in the code.
@@ -371,30 +352,24 @@ class Graspd2022:
         joints = x[:, 7:].clamp(problem.hand.lower, problem.hand.upper) if steps.within_limits else x[:, 7:]
         return replace(after, value=torch.cat([x[:, :3], quaternion, joints], -1))
 
-    def best(self, state: RelaxedState) -> tuple[Poses, Float[Tensor, "batch"]]:
+    def best(self, state: RelaxedState) -> tuple[Poses, Values]:
         if self.config.keep == "last":
             return unpack(state.pose.value), state.loss
         scored = torch.isfinite(state.best_loss)
         x = torch.where(scored[:, None], state.best, state.pose.value)
         return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
-    def cost(self, found: Evaluation) -> Float[Tensor, "batch"]:
+    def cost(self, found: Evaluation) -> Values:
         """What is minimised: L_phys, or the motion itself without relaxation, with L_range and L_inter."""
         config = self.config
         goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
         return goal + config.weights.range * found.range + config.weights.inter * found.inter
 
-    def evaluate(
-        self,
-        problem: Problem,
-        pose: Float[Tensor, "batch variables"],
-        desired: Float[Tensor, "batch points simulations components"],
-        radius: Float[Tensor, "batch"],
-    ) -> Evaluation:
+    def evaluate(self, problem: Problem, pose: Rows, desired: Forces, radius: Values) -> Evaluation:
         """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
         config, body = self.config, self.body
         poses = unpack(pose)
-        placed = hand_forward(problem, self.points(problem), poses.translation, poses.quaternion, poses.joints)
+        placed = hand_forward(problem, self.points(problem), poses)
         distance, normals = sample_sdf(problem.object.sdf, placed.points)
         arms = placed.points - body.center
         velocities = self.velocities
