@@ -205,17 +205,8 @@ def _message(path: Path) -> Any:
     from bag_writer import camera_info_message
 
     from graspd_core.errors import FormatError
-    from graspd_core.io.bags import (
-        CLOUD,
-        IMAGE,
-        INFO,
-        TRANSFORMS,
-        add_transforms,
-        cloud_from_depth_message,
-        cloud_from_message,
-        jazzy_types,
-        stamp_of,
-    )
+    from graspd_core.io.bags import CLOUD, IMAGE, INFO, TRANSFORMS, jazzy_types
+    from graspd_core.io.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
     from graspd_core.perception.cloud.camera import PinholeCamera
     from graspd_core.transforms import TransformBuffer
 

@@ -104,7 +104,7 @@ class Follower:
 
     def _seen(self, frame: str) -> np.ndarray:
         """The points of the newest cloud, where it is in the frame of the answer [m]."""
-        from graspd_core.io.bags import points_from_message
+        from graspd_core.io.messages import points_from_message
 
         if self._cloud is None or self._cloud.header.frame_id != frame:
             return np.zeros((0, 3))

@@ -1,7 +1,6 @@
 """Read rosbag2 recordings (mcap and sqlite3) by the rosbags library: no ROS installation, no DDS.
 
-What sensor messages hold becomes arrays: those of a bag, and any other objects with the attributes that ROS names. The
-order is the recording's, so that the same bag gives the same clouds every time.
+The order is the recording's, so that the same bag gives the same clouds every time.
 """
 
 from __future__ import annotations
@@ -14,144 +13,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from graspd_core.errors import BagError, CloudError, TransformError
+from graspd_core.errors import BagError, TransformError
+from graspd_core.io.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
 from graspd_core.perception.cloud.camera import (
     ENCODINGS,
-    PinholeCamera,
-    camera_from_calibration,
-    cloud_from_depth,
-    depth_from_bytes,
 )
 from graspd_core.perception.cloud.point_cloud import (
-    CloudLayout,
     PointCloud,
-    organised_points,
-    points_from_layout,
     transform_cloud,
 )
-from graspd_core.transforms import SECOND, TransformBuffer
-
-
-def stamp_of(message: Any) -> int:
-    """Time of a stamped message's header [ns]."""
-    stamp = message.header.stamp
-    return stamp.sec * SECOND + stamp.nanosec
-
-
-def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
-    """The finite points of a sensor_msgs/PointCloud2, in row order, in the cloud's own frame and unit.
-
-    Raises:
-        CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
-    """
-    return points_from_layout(_layout(message))
-
-
-def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Every point of a sensor_msgs/PointCloud2 in its place, NaN and infinite ones too. Raises CloudError as above."""
-    return organised_points(_layout(message))
-
-
-def _layout(message: Any) -> CloudLayout:
-    fields = {field.name: (field.offset, field.datatype) for field in message.fields}
-    return CloudLayout(
-        width=message.width,
-        height=message.height,
-        point_step=message.point_step,
-        row_step=message.row_step,
-        is_bigendian=bool(message.is_bigendian),
-        fields=fields,
-        data=memoryview(message.data),
-    )
-
-
-def cloud_from_message(message: Any) -> PointCloud:
-    """A sensor_msgs/PointCloud2 as seen from the origin of its frame. Raises CloudError as `points_from_message`."""
-    # REP 103: the frames of cameras whose z axis is the optical axis are called so.
-    optical = message.header.frame_id.endswith("optical_frame")
-    return PointCloud(points_from_message(message), np.zeros(3), np.array([0.0, 0.0, 1.0]) if optical else None)
-
-
-def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
-    """The camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P without any for a rectified one.
-
-    Binning and region of interest count: the camera is that of the image as sent.
-
-    Raises:
-        CloudError: it is not calibrated, or of a distortion model that is not known.
-    """
-    # Drivers of cameras without distortion often leave P empty.
-    by_projection = rectified and info.p[0] > 0
-    matrix = np.array(info.p).reshape(3, 4)[:, :3] if by_projection else np.array(info.k, dtype=float).reshape(3, 3)
-    if not np.isfinite(matrix).all():
-        raise CloudError(f"camera: its {'P' if by_projection else 'K'} has numbers that are not finite")
-    roi, bins = info.roi, np.array([max(info.binning_x, 1), max(info.binning_y, 1)])
-    shown = matrix.copy()
-    shown[:2, 2] -= roi.x_offset, roi.y_offset
-    shown[:2] /= bins[:, None]
-    width, height = (roi.width or info.width) // bins[0], (roi.height or info.height) // bins[1]
-    # Once it is taken out, its model does not matter: that of a fisheye lens is not known here.
-    distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
-    return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, model)
-
-
-def depth_from_message(image: Any) -> Float[np.ndarray, "height width"]:
-    """Depth [m] of a sensor_msgs/Image, 0 where there is none. Raises CloudError: no depth image, or a broken one."""
-    return depth_from_bytes(
-        memoryview(image.data),
-        width=image.width,
-        height=image.height,
-        step=image.step,
-        encoding=image.encoding,
-        is_bigendian=bool(image.is_bigendian),
-    )
-
-
-def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
-    """What a depth image and its sensor_msgs/CameraInfo show, in the camera's optical frame.
-
-    Args:
-        image: a sensor_msgs/Image of an encoding for depth.
-        info: the camera's calibration, for an image of the same size.
-        rectified: whether distortion has been taken out of the image.
-
-    Raises:
-        CloudError: the image is no depth, is broken, shows nothing, or does not fit the calibration.
-    """
-    cloud = cloud_from_depth(depth_from_message(image), camera_from_message(info, rectified=rectified))
-    if len(cloud.points) == 0:
-        raise CloudError(f"depth image: none of its {image.width} x {image.height} pixels has a depth")
-    return cloud
-
-
-def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
-    """Put a tf2_msgs/TFMessage into a buffer; transforms that make no sense are left out and named, one line each."""
-    refused = []
-    for item in message.transforms:
-        try:
-            pose = _pose(item.transform)
-            buffer.add(item.header.frame_id, item.child_frame_id, pose, stamp_of(item), static)
-        except TransformError as error:
-            refused.append(str(error))
-    return tuple(refused)
-
-
-def _pose(transform: Any) -> Float[np.ndarray, "4 4"]:
-    """The matrix of a geometry_msgs/Transform; NaN where its quaternion is no rotation."""
-    from scipy.spatial.transform import Rotation
-
-    turn, move = transform.rotation, transform.translation
-    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
-    pose = np.eye(4)
-    pose[:3, 3] = move.x, move.y, move.z
-    # A driver that leaves the quaternion at zero, or far from unit length, says nothing that could be trusted.
-    usable = np.isfinite(quaternion).all() and abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) < 1e-2
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix() if usable else np.nan
-    return pose
-
+from graspd_core.transforms import TransformBuffer
 
 BAG_ENDINGS = ("mcap", "db3")
 CLOUD, IMAGE, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"

@@ -197,7 +197,7 @@ def try_hypotheses(
     time.
     """
     travel = turn = 0.0
-    for items, though_failed in zip(hypotheses.stages, HELD_THOUGH_FAILED, strict=False):
+    for items, though_failed in zip(hypotheses.stages, HELD_THOUGH_FAILED[: len(hypotheses.stages)], strict=True):
         with closing(hold_under(items, grasp, stop)) as results:
             for item, result in zip(items, results, strict=False):
                 if stop() or result is None:

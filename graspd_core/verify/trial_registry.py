@@ -1,4 +1,4 @@
-"""The trials that planning runs, one row each, in this order. A grasp is verified when it passes all that apply."""
+"""The trials that planning runs, one row each, in this order. `types.Grasp.verdict` says what passing them means."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from graspd_core import PinholeCamera, PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
 from graspd_core.config import load_scene_config
 from graspd_core.errors import CloudError
-from graspd_core.io.bags import camera_from_message, depth_from_message, pixels_from_message, points_from_message
+from graspd_core.io.messages import camera_from_message, depth_from_message, pixels_from_message, points_from_message
 from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import transform_cloud
 from graspd_core.perception.cloud.viewpoint_check import check_viewpoint

@@ -12,7 +12,8 @@ from bag_writer import Record, camera_info_message, cloud_message, depth_message
 
 from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import BagError, CloudError, TransformError
-from graspd_core.io.bags import bag_topics, camera_from_message, is_bag, read_frames, read_raw, read_transforms
+from graspd_core.io.bags import bag_topics, is_bag, read_frames, read_raw, read_transforms
+from graspd_core.io.messages import camera_from_message
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND

@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_core.errors import BagError
-from graspd_core.io.bags import cloud_from_depth_message, points_from_message
+from graspd_core.io.messages import cloud_from_depth_message, points_from_message
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 from graspd_ros.player import main, play

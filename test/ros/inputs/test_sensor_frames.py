@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError, TransformError
-from graspd_core.io.bags import camera_from_message, points_from_message
+from graspd_core.io.messages import camera_from_message, points_from_message
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of
