@@ -18,11 +18,10 @@ from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import RETREAT, drawn_back, forward, place_points
 from graspd_core.hands.link_distance import pair_distance, solid_distance
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.optimize import losses
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.loop import Distances, Joints, Poses, Rows, Values, adam_moments, pack
-from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors, obstacle_gaps
-from graspd_core.optimize.problem import OBSTACLE_MARGIN, Problem, hand_forward
+from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors
+from graspd_core.optimize.problem import Problem, hand_forward, obstacle_depth
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # Contacts of one link beyond its nearest.
@@ -199,7 +198,9 @@ def _find_pregrasp(
         short = ((wanted - distances(x)).clamp_min(0.0) / 0.001).unflatten(0, (len(_WAY), -1))
         loss = (short * short).mean(-1).sum(0) + (cost * (x - start) ** 2).sum(-1)
         if problem.obstacles is not None:
-            blocked = _obstacle_cost(problem.obstacles, problem, rotation, way_to(x))
+            way = way_to(x)
+            links = forward(problem.hand.kinematics, way[:, 3:])
+            blocked = obstacle_depth(problem.obstacles, SE3(rotation, way[:, :3]), links)
             loss = loss + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         gradient = torch.nan_to_num(gradient)
@@ -223,13 +224,6 @@ def _rates_and_costs(
     cost[3:] /= problem.hand.joint_scale**2
     cost[:3] = _BASE_COST
     return rates, cost
-
-
-def _obstacle_cost(
-    obstacles: ObstacleTensors, problem: Problem, rotation: Float[Tensor, "batch 3 3"], x: Rows
-) -> Values:
-    gaps = obstacle_gaps(obstacles, SE3(rotation, x[:, :3]), forward(problem.hand.kinematics, x[:, 3:]))
-    return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Closed-form resistance of soft contacts against disturbance wrenches.
+"""Compute the loss terms of the closed-form relaxation: pure functions of arrays, one value per start, of order one.
 
 For a unit disturbance w the friction-cone-bounded contact forces that resist it best have a closed form at every
 contact, so the support function of the grasp wrench space is a sum over contacts (docs/method.md):
@@ -6,11 +6,7 @@ contact, so the support function of the grasp wrench space is a sum over contact
     v_ik = w_k,lin + w_k,ang × (x_i − c) / L
     h_k  = Σ_i s_i · max(0, −n_i·v_ik + μ ‖v_ik − (n_i·v_ik) n_i‖)
 
-Gradients are exact, except that the square root of the tangential speed is floored at `_TANGENT_FLOOR`.
-
-Loss terms of the closed-form relaxation: pure functions of arrays, one value per start, each of order one.
-
-Weights live in `closed_form_config.LossWeights`. Gradients are exact where a term is smooth.
+Gradients are exact where a term is smooth, except that the tangential speed's root is floored at `_TANGENT_FLOOR`.
 """
 
 from __future__ import annotations
@@ -23,10 +19,14 @@ from graspd_core.optimize.loop import Distances, Joints, Points, Values
 
 # Floor of the squared tangential speed, relative to the unit disturbance: keeps the square root differentiable.
 _TANGENT_FLOOR = 1e-6
+# Lengths that make a term one [m].
+_CENTIMETRE, _MILLIMETRE = 0.01, 0.001
+# Added to h so that a start without any contact has a finite task loss.
+_SUPPORT_FLOOR = 1e-3
 
 
 def disturbance_directions(count: int, seed: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "count 6"]:
-    """Unit wrenches spread over the sphere in R⁶: the 12 signed axes first, then farthest-of-many random ones."""
+    """Spread unit wrenches over the sphere in R⁶: the 12 signed axes first, then farthest-of-many random ones."""
     axes = torch.cat([torch.eye(6, dtype=dtype), -torch.eye(6, dtype=dtype)])
     chosen = axes[:count]
     pool = torch.randn(64 * max(count, 1), 6, generator=torch.Generator().manual_seed(seed), dtype=dtype)
@@ -42,7 +42,7 @@ def disturbance_directions(count: int, seed: int, dtype: torch.dtype = torch.flo
 def wrench_support(
     arms: Points, normals: Points, activation: Distances, directions: Float[Tensor, "directions 6"], friction: float
 ) -> Float[Tensor, "batch directions"]:
-    """Support h_k of the soft grasp wrench space in each direction; force closure is h_k > 0 for all k.
+    """Return the support h_k of the soft grasp wrench space in each direction. Force closure is h_k > 0 for all k.
 
     Args:
         arms: contact points about the centre of mass over the characteristic length, (x − c) / L.
@@ -68,32 +68,25 @@ def wrench_support(
     return (activation[..., None, :] @ resistance).squeeze(-2)
 
 
-# Lengths that make a term one [m].
-_CENTIMETRE = 0.01
-_MILLIMETRE = 0.001
-# Added to h so that a start without any contact has a finite task loss.
-_SUPPORT_FLOOR = 1e-3
-
-
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Contact activation s = exp(−|φ − r| / δ): one on the padded surface, never with a zero gradient off it."""
+    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface, never with a zero gradient off it."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
 def hard_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """The ablation of `soft_contact`: one within δ of the padded surface, zero elsewhere, without any gradient."""
+    """Return one within δ of the padded surface, else zero, without any gradient: the ablation of `soft_contact`."""
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
 def wrench_resistance(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Values:
-    """Soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst disturbance is resisted."""
+    """Return the soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst one is resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()
     count = support.shape[-1]
     return (torch.logsumexp(sharpness * resisted, -1) - torch.log(torch.tensor(float(count)))) / sharpness
 
 
 def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Values:
-    """Distance of each group of links from the padded surface, either side, saturating beyond the group's reach [m].
+    """Return the distance of the groups of links from the padded surface, saturating beyond each group's reach [m].
 
     Groups with a long reach (fingertips) are drawn from afar, the others only finish a contact that is already near.
     """
@@ -102,7 +95,7 @@ def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) ->
 
 
 def penetration(distance: Distances, radius: Values) -> Values:
-    """Depth below the padded surface: sum of squares in mm², tempered to grow linearly for deep points."""
+    """Return the depth below the padded surface: sum of squares in mm², growing linearly for deep points."""
     depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
     return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
 
@@ -110,9 +103,9 @@ def penetration(distance: Distances, radius: Values) -> Values:
 def self_collision(
     centers: Float[Tensor, "batch spheres 3"], radii: Float[Tensor, "spheres"], weight: Float[Tensor, "spheres spheres"]
 ) -> Values:
-    """Overlap of proxy spheres of non-adjacent links [mm²]: depth as (R² − d²) / 2R, exact where spheres just touch.
+    """Return the overlap of spheres of non-adjacent links [mm²], depth as (R² − d²) / 2R, exact where they touch.
 
-    `weight` is 1 / 2R [1/m] for each checked pair, R the sum of its radii, once, and zero for every other.
+    `weight` is 1 / 2R [1/m] once for each checked pair, with R the sum of its radii, and zero elsewhere.
     """
     inner = (radii * radii - (centers * centers).sum(-1))[..., None]
     ones, r = torch.ones_like(inner), radii.expand(len(centers), -1)[..., None]
@@ -124,6 +117,6 @@ def self_collision(
 
 
 def posture(joints: Joints, lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]) -> Values:
-    """Squared distance of the joints from mid-range, in half ranges."""
+    """Return the squared distance of the joints from mid-range, in half ranges."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     return (((joints - middle) / half) ** 2).sum(-1)

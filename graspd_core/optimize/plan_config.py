@@ -1,4 +1,4 @@
-"""Everything that a run of `plan_grasps` is set by: the methods, their settings, and the presets that hold them.
+"""Hold the settings of a run of `plan_grasps`: the methods, their own settings, and the presets.
 
 A method of graspd_core is a row of `METHODS`. A method of another package registers itself: an entry point of the group
 `graspd.methods` names its row, which is loaded when the method is first asked for.
@@ -27,26 +27,18 @@ if TYPE_CHECKING:
     from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
 
 
-def _unchanged(settings: Any, budget: float) -> Any:
-    return settings
-
-
-def _one(settings: Any) -> int:
-    return 1
-
-
 @dataclass(frozen=True)
 class Method:
     """One way to find grasps.
 
     Attributes:
-        module: has `plan(PlannerInput) -> PlannerOutput`; imported when the method is first used, since it needs torch.
-        config: dataclass of its settings; a preset's section of the method's name fills it.
+        module: has `plan(PlannerInput) -> PlannerOutput`.
+        config: dataclass of its settings. A preset's section of the method's name fills it.
         label: its name in charts.
         colour, marker: of its points in charts, as Matplotlib takes them.
         benchmark_count: grasps of one unfiltered batch in the benchmark.
-        at_budget: its settings at a share of the usual budget; a method without one keeps its settings.
-        searches: of a round at most, by its settings: again only where too few grasps are expected to hold.
+        at_budget: its settings at a share of the usual budget. The default keeps the settings.
+        searches: of a round at most, by its settings, repeated only if too few grasps are expected to hold.
     """
 
     module: str
@@ -55,11 +47,14 @@ class Method:
     colour: str
     marker: str
     benchmark_count: int
-    at_budget: Callable[[Any, float], Any] = _unchanged
-    searches: Callable[[Any], int] = _one
+    at_budget: Callable[[Any, float], Any] = lambda settings, budget: settings
+    searches: Callable[[Any], int] = lambda settings: 1
 
     def plan(self, task: PlannerInput) -> PlannerOutput:
-        """Find poses. Numerical trouble is a pose that is not there, never an exception."""
+        """Find poses. Numerical trouble is a missing pose, never an exception.
+
+        The module is imported here and not with this file, because it needs torch.
+        """
         return importlib.import_module(self.module).plan(task)
 
 
@@ -110,9 +105,9 @@ class PlanConfig:
     """Settings of a run, apart from the scene, the hand and the seed.
 
     Attributes:
-        resolution: the signed distance grid has at most the cube of it in nodes; a cube has as many along each side.
+        resolution: the signed distance grid has at most its cube in nodes. A cube has as many along each side.
         method: how poses are searched for, one of `method_names`.
-        settings: of that method, of the type that its row names; None takes the defaults.
+        settings: of that method, of the type that its row names. None takes the defaults.
         problem: how scene and hand are laid out.
         grasp_stages: pregrasp and squeeze.
         rounds: of optimiser and trial.
@@ -140,16 +135,16 @@ class PlanConfig:
             raise ConfigError(f"settings: {type(self.settings).__name__} is not {config.__name__} of {self.method}")
 
     def at_budget(self, budget: float) -> PlanConfig:
-        """The same method with more or less effort; 1 is its settings as they are."""
+        """Return the same method with more or less effort. A budget of 1 keeps its settings."""
         return dataclasses.replace(self, settings=method_row(self.method).at_budget(self.settings, budget))
 
     def with_method(self, method: str) -> PlanConfig:
-        """The settings with another method at its defaults; unchanged where it is the same method."""
+        """Return the settings with another method at its defaults, unchanged if it is the same method."""
         return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
 
 
 def to_mapping(config: PlanConfig) -> dict[str, Any]:
-    """The settings as a preset file has them: the method's own are in the section of its name."""
+    """Return the settings as a preset file has them: the method's own are in the section of its name."""
     values = dataclasses.asdict(config)
     return {config.method if key == "settings" else key: value for key, value in values.items()}
 
@@ -173,7 +168,7 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
 
 
 def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
-    """The settings with some of a preset's values changed, each by its dotted name.
+    """Return the settings with some of a preset's values changed, each by its dotted name.
 
     Raises:
         ConfigError: there is no such value, or it is of another type.
@@ -191,12 +186,12 @@ def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
 
 
 def preset_names() -> tuple[str, ...]:
-    """Names of the boxed presets."""
+    """Return the names of the presets in `config/presets`."""
     return tuple(sorted(path.stem for path in (config_dir() / "presets").glob("*.yaml")))
 
 
 def load_preset(name: str) -> PlanConfig:
-    """A boxed preset by name, or a preset file by path.
+    """Load a preset by name, or a preset file by path.
 
     Raises:
         ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.

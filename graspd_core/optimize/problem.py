@@ -1,7 +1,4 @@
-"""Hand and object laid out as tensors on one device and dtype: what every evaluation of a problem reads.
-
-The assembled problem: everything a solver evaluates, as tensors on one device, and the terms of one evaluation.
-"""
+"""Lay hand, object and obstacles out as tensors on one device and dtype, and evaluate the loss terms of a problem."""
 
 from __future__ import annotations
 
@@ -41,13 +38,16 @@ from graspd_core.se3 import SE3
 if TYPE_CHECKING:
     from graspd_core.optimize.kernel_problem import KernelProblem
 
-# How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact.
-_REACH_OF_TIPS = 0.1
-_REACH_OF_OTHERS = 0.004
-# The same of patches of a hand that is to touch with all of itself [m].
-_REACH_OF_PATCHES = 0.03
+# How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact,
+# and patches of a hand that is to touch with its whole surface.
+_REACH_OF_TIPS, _REACH_OF_OTHERS, _REACH_OF_PATCHES = 0.1, 0.004, 0.03
+REACH_WHEN_SHARP = 0.01
 # A base frame this near to the middle of the palm lies in the palm [m].
 _PALM_RADIUS = 0.05
+# Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
+TASK_POINTS, FEATURE_PAIRS = 96, 96
+# Free space that the hand keeps to obstacles [m]. Fingertips that hold an object low on a table all but touch it.
+OBSTACLE_MARGIN = 0.001
 
 
 @dataclass(frozen=True)
@@ -87,17 +87,15 @@ class HandTensors:
     Attributes:
         model: the hand that is laid out.
         kinematics: forward kinematics.
-        coarse: the first, evenly spread contact candidates; what most steps look at.
-        fine: all contact candidates; what the last steps look at.
+        coarse: the first, evenly spread contact candidates, for most steps.
+        fine: all contact candidates, for the last steps.
         reach: attraction range of each group of candidates [m].
         solids: collision primitives.
-        group_of_solid: index of the group of each solid's links, the first where they have several; one past the last
-            where they have no coarse candidate.
+        group_of_solid: the first group of each solid's links, one past the last group if they have no coarse candidate.
         spheres: for self-collision.
-        lower: joint limits [rad] or [m].
-        upper: joint limits [rad] or [m].
+        lower, upper: joint limits [rad] or [m].
         pivot: the point that a solver turns the hand about, base frame [m].
-        joint_scale: travel of each joint that counts as much as one radian, one where it turns [rad] or [m].
+        joint_scale: travel of each joint that counts as much as one radian, one if it turns [rad] or [m].
     """
 
     model: HandModel
@@ -120,12 +118,11 @@ class ObjectTensors:
 
     Attributes:
         sdf: signed distance field.
-        features: sharp points of its surface, which candidates would not notice sinking in [m].
-        coarse_features: how many of them, from the first, the coarse steps look at too: none, but on thin walls, which
-            a finger could otherwise step through.
+        features: sharp points of the surface, which could sink in between the hand's candidates [m].
+        coarse_features: how many of the first sharp points the coarse steps look at: some on thin walls, else none.
         center: centre of mass [m].
         length: characteristic length of torques [m].
-        confidence: in the surface near each node of `sdf`, raised to a floor; None: all of it is known.
+        confidence: in the surface near each node of `sdf`, raised to a floor. None if all of it is known.
     """
 
     sdf: GridSDF
@@ -140,10 +137,9 @@ class ObjectTensors:
 def make_hand_tensors(
     hand: HandModel, candidates: int, patch_size: int, device: str, dtype: torch.dtype
 ) -> HandTensors:
-    """Lay a hand out; the coarse set is the first `candidates` of the contact candidates that it was loaded with.
+    """Lay a hand out. The coarse set is the first `candidates` of the hand's contact candidates.
 
-    They are grouped by rigid groups of links, or into patches of so many of them. Kept for the last few hands, which
-    are hashed by identity.
+    Candidates are grouped by rigid groups of links, or into patches of `patch_size`. The last few hands are kept.
     """
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -193,7 +189,7 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 
 @lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
-    """Lay the scene's object out; kept for the last few scenes, which are hashed by identity."""
+    """Lay the scene's object out. The last few scenes are kept. They are hashed by identity."""
     sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
     thin = thin_share > THIN_WALLED
     floor, confidence = settings.confidence_floor, None
@@ -224,9 +220,9 @@ def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
-    """Which patch each contact candidate belongs to: the nearest of its links', each around a coarse candidate.
+    """Return the patch of each contact candidate: the nearest of its links' patches.
 
-    The coarse candidates of a rigid group of links have one patch for `size` of them, the centres far from each other.
+    A rigid group of links has one patch for every `size` coarse candidates, with centres far from each other.
     """
     posture = link_poses(hand, (hand.lower + hand.upper) / 2)
     points = in_base(posture, hand.candidate_points, hand.candidate_link)
@@ -251,13 +247,6 @@ def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"])
     return np.stack([np.resize(m if len(m) else [0], width) for m in members])
 
 
-REACH_WHEN_SHARP = 0.01
-# Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
-TASK_POINTS, FEATURE_PAIRS = 96, 96
-# Free space that the hand keeps to obstacles [m]; what is low on a table is held by fingertips that all but touch it.
-OBSTACLE_MARGIN = 0.001
-
-
 @dataclass(frozen=True)
 class Problem:
     """One hand, one object, one set of disturbances, on one device and dtype.
@@ -266,7 +255,7 @@ class Problem:
         hand, object: laid out as tensors.
         directions: unit disturbance wrenches.
         friction: coefficient planned with, never above the object's own.
-        obstacles: what else is in the way, None where nothing is: then nothing is evaluated for it.
+        obstacles: what else is in the way, None if nothing is.
     """
 
     hand: HandTensors
@@ -291,17 +280,14 @@ class Problem:
 
 
 class Terms(NamedTuple):
-    """Loss terms of a batch of starts, unweighted; the fields are those of `LossWeights`.
+    """Loss terms of a batch of starts, unweighted, named as in `LossWeights`. Free scenes have no `obstacle`."""
 
-    `obstacle` is None where the scene has none.
-    """
-
-    wrench_resistance: Float[Tensor, "batch"]
-    distance: Float[Tensor, "batch"]
-    penetration: Float[Tensor, "batch"]
-    self_collision: Float[Tensor, "batch"]
-    posture: Float[Tensor, "batch"]
-    obstacle: Float[Tensor, "batch"] | None = None
+    wrench_resistance: Values
+    distance: Values
+    penetration: Values
+    self_collision: Values
+    posture: Values
+    obstacle: Values | None = None
 
 
 def build_problem(
@@ -313,7 +299,7 @@ def build_problem(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
-    """Lay scene and hand out as tensors; `seed` spreads the disturbances beyond the signed axes."""
+    """Lay scene and hand out as tensors. `seed` spreads the disturbances beyond the signed axes."""
     return Problem(
         hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
         object=make_object_tensors(scene, settings, device, dtype),
@@ -328,7 +314,7 @@ class HandPlacement(NamedTuple):
 
     base: SE3
     links: SE3
-    points: Float[Tensor, "batch points 3"]
+    points: Points
 
 
 def hand_forward(problem: Problem, points: PointSet, poses: Poses) -> HandPlacement:
@@ -337,10 +323,22 @@ def hand_forward(problem: Problem, points: PointSet, poses: Poses) -> HandPlacem
     return HandPlacement(base, links, base.apply(place_points(points.matrix, links)))
 
 
+def self_collision(problem: Problem, links: SE3) -> Values:
+    """Return the loss of the hand's overlap with itself, at link poses in the base frame."""
+    spheres = problem.hand.spheres
+    return losses.self_collision(place_points(spheres.matrix, links), spheres.radii, spheres.weight)
+
+
+def obstacle_depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
+    """Return the loss of the hand's depth in support and obstacles, at link poses in the base frame."""
+    gaps = obstacle_gaps(obstacles, base, links)
+    return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
+
+
 def feature_distance(
     problem: Problem, features: Float[Tensor, "features 3"], placed: HandPlacement
 ) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
-    """Signed distance of the object's sharp points to the hand's solids [m], of the nearest pairs; their solids."""
+    """Return the signed distance of the nearest pairs of a sharp point and a solid of the hand [m], and the solids."""
     in_base = placed.base.apply_inverse(features)
     with torch.no_grad():
         every = solid_bound(problem.hand.solids, placed.links, in_base)
@@ -367,7 +365,7 @@ def _wrench_resistance(
     radius: Values,
     activate: Callable[..., Tensor],
 ) -> Values:
-    """The loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
+    """Return the loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
     near = (distance.detach() - radius[:, None]).abs().topk(min(TASK_POINTS, distance.shape[-1]), largest=False).indices
     rows = torch.arange(len(near), device=near.device)[:, None]
     target, position = problem.object, points[rows, near]
@@ -389,11 +387,11 @@ def evaluate(
     sharp: bool = False,
     activate: Callable[..., Tensor] = losses.soft_contact,
 ) -> Terms:
-    """All loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
+    """Compute all loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
 
     Args:
         fine: look at all candidates.
-        sharp: look at all sharp points, and draw in only what is all but there.
+        sharp: look at all sharp points, and attract only what is very near to the surface.
         activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
     """
     points = problem.hand.fine if fine else problem.hand.coarse
@@ -406,11 +404,6 @@ def evaluate(
         edge, solids = feature_distance(problem, features, placed)
         sunk = sunk + losses.penetration(edge, torch.zeros_like(radius))
         gap = torch.minimum(gap, _nearest_of_group(edge, problem.hand.group_of_solid[solids], gap.shape[-1]))
-    spheres = place_points(problem.hand.spheres.matrix, placed.links)
-    obstacle = None
-    if problem.obstacles is not None:
-        gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
-        obstacle = losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
     return Terms(
         wrench_resistance=_wrench_resistance(
             problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)
@@ -419,9 +412,9 @@ def evaluate(
             gap, torch.full_like(problem.hand.reach, REACH_WHEN_SHARP) if sharp else problem.hand.reach
         ),
         penetration=sunk,
-        self_collision=losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight),
+        self_collision=self_collision(problem, placed.links),
         posture=losses.posture(poses.joints, problem.hand.lower, problem.hand.upper),
-        obstacle=obstacle,
+        obstacle=None if problem.obstacles is None else obstacle_depth(problem.obstacles, placed.base, placed.links),
     )
 
 

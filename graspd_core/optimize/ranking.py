@@ -1,7 +1,7 @@
-"""The score that candidates are tried in order of: how likely the hold trial is to pass, from what is known before it.
+"""Score candidates by how likely the hold trial is to pass, from what is known before the trial.
 
-A network of two small layers, fitted to trials by `benchmarks/ranking.py`, which writes `ranking.npz`; docs/method.md
-says on what and how well.
+The score is a network of two small layers, fitted to trials by `benchmarks/ranking.py`, which writes `ranking.npz`.
+docs/method.md says on what data and how well.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from graspd_core.optimize.loop import Poses, Values
 from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import rotation_from_quaternion
 
-# Figures farther from their mean than so many deviations say no more.
+# Figures are clamped at so many deviations from their mean.
 FARTHEST = 4.0
-# What a hand pays that presses on nothing: no candidate that the network was fitted to did so.
+# Cost of a hand that presses on nothing: no candidate that the network was fitted to did so.
 _IDLE_COST = 20.0
 
 
@@ -41,17 +41,16 @@ class Staged(NamedTuple):
 
     poses: Poses
     opened: Poses
-    clearance: Float[Tensor, "batch"]
+    clearance: Values
     contact_set: ContactSet
     pressed: Squeeze
-    overlap: Float[Tensor, "batch"]
+    overlap: Values
 
 
 def score(problem: Problem, staged: Staged) -> Values:
-    """Log-odds that a candidate passes the hold trial, less what the trial forgives and a real hand does not.
+    """Return the log-odds of passing the hold trial, less what the trial forgives and a real hand does not.
 
-    A finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself and one that presses on nothing cost; no
-    trial goes into it.
+    Costs are a finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself, and pressing on nothing.
     """
     odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
     idle = (staged.pressed.forces == 0.0).all(-1).all(-1)
@@ -60,7 +59,7 @@ def score(problem: Problem, staged: Staged) -> Values:
 
 
 def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Values:
-    """Log-odds of passing the hold trial, by a network as `benchmarks/ranking.py` fits it."""
+    """Return the log-odds of passing the hold trial, by a network as `benchmarks/ranking.py` fits it."""
     x = ((figures - network["mean"]) / network["deviation"]).clamp(-FARTHEST, FARTHEST)
     for layer in range(2):
         x = torch.nn.functional.silu(x @ network[f"weight{layer}"] + network[f"bias{layer}"])
@@ -69,7 +68,7 @@ def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figure
 
 @torch.no_grad()
 def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch figures"]:
-    """What the score looks at, on the CPU; lengths over the object's own, joints over their travel."""
+    """Return what the score looks at, on the CPU. Lengths are over the object's length, joints over their travel."""
     poses, opened, pressed = staged.poses, staged.opened, staged.pressed
     hand, length = problem.hand, problem.object.length
     normal_forces = pressed.forces.norm(dim=-1)

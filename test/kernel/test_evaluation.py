@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -11,7 +11,6 @@ from graspd_core.config import ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.optimize.closed_form.closed_form import (
     ClosedForm,
-    evaluate_compiled,
     least_distance_compiled,
     weighted,
 )
@@ -34,6 +33,17 @@ WEIGHTS = LossWeights(3.0, 1.0, 1.0, 1.0, 0.02, 1.0)
 def compiled_of(problem: Problem) -> KernelProblem:
     assert problem.compiled is not None
     return problem.compiled
+
+
+def evaluate_compiled(
+    problem: KernelProblem, x, radius, delta: float, weights: LossWeights, *, fine=False, sharp=False, soft=True
+) -> tuple[torch.Tensor, torch.Tensor, Terms]:
+    """Weighted loss of every row, its gradient, and the terms; the rows are `AdamState.x`."""
+    x, radius = x.contiguous(), radius.contiguous()
+    loss, gradient, terms = torch.empty(len(x)), torch.empty_like(x), torch.empty(len(x), len(Terms._fields))
+    given = builds.Weights(**asdict(weights)), len(x), x, radius, delta, fine, sharp, soft
+    problem.call("graspd_evaluate", *given, loss, gradient, terms)
+    return loss, gradient, Terms(*terms.T)
 
 
 def by_torch(problem, x, radius, **look) -> Terms:

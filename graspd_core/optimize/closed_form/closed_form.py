@@ -171,25 +171,6 @@ class ClosedForm:
         return loss[:rows], torch.where(finite[:, None], gradient, torch.zeros_like(gradient))[:rows]
 
 
-def evaluate_compiled(
-    problem: KernelProblem,
-    x: Rows,
-    radius: Values,
-    delta: float,
-    weights: LossWeights,
-    *,
-    fine: bool = False,
-    sharp: bool = False,
-    soft: bool = True,
-) -> tuple[Values, Rows, Terms]:
-    """Return the weighted loss of every row of `AdamState.x`, its gradient, and the terms."""
-    x, radius = x.contiguous(), radius.contiguous()
-    loss, gradient, terms = torch.empty(len(x)), torch.empty_like(x), torch.empty(len(x), len(Terms._fields))
-    given = structs.Weights(**asdict(weights)), len(x), x, radius, delta, fine, sharp, soft
-    problem.call("graspd_evaluate", *given, loss, gradient, terms)
-    return loss, gradient, Terms(*terms.T)
-
-
 def least_distance_compiled(problem: KernelProblem, x: Rows) -> Values:
     """Return the least distance of any coarse candidate to the object [m], for rows of `AdamState.x`."""
     x = x.contiguous()

@@ -1,18 +1,17 @@
-"""The penalty contact of Grasp'D (Turpin et al., ECCV 2022): what hand points that sink in do to the object.
+"""Simulate one step of the object under the penalty contact of Grasp'D (Turpin et al., ECCV 2022).
+
+Hand points that sink in push the object:
 
     f_n = k_n min(φ − r, 0) ∇φ        f_t = −min(k_f ‖v_t‖, μ ‖f_n‖) v̂_t
 
 φ is the object's signed distance at the hand's point, r the level set that counts as its surface, v_t the object's
 velocity against the hand, less its part along ∇φ. Forces are those on the object [N].
 
+The whole simulation is one semi-implicit Euler step of a free rigid body, without gravity. Only velocities are asked
+for. All is in SI units and in the object's frame, torques and angular velocities about the centre of mass.
+
 Gradients are exact with two exceptions. `leaky_min` leaks on purpose: out of contact its value is zero and its slope is
 not. The tangential speed is floored at `_SLIP_FLOOR`, so that friction is smooth where nothing slides.
-
-One step of a free rigid body under contact forces: the whole simulation of Grasp'D (no gravity, hand kinematic).
-
-Semi-implicit Euler: velocities first, from the forces at the start; positions with the new velocities, which nothing
-here asks for. SI units, all in the object's frame; torques and angular velocities about the centre of mass. Gradients
-are exact.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class LeakyMin(torch.autograd.Function):
 
 
 def leaky_min(x: Float[Tensor, "*shape"], leak: float) -> Float[Tensor, "*shape"]:
-    """min(x, 0), with slope `leak` where x ≥ 0; zero makes it the plain minimum."""
+    """Return min(x, 0), with slope `leak` where x ≥ 0."""
     return cast(Tensor, LeakyMin.apply(x, leak))
 
 
@@ -61,11 +60,11 @@ def contact_forces(
     friction: float,
     leak: float,
 ) -> Float[Tensor, "batch points simulations 3"]:
-    """Forces on the object at every hand point, once for each velocity of the object [N].
+    """Compute forces on the object at every hand point, once for each velocity of the object [N].
 
     Args:
         height: of the hand's points above the level set, φ − r [m].
-        normals: ∇φ there; zero gives no normal force.
+        normals: ∇φ there. Zero gives no normal force.
         velocities: of the object against the hand, without rotation [m/s].
         stiffness: k_n [N/m].
         friction_stiffness: k_f [N·s/m].
@@ -107,7 +106,7 @@ def make_body(
     device: torch.device | str,
     dtype: torch.dtype,
 ) -> FreeBody:
-    """The body as tensors. Thin objects keep a least radius of gyration of a tenth of `length` about every axis."""
+    """Lay the body out. Thin objects keep a radius of gyration of at least a tenth of `length` about every axis."""
     moments, axes = np.linalg.eigh(inertia)
     moments = np.maximum(moments, mass * (0.1 * length) ** 2)
     options: dict[str, Any] = {"device": device, "dtype": dtype}
@@ -123,7 +122,7 @@ def make_body(
 def net_wrench(
     forces: Float[Tensor, "batch points simulations 3"], arms: Points
 ) -> tuple[Float[Tensor, "batch simulations 3"], Float[Tensor, "batch simulations 3"]]:
-    """Sum of forces [N] and of their torques Σ r × f [N·m] for every simulation; `arms` from the centre of mass [m]."""
+    """Return Σ f [N] and Σ r × f [N·m] for every simulation, with `arms` r from the centre of mass [m]."""
     # Σ rᵢ fⱼ in one matrix product; the torque is what is antisymmetric in it.
     products = (arms.transpose(1, 2) @ forces.flatten(2)).unflatten(2, forces.shape[2:])
     x, y, z = products.unbind(1)
@@ -139,7 +138,7 @@ def euler_step(
     torque: Float[Tensor, "*#batch 3"],
     time_step: float,
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-    """Linear [m/s] and angular [rad/s] velocity after `time_step` [s] of a force [N] and a torque [N·m]."""
+    """Return linear [m/s] and angular [rad/s] velocity after `time_step` [s] of a force [N] and a torque [N·m]."""
     gyroscopic = torch.linalg.cross(angular, angular @ body.inertia)
     return (
         linear + (time_step / body.mass) * force,
@@ -150,5 +149,5 @@ def euler_step(
 def speed_left(
     body: FreeBody, linear: Float[Tensor, "*batch 3"], angular: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Squared speed ‖v‖² + ‖L ω‖² of a body [m²/s²]."""
+    """Return the squared speed ‖v‖² + ‖L ω‖² of a body [m²/s²]."""
     return (linear * linear).sum(-1) + body.length**2 * (angular * angular).sum(-1)

@@ -1,23 +1,18 @@
-"""Desired contact forces: the variables that Grasp'D relaxes physics with (after contact-invariant optimisation).
-
-For every hand point and every simulation there is a force f̂ on the object that the pose does not have to supply.
-Whether it stops the object is a constraint, L_task; whether the pose supplies it is a cost, L_phys. Gradients are
-exact; `into_cone` is a projection and carries none.
-
-Constrained minimisation by gradient steps: the modified differential multiplier method, Adamax and Adam.
-
-For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0); x descends it while λ
-climbs it. The damping d c² / 2 makes the two settle instead of circling (Platt & Barr, NIPS 1987).
-
-The published starts of Grasp'D: palm towards a random surface point along the normal, random roll, fingers open.
-
-Grasp'D as published (Turpin et al., ECCV 2022): desired forces that stop the object, and a pose that supplies them.
+"""Solve Grasp'D as published (Turpin et al., ECCV 2022): forces that stop the object, a pose that supplies them.
 
     min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
 
 by damped multipliers and Adamax, on contacts with the level set φ = r, r shrinking to zero (docs/method.md, §1).
-Gradients are exact, but that contacts leak (`penalty_forces`), that the pose has no part in L_task, and that desired
-forces are projected into their cones where they have any.
+
+Physics is relaxed after contact-invariant optimisation: for every hand point and every simulation there is a force f̂ on
+the object that the pose need not supply. Whether f̂ stops the object is a constraint, L_task. Whether the pose supplies
+f̂ is a cost, L_phys.
+
+For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0). x descends it while λ
+climbs it. The damping d c² / 2 makes the two settle instead of circling (Platt & Barr, NIPS 1987).
+
+Gradients are exact with three exceptions: contacts leak (`contact_forces`), the pose has no part in L_task, and the
+projection of desired forces into their cones (`into_cone`) carries none.
 """
 
 from __future__ import annotations
@@ -30,7 +25,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.hands.kinematics import place_points
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
@@ -47,11 +41,15 @@ from graspd_core.optimize.graspd2022.contact_dynamics import (
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Points, Poses, Rows, Values, minimise, pack, unpack
-from graspd_core.optimize.obstacle_distance import obstacle_gaps
-from graspd_core.optimize.problem import OBSTACLE_MARGIN, PointSet, Problem, hand_forward, least_distance
+from graspd_core.optimize.problem import PointSet, Problem, hand_forward, least_distance, obstacle_depth, self_collision
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import EPSILON, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
 
+_BETA1, _EPSILON = 0.9, 1e-8
+# Places drawn for each start kept: those where the hand would touch are drawn again, as the released code does.
+_POOL = 4
+# L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
+_ALL_MOTION = 60.0
 # A variable of every start.
 Variable = Float[Tensor, "batch *shape"]
 # Forces on the object [N], or wrenches, at every point in every simulation.
@@ -59,7 +57,7 @@ Forces = Float[Tensor, "batch points simulations components"]
 
 
 def actual(forces: Float[Tensor, "batch points simulations 3"], arms: Points, length: float, components: int) -> Forces:
-    """Contact forces as what desired ones are compared with: forces (3), or wrenches with torques over `length` (6)."""
+    """Return contact forces in the components of desired ones: forces (3), or wrenches, torques over `length` (6)."""
     if components == 3:
         return forces
     torques = torch.linalg.cross(arms[:, :, None] / length, forces)
@@ -67,7 +65,7 @@ def actual(forces: Float[Tensor, "batch points simulations 3"], arms: Points, le
 
 
 def physics(desired: Forces, supplied: Forces) -> Values:
-    """L_phys: squared differences of desired and supplied forces, over all points and simulations [N²]."""
+    """Return L_phys: squared differences of desired and supplied forces, over all points and simulations [N²]."""
     difference = (desired - supplied).flatten(1)
     return (difference * difference).sum(-1)
 
@@ -75,7 +73,7 @@ def physics(desired: Forces, supplied: Forces) -> Values:
 def motion_left(
     body: FreeBody, forces: Forces, arms: Points, velocities: Float[Tensor, "simulations 3"], time_step: float
 ) -> Float[Tensor, "batch simulations"]:
-    """Squared speed of the object after one step, over the mean of its squares before (one: nothing was stopped).
+    """Return the object's squared speed after one step, over the mean of its squares before (1: nothing stopped).
 
     Forces with six components bring their own torques, over the body's length.
     """
@@ -92,7 +90,7 @@ def motion_left(
 def into_cone(
     forces: Float[Tensor, "batch points simulations 3"], normals: Points, friction: float
 ) -> Float[Tensor, "batch points simulations 3"]:
-    """The nearest forces that only push on a surface with outward `normals`, within Coulomb friction."""
+    """Return the nearest forces that only push on a surface with outward `normals`, within Coulomb friction."""
     along = -(forces * normals[:, :, None]).sum(-1)
     across = forces + along[..., None] * normals[:, :, None]
     side = across.norm(dim=-1)
@@ -104,9 +102,6 @@ def into_cone(
     return share[..., None] * across - push[..., None] * normals[:, :, None]
 
 
-_BETA1, _EPSILON = 0.9, 1e-8
-
-
 @dataclass(frozen=True)
 class Adamax:
     """A variable of every start and its moments (Kingma & Ba 2015, §7.1).
@@ -114,28 +109,28 @@ class Adamax:
     Attributes:
         value: the iterate.
         mean: running mean of the gradient.
-        top: decaying maximum of the gradient's size; with Adam the running mean of its squares.
+        top: decaying maximum of the gradient's size, with Adam the running mean of its squares.
     """
 
-    value: Float[Tensor, "batch *shape"]
-    mean: Float[Tensor, "batch *shape"]
-    top: Float[Tensor, "batch *shape"]
+    value: Variable
+    mean: Variable
+    top: Variable
 
 
 def adamax(value: Variable) -> Adamax:
-    """The state before the first step."""
+    """Return the state before the first step."""
     return Adamax(value, torch.zeros_like(value), torch.zeros_like(value))
 
 
 def adamax_step(state: Adamax, gradient: Variable, rate: float, count: int, memory: float = 0.999) -> Adamax:
-    """The state after step number `count`, from one; a negative rate climbs. `memory` keeps that share of `top`."""
+    """Take step number `count`, from one. A negative rate climbs. `memory` is the share of `top` that is kept."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     top = torch.maximum(memory * state.top, gradient.abs())
     return Adamax(torch.addcdiv(state.value, mean, top + _EPSILON, value=-rate / (1 - _BETA1**count)), mean, top)
 
 
 def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory: float = 0.999) -> Adamax:
-    """The state after Adam's step number `count`, from one (Kingma & Ba 2015, §2); `memory` is its β2."""
+    """Take Adam's step number `count`, from one (Kingma & Ba 2015, §2). `memory` is its β2."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     squares = torch.lerp(gradient * gradient, state.top, memory)
     size = (squares / (1 - memory**count)).sqrt() + _EPSILON
@@ -143,24 +138,21 @@ def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory
 
 
 def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:
-    """By how much a constraint g < C is broken: max(g − C, 0). It is also the gradient of the Lagrangian in λ."""
+    """Return how far a constraint g < C is broken, max(g − C, 0): the gradient of the Lagrangian in λ."""
     return (value - bound).clamp_min(0.0)
 
 
-def damped(
-    broken: Float[Tensor, "*shape"], multiplier: Float[Tensor, "*shape"], damping: float
-) -> Float[Tensor, "*shape"]:
-    """What a broken constraint adds to the Lagrangian: λ c + d c² / 2."""
+def damped(broken: Variable, multiplier: Variable, damping: float) -> Variable:
+    """Return what a broken constraint adds to the Lagrangian: λ c + d c² / 2."""
     return broken * (multiplier + 0.5 * damping * broken)
-
-
-# Places drawn for each start kept: those where the hand would touch are drawn again, as the released code does.
-_POOL = 4
 
 
 @torch.no_grad()
 def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int, seed: int, standoff: float) -> Poses:
-    """`count` seeded starts with the palm `standoff` [m] off the surface; those that touch only where all do."""
+    """Draw `count` starts: palm `standoff` [m] off a random surface point, random roll, fingers open.
+
+    Starts that touch the object are chosen last.
+    """
     generator = torch.Generator().manual_seed(seed)
     # Samples come in the order of the mesh's faces: unshuffled, the first that are clear would all lie on one side.
     order = torch.randperm(_POOL * count, generator=generator)
@@ -177,63 +169,52 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
     return drawn[touching.int().argsort(stable=True)[:count]]
 
 
-# L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
-_ALL_MOTION = 60.0
-
-
 class Evaluation(NamedTuple):
     """Terms of one evaluation, one value per start, and the outward normals at the hand's points."""
 
-    physics: Float[Tensor, "batch"]
-    task: Float[Tensor, "batch"]
-    motion: Float[Tensor, "batch"]
-    limit: Float[Tensor, "batch"]
-    range: Float[Tensor, "batch"]
-    inter: Float[Tensor, "batch"]
-    normals: Float[Tensor, "batch points 3"]
+    physics: Values
+    task: Values
+    motion: Values
+    limit: Values
+    range: Values
+    inter: Values
+    normals: Points
 
 
 class Slope(NamedTuple):
-    """The Lagrangian's gradients at an iterate, that by the forces where there are any, and what they are made of."""
+    """Cost, broken constraints and the Lagrangian's gradients at an iterate, by the forces too if there are any."""
 
-    cost: Float[Tensor, "batch"]
+    cost: Values
     broken: Float[Tensor, "batch constraints"]
-    by_pose: Float[Tensor, "batch variables"]
-    by_force: Float[Tensor, "batch points simulations components"] | None
-    normals: Float[Tensor, "batch points 3"]
+    by_pose: Rows
+    by_force: Forces | None
+    normals: Points
 
 
 @dataclass(frozen=True)
 class RelaxedState:
-    """Iterate and best iterate of every start.
+    """Iterate of every start, and the best iterate on the true surface so far.
 
     Attributes:
         pose: rows of translation, quaternion, joints.
-        forces: desired forces [N]; of no points without relaxation.
+        forces: desired forces [N], of no points without relaxation.
         multipliers: of L_task and L_limit.
         radius: level set at the start [m].
-        best: best pose on the true surface so far.
-        best_loss: its loss.
         loss: of the last evaluation.
     """
 
     pose: Adamax
     forces: Adamax
     multipliers: Adamax
-    radius: Float[Tensor, "batch"]
-    best: Float[Tensor, "batch variables"]
-    best_loss: Float[Tensor, "batch"]
-    loss: Float[Tensor, "batch"]
+    radius: Values
+    best: Rows
+    best_loss: Values
+    loss: Values
 
 
 @dataclass(frozen=True)
 class Graspd2022:
-    """The solver of docs/method.md, §1.
-
-    Attributes:
-        config: hyper-parameters.
-        body: the object as a rigid body.
-    """
+    """The solver of docs/method.md, §1. `body` is the object as a rigid body."""
 
     config: Graspd2022Config
     body: FreeBody
@@ -257,7 +238,7 @@ class Graspd2022:
         return self.body.mass * config.simulation.speed * math.sqrt(3) / config.simulation.stopping_force
 
     def points(self, problem: Problem) -> PointSet:
-        """The hand's points that may touch."""
+        """Return the hand's points that may touch."""
         return problem.hand.fine if self.config.contact.all_candidates else problem.hand.coarse
 
     def init(self, problem: Problem, starts: Poses) -> RelaxedState:
@@ -316,7 +297,7 @@ class Graspd2022:
     def slope(
         self, problem: Problem, state: RelaxedState, index: int, radius: Values, *, pose_only: bool = False
     ) -> Slope:
-        """Cost, broken constraints and the Lagrangian's gradients at an iterate, against the level set φ = `radius`."""
+        """Differentiate the Lagrangian at an iterate, against the level set φ = `radius` [m]."""
         bounds = self.config.constraints
         pose = state.pose.value.detach().requires_grad_(True)
         forces = state.forces.value.detach().requires_grad_(not pose_only)
@@ -330,15 +311,15 @@ class Graspd2022:
         return Slope(cost.detach(), broken.detach(), by_pose, by_force[0] if by_force else None, found.normals.detach())
 
     def rate(self, index: int) -> float:
-        """Share of the step sizes at a step: grown while warming up, faded along half a cosine."""
+        """Return the share of the step sizes at a step: grown while warming up, faded along half a cosine."""
         config = self.config
         fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
         return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
 
     def moved(self, problem: Problem, pose: Adamax, gradient: Rows, when: tuple[int, int]) -> Adamax:
-        """The pose after a move, `when` the index of the step and the turn in it.
+        """Move the pose. `when` is the index of the step and the turn in the step.
 
-        All moments follow the gradient, also those of variables whose turn it is not: so it is in the code.
+        All moments follow the gradient, also of variables whose turn it is not, as in the released code.
         """
         config, (index, turn) = self.config, when
         steps = config.pose_steps
@@ -360,19 +341,17 @@ class Graspd2022:
         return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
     def cost(self, found: Evaluation) -> Values:
-        """What is minimised: L_phys, or the motion itself without relaxation, with L_range and L_inter."""
+        """Return L_phys, or the motion itself without relaxation, with L_range and L_inter."""
         config = self.config
         goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
         return goal + config.weights.range * found.range + config.weights.inter * found.inter
 
     def evaluate(self, problem: Problem, pose: Rows, desired: Forces, radius: Values) -> Evaluation:
-        """All terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
-        config, body = self.config, self.body
-        poses = unpack(pose)
+        """Compute all terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
+        config, body, poses, velocities = self.config, self.body, unpack(pose), self.velocities
         placed = hand_forward(problem, self.points(problem), poses)
         distance, normals = sample_sdf(problem.object.sdf, placed.points)
         arms = placed.points - body.center
-        velocities = self.velocities
         supplied = contact_forces(
             distance - radius[:, None],
             normals,
@@ -391,11 +370,9 @@ class Graspd2022:
         else:
             left = motion_left(body, supplied, arms, velocities, self.time_step)
             difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
-        spheres = place_points(problem.hand.spheres.matrix, placed.links)
-        inter = losses.self_collision(spheres, problem.hand.spheres.radii, problem.hand.spheres.weight)
+        inter = self_collision(problem, placed.links)
         if problem.obstacles is not None:
-            gaps = obstacle_gaps(problem.obstacles, placed.base, placed.links)
-            inter = inter + losses.penetration(gaps, torch.full_like(radius, OBSTACLE_MARGIN))
+            inter = inter + obstacle_depth(problem.obstacles, placed.base, placed.links)
         beyond = (poses.joints - problem.hand.upper).clamp_min(0.0) + (problem.hand.lower - poses.joints).clamp_min(0.0)
         return Evaluation(
             difference,
@@ -409,7 +386,7 @@ class Graspd2022:
 
 
 def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
-    """Share of the step size that each variable moves by in a turn of a step: position, quaternion, joints."""
+    """Return the share of the step size of each variable in a turn of a step: position, quaternion, joints."""
     position, others = (1 - turn, turn) if steps.in_turns else (1, 1)
     return [position * steps.translation_share] * 3 + [others * steps.rotation_share] * 4 + [float(others)] * joints
 
@@ -428,10 +405,8 @@ def plan(task: PlannerInput) -> PlannerOutput:
         starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
         starts = task.allowed(starts)
     else:
-        restrictions = task.restrictions
-        starts = draw_starts(
-            task.scene, task.hand, drawn, task.seed, task.device, task.dtype, restrictions=restrictions
-        )
+        asked = task.scene, task.hand, drawn, task.seed, task.device, task.dtype
+        starts = draw_starts(*asked, restrictions=task.restrictions)
     if len(starts.joints) == 0:
         return PlannerOutput(starts)
     body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
