@@ -11,7 +11,7 @@ from graspd_core.errors import ConfigError, MeshError
 from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import SHAPES, object_hash, object_sources, thing_name
-from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.perception.load_scene import load_scene
@@ -192,4 +192,4 @@ def object_cases(request: Request, objects: Sequence[str], count: int, quick_cou
 
 def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:
     """The first of a method's own ranking, none filtered by a trial."""
-    return find_candidates(scene, hand, count=count, seed=seed, config=config, hooks=Hooks()).grasps[:count]
+    return find_candidates(PlannerInput(scene, hand, count, seed, config, Hooks())).grasps[:count]

@@ -27,7 +27,7 @@ from graspd_bench.study import Record
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import SHAPES
-from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import method_row, plan_config
 from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
@@ -125,7 +125,7 @@ def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop
     session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
     show(session)
     count, hooks = record["count"], Hooks(lambda step, of, _: tell(f"searching {step} of {of}", step / of), stop)
-    found = find_candidates(scene, hand, count=count, seed=record["seed"], config=config, hooks=hooks).grasps[:count]
+    found = find_candidates(PlannerInput(scene, hand, count, record["seed"], config, hooks)).grasps[:count]
     worlds = trial_context(scene, hand, "standard")
     context, grasps = make_metrics_context(scene.object, hand), []
     for grasp in found:

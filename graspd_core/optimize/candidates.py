@@ -82,35 +82,24 @@ class PlannerOutput:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Grasps in rank order, best first, none tried yet; and how the optimiser ended ("" , "cancelled", "deadline")."""
+    """Untried grasps, best first, and how the optimiser ended: "", "cancelled" or "deadline"."""
 
     grasps: tuple[Grasp, ...]
     interrupted: str
 
 
-def find_candidates(
-    scene: Scene,
-    hand: HandModel,
-    *,
-    count: int,
-    seed: int,
-    config: PlanConfig,
-    hooks: Hooks,
-    device: str = "cpu",
-    dtype: torch.dtype = torch.float32,
-    restrictions: BoundRestrictions = UNRESTRICTED,
-) -> Candidates:
-    """Return ranked candidates for `count` grasps by `config.method`. There are fewer if starts were hopeless.
+def find_candidates(task: PlannerInput) -> Candidates:
+    """Return ranked candidates by the method of the task's settings. There are fewer if starts were hopeless.
 
     The search is repeated from as many other starts if the ranking expects too few grasps to hold: small, large and
     long objects gain by that. Restrictions shape only the starts. Their caller refuses candidates.
     """
-    task = PlannerInput(scene, hand, count, seed, config, hooks, device, dtype, restrictions)
+    config, count = task.config, task.count
     found = _searched(task)
     for again in range(1, method_row(config.method).searches(config.settings)):
         if found.interrupted or expected_to_hold(found.grasps[:count]) >= _LEAST_EXPECTED * count:
             break
-        more = _searched(replace(task, seed=seed + _SEED_STEP * again))
+        more = _searched(replace(task, seed=task.seed + _SEED_STEP * again))
         found = Candidates(_best_first((*found.grasps, *more.grasps)), more.interrupted)
     return found
 

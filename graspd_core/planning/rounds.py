@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from graspd_core.errors import ResourceError
 from graspd_core.hands.model import HandModel
-from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks, Poses
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
@@ -135,7 +135,7 @@ def run_rounds(
         asked = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
-            candidates = find_candidates(scene, hand, seed=seed + _SEED_STEP * attempt, count=seek, **asked).grasps
+            candidates = find_candidates(PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **asked)).grasps
         for some in _in_rank_order(candidates, enough - good, restrictions):
             admitted, refused = restrictions.admit(some)
             spent = time.perf_counter() - began

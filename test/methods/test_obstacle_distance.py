@@ -15,7 +15,7 @@ from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, in_base, link_poses, place_points
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, pack, unpack
@@ -187,7 +187,7 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     assert scene.support is not None
     short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15)
     config = PlanConfig(settings=short, problem=ProblemConfig(candidates=60, fine_candidates=120))
-    found = find_candidates(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE)
+    found = find_candidates(PlannerInput(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE))
     assert found.grasps
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
     assert obstacles is not None

@@ -56,8 +56,8 @@ def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_step
 def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, monkeypatch):
     asked = []
 
-    def none_found(scene, hand, *, count, **settings):
-        asked.append(count)
+    def none_found(task):
+        asked.append(task.count)
         return Candidates((), "")
 
     monkeypatch.setattr(planning_rounds, "find_candidates", none_found)

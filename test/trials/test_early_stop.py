@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from graspd_bench.trials import TOLERANCE, gravity_trial
 from graspd_core.hands.library import load_hand
-from graspd_core.optimize.candidates import find_candidates
+from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.load_scene import load_scene
@@ -181,7 +181,7 @@ def real() -> tuple[Scene, Any, list[Grasp]]:
     """Grasps that the method found on a mug-sized box, each once more out of place, and an open hand far above."""
     config, hand = load_preset("fast"), load_hand("allegro_right")
     scene = load_scene("shape:box", resolution=config.resolution)
-    found = find_candidates(scene, hand, count=3, seed=0, config=config, hooks=Hooks()).grasps[:3]
+    found = find_candidates(PlannerInput(scene, hand, count=3, seed=0, config=config, hooks=Hooks())).grasps[:3]
     center = scene.object.center_of_mass
     away = [displaced(g, *e, center) for g, e in zip(found, pose_errors(1, 3), strict=True)]
     # An open hand may yet lift the box as a shovel does; this one is far above it.

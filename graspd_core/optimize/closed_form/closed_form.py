@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
@@ -26,6 +25,7 @@ from graspd_core.optimize.loop import (
     Follow,
     Hooks,
     Poses,
+    Positions,
     Rows,
     Solution,
     Values,
@@ -55,14 +55,14 @@ class AdamState:
     the origin of a base frame far from the palm, a small turn would throw the fingers off the object.
     """
 
-    pivot: Float[Tensor, "batch 3"]
-    x: Float[Tensor, "batch variables"]
-    mean: Float[Tensor, "batch variables"]
-    square: Float[Tensor, "batch variables"]
-    radius: Float[Tensor, "batch"]
-    best_x: Float[Tensor, "batch variables"]
-    best_loss: Float[Tensor, "batch"]
-    loss: Float[Tensor, "batch"]
+    pivot: Positions
+    x: Rows
+    mean: Rows
+    square: Rows
+    radius: Values
+    best_x: Rows
+    best_loss: Values
+    loss: Values
 
     def __getitem__(self, rows: Tensor) -> AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
@@ -104,12 +104,7 @@ def weighted(terms: Terms, weights: LossWeights) -> Values:
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """The solver of docs/method.md, §2.
-
-    Attributes:
-        config: hyper-parameters.
-        keep: starts kept after exploring.
-    """
+    """The solver of docs/method.md, §2. `keep` starts are kept after exploring."""
 
     config: ClosedFormConfig
     keep: int
@@ -134,9 +129,8 @@ class ClosedForm:
             delta = config.delta_end
         polish = index >= config.explore_steps + config.refine_steps
         fine = index >= self.steps - min(config.fine_steps, config.polish_steps)
-        loss, gradient = self.value_and_gradient(
-            problem, state.x, state.radius * remaining, delta, fine=fine, sharp=polish
-        )
+        radius = state.radius * remaining
+        loss, gradient = self.value_and_gradient(problem, state.x, radius, delta, fine=fine, sharp=polish)
         if fine or (config.fine_steps == 0 and polish) or (config.polish_steps == 0 and remaining == 0.0):
             better = loss < state.best_loss
             state = replace(
@@ -144,9 +138,8 @@ class ClosedForm:
                 best_x=torch.where(better[:, None], state.x, state.best_x),
                 best_loss=torch.where(better, loss, state.best_loss),
             )
-        rate = _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (
-            1 + torch.cos(torch.tensor(torch.pi * index / self.steps)).item()
-        )
+        fade = 1 + torch.cos(torch.tensor(torch.pi * index / self.steps)).item()
+        rate = _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * fade
         return replace(adam_step(problem, state, gradient, rate, index + 1, config), loss=loss)
 
     def best(self, state: AdamState) -> tuple[Poses, Values]:
@@ -162,8 +155,7 @@ class ClosedForm:
         radius = torch.cat([radius, radius[:1].expand(short)])
         poses = moved_along(unpack(x), -problem.hand.pivot)
         activate = soft_contact if self.config.activation == "soft" else hard_contact
-        looked = {"fine": fine, "sharp": sharp, "activate": activate}
-        terms = evaluate(problem, poses, radius, delta, **looked)
+        terms = evaluate(problem, poses, radius, delta, fine=fine, sharp=sharp, activate=activate)
         loss = weighted(terms, self.config.polish_weights if sharp else self.config.weights)
         (gradient,) = torch.autograd.grad(loss.sum(), x)
         finite = torch.isfinite(gradient).all(-1) & torch.isfinite(loss)
@@ -171,20 +163,14 @@ class ClosedForm:
         return loss[:rows], torch.where(finite[:, None], gradient, torch.zeros_like(gradient))[:rows]
 
 
-def least_distance_compiled(problem: KernelProblem, x: Rows) -> Values:
-    """Return the least distance of any coarse candidate to the object [m], for rows of `AdamState.x`."""
-    x = x.contiguous()
-    distance = torch.empty(len(x))
-    problem.call("graspd_least_distance", len(x), x, distance)
-    return distance
-
-
 def minimise_compiled(
     solver: ClosedForm, problem: Problem, compiled: KernelProblem, starts: Poses, hooks: Hooks
 ) -> Solution:
     """Run `solver` as `loop.minimise` does, by the kernel. Raises MemoryError: too little memory for the threads."""
-    config, x = solver.config, pack(moved_along(starts, problem.hand.pivot))
-    state = initial_state(problem, starts, least_distance_compiled(compiled, x).clamp(0.0, config.radius_start))
+    config, x = solver.config, pack(moved_along(starts, problem.hand.pivot)).contiguous()
+    nearest = torch.empty(len(x))
+    compiled.call("graspd_least_distance", len(x), x, nearest)
+    state = initial_state(problem, starts, nearest.clamp(0.0, config.radius_start))
     follow = Follow(hooks, solver.steps)
     for begin, end in pairwise(sorted({0, *drop_steps(config), solver.steps})):
         kept = rows_kept(config, solver.keep, len(state.x), begin)
