@@ -79,15 +79,14 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
     gap, n = distance[rows, slots], normal[rows, slots]
     own_link = points.links[slots] == links.repeat_interleave(_SPREAD + 1)
     # A patch that is hardly larger than a point is one contact, not three.
-    apart = torch.cat([torch.ones_like(gap[:, :1], dtype=torch.bool).expand(-1, len(links))[..., None]] + [
-        (placed.points[rows, c] - placed.points[rows, chosen[0]]).norm(dim=-1)[..., None] > 0.004 for c in chosen[1:]
-    ], -1).flatten(1)  # fmt: skip
+    apart = [torch.ones_like(chosen[0], dtype=torch.bool)]
+    apart += [(placed.points[rows, c] - placed.points[rows, chosen[0]]).norm(dim=-1) > 0.004 for c in chosen[1:]]
     found = ContactSet(
         links.repeat_interleave(_SPREAD + 1),
         placed.points[rows, slots] - gap[..., None] * n,
         n,
         gap,
-        (gap.abs() <= reach) & own_link & apart,
+        (gap.abs() <= reach) & own_link & torch.stack(apart, -1).flatten(1),
     )
     return _with_features(problem, poses, found, reach) if len(problem.object.features) else found
 

@@ -129,7 +129,7 @@ def kernel_problem(problem: Problem) -> KernelProblem:
 
 @lru_cache(maxsize=8)
 def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
-    """The fields of `builds.Problem` that tell of the hand."""
+    """Lay out the fields of `builds.Problem` that describe the hand."""
     arrays = Arrays()
     spheres, links = placed_points(hand.spheres.matrix)
     order = np.argsort(links.numpy(), kind="stable")
@@ -167,23 +167,16 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
         parent=arrays.ints(model.link_parent),
         joint=arrays.ints(np.maximum(model.link_joint, 0)),
         kind=arrays.ints(kind),
-        constant=rows(k.constant),
-        sine=rows(k.sine),
-        cosine=rows(k.cosine),
-        slide=rows(k.slide),
+        **{name: rows(getattr(k, name)) for name in ("constant", "sine", "cosine", "slide")},
         axis=arrays.floats(model.joint_axis),
         multiplier=arrays.floats(model.link_multiplier),
         shift=arrays.floats(model.link_shift),
-        lower=arrays.floats(hand.lower),
-        upper=arrays.floats(hand.upper),
-        joint_scale=arrays.floats(hand.joint_scale),
-        pivot=arrays.floats(hand.pivot),
-        reach=arrays.floats(hand.reach),
+        **{name: arrays.floats(getattr(hand, name)) for name in ("lower", "upper", "joint_scale", "pivot", "reach")},
     )
 
 
 def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
-    """Candidates sorted by group and link; every group of links moves as one, so that its links lie together."""
+    """Sort candidates by group and link. Every group of links moves as one, so that its links lie together."""
     at, links = (values.numpy() for values in placed_points(points.matrix))
     group = np.zeros(len(at), dtype=int)
     for index, members in enumerate(points.groups.numpy()):
