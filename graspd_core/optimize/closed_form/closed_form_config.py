@@ -78,12 +78,12 @@ class ClosedFormConfig:
 
 
 def drop_steps(settings: ClosedFormConfig) -> list[int]:
-    """The steps before which exploring drops starts."""
+    """Return the steps before which exploring drops starts."""
     return [round(settings.explore_steps * drop / settings.drops) for drop in range(1, settings.drops + 1)]
 
 
 def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> int:
-    """How many of so many rows go on before step `index`; `keep` are left when exploring ends."""
+    """Return how many of so many rows go on before step `index`. `keep` are left when exploring ends."""
     at = drop_steps(settings)
     if index not in at or keep >= rows:
         return rows
@@ -92,7 +92,7 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """The settings at a budget: below one that share of the steps and one search, above it as many times the starts.
+    """Return the settings at a budget: below one that share of the steps and one search, above one more starts.
 
     Steps are what a small batch costs, and fewer of them do on easy objects. Starts are what hard objects want.
     """
