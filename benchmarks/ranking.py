@@ -78,9 +78,9 @@ def thing_scene(source: str, rng: np.random.Generator, friction: float, resoluti
     if source in HOLLOW:
         made = hollow(source, rng)
         mesh = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
-        return load_scene(mesh, friction=friction, resolution=resolution)
+        return load_scene(mesh, mass=0.1, friction=friction, resolution=resolution)
     scale = float(np.exp(rng.uniform(*np.log(SCALES)))) if source.startswith("shape:") else 1.0
-    return load_scene(source, scale=scale, friction=friction, resolution=resolution)
+    return load_scene(source, mass=0.1, scale=scale, friction=friction, resolution=resolution)
 
 
 def try_block(where: Path, source: str, hand_name: str, variant: int, count: int) -> None:

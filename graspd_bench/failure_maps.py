@@ -20,7 +20,7 @@ from graspd_bench.charts import figure, save
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_meshes import thin_cup
-from graspd_bench.study import Case, Picture, Record, Request, Sections, raw_grasps
+from graspd_bench.study import PROTOCOL_MASS, Case, Picture, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.fingers import find_fingers
 from graspd_core.hands.kinematics import make_kinematics, points_in_base
@@ -141,18 +141,14 @@ _YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
 
 
 def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan at the friction of the case, for the 0.1 kg that planning supposes; try at every mass."""
+    """Plan at the friction of the case, for 0.1 kg; try at every mass."""
     config = settings(case.preset)
-    scene = load_scene(f"shape:{case.thing}", friction=float(case.across), resolution=config.resolution)
+    scene = load_scene(
+        f"shape:{case.thing}", mass=PROTOCOL_MASS, friction=float(case.across), resolution=config.resolution
+    )
     hand, grasps = plan(case, scene)
     protocol = at_friction(PROTOCOLS["standard"], float(case.across))
-    return tuple(try_grasps(case, mass, hand, at_mass(scene.object, mass), grasps, protocol) for mass in case.up)
-
-
-def at_mass(target: ObjectModel, mass: float | str) -> ObjectModel:
-    """The same object of another mass [kg], evenly spread as before."""
-    share = float(mass) / target.mass
-    return replace(target, mass=float(mass), inertia=target.inertia * share)
+    return tuple(try_grasps(case, mass, hand, scene.object.at_mass(float(mass)), grasps, protocol) for mass in case.up)
 
 
 def run_size(case: MapCase) -> tuple[MapCell, ...]:
@@ -160,7 +156,7 @@ def run_size(case: MapCase) -> tuple[MapCell, ...]:
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     scale = width / least_width(make_shape(case.thing))
-    scene = load_scene(f"shape:{case.thing}", scale=scale, resolution=config.resolution)
+    scene = load_scene(f"shape:{case.thing}", mass=PROTOCOL_MASS, scale=scale, resolution=config.resolution)
     hand, grasps = plan(case, scene)
     return tuple(try_grasps(case, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in case.up)
 
@@ -223,8 +219,8 @@ def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int
     stage = tabletop(thing, yaw=_YAW)
     poses = ring_poses(1, elevation=float(np.deg2rad(elevation)), azimuth=float(_AZIMUTH))
     views = views_of(stage, CAMERA, poses, noise_at(noise), seed)
-    scene = scene_from_views(views, resolution=resolution)
-    return build_scene(stage.truth, source=thing, resolution=resolution).object, scene
+    scene = scene_from_views(views, mass=PROTOCOL_MASS, resolution=resolution)
+    return build_scene(stage.truth, source=thing, mass=PROTOCOL_MASS, resolution=resolution).object, scene
 
 
 def run_wall(case: MapCase) -> tuple[MapCell, ...]:
@@ -238,7 +234,7 @@ def run_wall(case: MapCase) -> tuple[MapCell, ...]:
 @lru_cache(maxsize=1)
 def cup(wall: float) -> Scene:
     """A cup with walls of so many millimetres."""
-    return build_scene(thin_cup(wall * 1e-3), source=f"cup of {wall:g} mm")
+    return build_scene(thin_cup(wall * 1e-3), mass=PROTOCOL_MASS, source=f"cup of {wall:g} mm")
 
 
 def on_grid(scene: Scene, resolution: int) -> Scene:

@@ -18,7 +18,7 @@ import numpy as np
 
 from graspd_bench.bullet.bullet_hold import bullet_hold_trial
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
-from graspd_bench.study import Case, Record, raw_grasps
+from graspd_bench.study import PROTOCOL_MASS, Case, Record, raw_grasps
 from graspd_bench.trials import gravity_trial
 from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
@@ -119,7 +119,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.perception.load_scene import load_scene
 source, hand, seed = sys.argv[1:]
-result = plan_grasps(load_scene(source), load_hand(hand), count=1, seed=int(seed))
+result = plan_grasps(load_scene(source, mass=0.1), load_hand(hand), count=1, seed=int(seed))
 print(str(result.grasps[0].verdict) == "verified" if result.grasps else False, time.process_time())
 """
 
@@ -181,7 +181,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
-        scene = load_scene(cell.object, resolution=cell.settings.resolution)
+        scene = load_scene(cell.object, mass=PROTOCOL_MASS, resolution=cell.settings.resolution)
     with stopwatch("optimise"):
         grasps = raw_grasps(scene, hand, cell.settings, cell.count, cell.seed)
     with stopwatch("parts"):
@@ -232,7 +232,7 @@ def run_verified(cell: Cell) -> dict[str, Any]:
     hand = load_hand(cell.hand)
     began = _now()
     told = _First(began)
-    scene = load_scene(cell.object)
+    scene = load_scene(cell.object, mass=PROTOCOL_MASS)
     result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=told)
     taken = {name: value - began[name] for name, value in _now().items()}
     return {
@@ -257,7 +257,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
     A grasp-step is one step of one start: what the optimiser does most of.
     """
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
-    scene = load_scene(cell.object, resolution=cell.settings.resolution)
+    scene = load_scene(cell.object, mass=PROTOCOL_MASS, resolution=cell.settings.resolution)
     runs: list[Stopwatch] = []
     for run in range(_RUNS + 1):
         stopwatch = Stopwatch()

@@ -20,6 +20,9 @@ from graspd_core.types import Grasp
 
 Record = dict[str, Any]
 
+# What objects weigh where nobody says [kg]: the convention of DexGraspBench, which figures compare with.
+PROTOCOL_MASS = 0.1
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -179,7 +182,7 @@ class ObjectCase(Case):
     def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
         """The hand and the scene."""
         hand = load_hand(self.hand, candidates=self.config.problem.fine_candidates)
-        return hand, load_scene(self.object, resolution=self.config.resolution, friction=friction)
+        return hand, load_scene(self.object, mass=PROTOCOL_MASS, resolution=self.config.resolution, friction=friction)
 
 
 def object_cases(request: Request, objects: Sequence[str], count: int, quick_count: int = 2) -> tuple[ObjectCase, ...]:

@@ -291,7 +291,8 @@ class GraspResult:
     `support` is what the object stood on, None where it floated. `audits` is always zero, and goes with 0.3.
     `next_view` is `T_object_camera` [m] of one more view that would show most of the hidden side, where grasps hold on
     the likeliest shape and none is sure enough. `refused` counts by reason the candidates that no trial was spent on,
-    because a restriction of the request did not admit them.
+    because a restriction of the request did not admit them. `mass` is what the object weighed in the trials [kg] where
+    the hand could not hold what was assumed, else None.
     """
 
     outcome: Outcome
@@ -305,3 +306,4 @@ class GraspResult:
     audits: AuditCount = AuditCount()
     next_view: Float[np.ndarray, "4 4"] | None = None
     refused: Mapping[str, int] = field(default_factory=dict)
+    mass: float | None = None

@@ -68,10 +68,12 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
     request: dict[str, Any] = {"preset": block.config, "verify": block.verify, "measure": block.measure != "none"}
     result = plan_grasps(scene, model, count=block.count, seed=block.seed, **request)
     grasps = result.grasps if block.measure != "all" else all_measured(scene, model, result.grasps)
+    # What the hand could not lift was tried at less than the mass that was assumed.
+    target = scene.object if result.mass is None else scene.object.at_mass(result.mass)
     asked = {"block": block.key, "asked": block.asked, "outcome": result.outcome.name, "message": result.message}
     return MadeBlock(
         object_sha256=scene.object.sha256,
-        file=parquet_bytes(_table(block, scene.object, model, grasps), asked),
+        file=parquet_bytes(_table(block, target, model, grasps), asked),
         rows=len(grasps),
         verified=sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps),
         failures=dict(Counter(failure_kind(grasp) for grasp in grasps if grasp.verdict is Verdict.FAILED)),
@@ -121,7 +123,7 @@ def _table(block: Block, target: ObjectModel, hand: HandModel, grasps: Sequence[
         "object_sha256": target.sha256,
         "object_source": block.object.source,
         "scale": block.object.scale,
-        "mass": block.object.mass,
+        "mass": target.mass,
         "friction": block.object.friction,
         "hand_name": block.hand_name,
         "hand_sha256": block.hand_content,

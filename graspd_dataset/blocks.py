@@ -38,14 +38,14 @@ class DatasetObject:
         source: shape:NAME or a mesh file.
         content: hash of the shape's or the file's content.
         scale: factor on the file's coordinates.
-        mass: [kg].
+        mass: [kg]; None: the heavy end of what the volume allows.
         friction: Coulomb coefficient.
     """
 
     source: str
     content: str
     scale: float
-    mass: float
+    mass: float | None
     friction: float
 
     @property
@@ -124,7 +124,7 @@ class DatasetRequest:
         scales: factors on every object's coordinates.
         random_scales: how many more factors each object gets, and the range that they are drawn from, evenly in their
             logarithm.
-        mass: [kg].
+        mass: [kg]; None assumes the heavy end of what each volume allows.
         friction: Coulomb coefficient.
         verify: the trials.
         measure: which grasps get their metrics.
@@ -141,7 +141,7 @@ class DatasetRequest:
     seed: int = 0
     scales: tuple[float, ...] = (1.0,)
     random_scales: tuple[int, float, float] = (0, 1.0, 1.0)
-    mass: float = 0.1
+    mass: float | None = None
     friction: float = 0.6
     verify: str = "standard"
     measure: str = "verified"
@@ -156,7 +156,7 @@ class DatasetRequest:
         if number < 0 or not 0 < low <= high < np.inf:
             raise ConfigError(f"random-scales: {number} {low:g} {high:g}; valid: a number, and 0 < LOW <= HIGH")
         for name, value in [("scales", s) for s in self.scales] + [("mass", self.mass), ("friction", self.friction)]:
-            if not (np.isfinite(value) and value > 0):
+            if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"{name}: {value!r}; it must be a positive number")
 
 

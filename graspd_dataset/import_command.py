@@ -34,7 +34,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--object", default=None, metavar="MESH", help="instead of what the files name")
     parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of npy files: the names of their joints")
     parser.add_argument("--preset", default="balanced", help="settings of the squeeze and the pregrasp that are found")
-    parser.add_argument("--mass", type=float, default=0.1, metavar="KG", help="of the objects (default 0.1)")
+    parser.add_argument("--mass", type=float, default=None, metavar="KG", help="by default the heavy end of a volume")
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     parser.add_argument("--verify", choices=VERIFICATIONS, default="none", help="try and measure them (default none)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="or a .json file for a single object")

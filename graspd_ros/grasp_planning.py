@@ -78,7 +78,7 @@ def request_from_goal(
 
 
 def _load(mesh: TriangleMesh, settings: Settings) -> Scene:
-    return run_isolated(load_scene, mesh, mass=settings.mass, friction=settings.friction)
+    return run_isolated(load_scene, mesh, mass=settings.mass or None, friction=settings.friction)
 
 
 def _solid(target: Object) -> TriangleMesh:

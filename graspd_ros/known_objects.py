@@ -24,7 +24,7 @@ def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -
     Raises GraspdError: the library must know the object and does not, or cannot be read.
     """
     library = GraspLibrary(Path(settings.grasp_library))
-    physics = Physics(settings.mass, settings.friction, settings.verify)
+    physics = Physics(settings.mass or None, settings.friction, settings.verify)
     if known.name:
         return entry_by_name(library, hand, known.name, physics)
     return entry_by_file(library, hand, known.path, settings.mesh_scale, physics, required=known.required)

@@ -171,7 +171,9 @@ class Settings:
     verify: str = _setting("standard", "the hold trial that a grasp must pass", choices=VERIFICATIONS)
     deadline: float = _setting(60.0, "time that one request may take [s]", low=BUDGETS[0], high=BUDGETS[1])
     seed: int = _setting(0, "seed of the random starts", low=0, high=2**63 - 1)
-    mass: float = _setting(0.1, "mass of the object [kg]", low=0.001, high=100.0)
+    mass: float = _setting(
+        0.0, "mass of the object [kg]; 0: not known, the heavy end of what its volume allows", low=0.0, high=100.0
+    )
     friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
     mesh_scale: float = _setting(1.0, "factor from the mesh file's unit to metres", low=SCALES[0], high=SCALES[1])
     mesh_frame: str = _setting("object", "frame id of grasps on a mesh: the mesh's own frame")

@@ -23,7 +23,7 @@ import numpy as np
 from graspd_bench.charts import PANELS, Point, points_of
 from graspd_bench.figures import Row, by_name, is_preset, per_verified, rows
 from graspd_bench.result_store import read_results
-from graspd_bench.study import Record
+from graspd_bench.study import PROTOCOL_MASS, Record
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import SHAPES
@@ -120,7 +120,7 @@ def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop
     """
     config = plan_config(record["settings"], f"settings of {record['name']}")
     hand = load_hand(record["hand"], candidates=config.problem.fine_candidates)
-    scene, _ = near_scene(load_scene(_source(record), resolution=config.resolution))
+    scene, _ = near_scene(load_scene(_source(record), mass=PROTOCOL_MASS, resolution=config.resolution))
     title = f"{record['name']}, {record['object']}, seed {record['seed']}"
     session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
     show(session)

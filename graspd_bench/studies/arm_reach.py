@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from graspd_bench.study import Case, ObjectCase, Record, Request, Sections, find_objects
+from graspd_bench.study import PROTOCOL_MASS, Case, ObjectCase, Record, Request, Sections, find_objects
 from graspd_core.arms.arm import Arm, arm_links, arm_names, load_arm
 from graspd_core.arms.arm_paths import arm_paths
 from graspd_core.arms.inverse_kinematics import (
@@ -73,7 +73,9 @@ class ReachCase(ObjectCase):
         vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))
         support = Plane(np.array([0.0, 0.0, 1.0]), float(vertices[:, 2].min()))
         mesh = TriangleMesh(vertices, scene.object.mesh.faces)
-        scene = build_scene(mesh, source=self.object, resolution=self.config.resolution, support=support)
+        scene = build_scene(
+            mesh, source=self.object, mass=PROTOCOL_MASS, resolution=self.config.resolution, support=support
+        )
         away, where, turn = rng.uniform(NEAREST, FARTHEST), *rng.uniform(-np.pi, np.pi, 2)
         base = (float(away * np.cos(where)), float(away * np.sin(where)), support.offset)
         quaternion = (float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2)))

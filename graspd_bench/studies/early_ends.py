@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd_bench.study import ObjectCase, Record, Request, Sections, find_objects, raw_grasps
+from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, find_objects, raw_grasps
 from graspd_bench.trials import gravity_trial
 from graspd_core.config import RobustConfig
 from graspd_core.hands.library import hand_names
@@ -47,7 +47,7 @@ class EarlyEnds(ObjectCase):
         if not self.factors:
             return hand, scene
         mesh = scene.object.mesh
-        return hand, load_scene(TriangleMesh(mesh.vertices * self.factors, mesh.faces))
+        return hand, load_scene(TriangleMesh(mesh.vertices * self.factors, mesh.faces), mass=PROTOCOL_MASS)
 
 
 def early_cases(request: Request) -> tuple[EarlyEnds, ...]:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
-from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases, raw_grasps
+from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, object_cases, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_files import surface_samples
@@ -138,7 +138,7 @@ def run_mano(case: HumanGrasps) -> Record:
     """Plan on one object, try every grasp, measure the best."""
     config = case.config
     mano = load_mano(Path(case.hand), [], candidates=config.problem.fine_candidates)
-    scene = load_scene(case.object, resolution=config.resolution)
+    scene = load_scene(case.object, mass=PROTOCOL_MASS, resolution=config.resolution)
     began = time.process_time()
     grasps = raw_grasps(scene, mano.model, config, case.count, case.seed)
     seconds = (time.process_time() - began) / case.count

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from graspd_bench.measurement import TRIALS, Tried
-from graspd_bench.study import ObjectCase, Record, Request, Sections, raw_grasps
+from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
@@ -107,7 +107,7 @@ def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
 def run_imported(case: ImportedCase) -> Record:
     """Theirs, the first of our own ranking, and verified ones: all tried and measured alike."""
     config, hand = case.config, load_hand(case.hand, candidates=case.config.problem.fine_candidates)
-    scene = load_scene(case.object, scale=case.scale, resolution=config.resolution)
+    scene = load_scene(case.object, mass=PROTOCOL_MASS, scale=case.scale, resolution=config.resolution)
     completed = complete_grasps(scene, hand, _theirs(case, hand), config)
     planned = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).grasps
     grasps = {

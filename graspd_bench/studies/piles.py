@@ -417,7 +417,7 @@ def film_strip(record: Record) -> UInt8[np.ndarray, "height width 3"]:
     """
     names = ("size", "preset", "hand", "seed", "views")
     case = PileCase(tuple(record["objects"]), **{name: record[name] for name in names})
-    meshes = [load_scene(thing).object.mesh for thing in drawn_things(case)]
+    meshes = [load_scene(thing, mass=MASS).object.mesh for thing in drawn_things(case)]
     hand = load_hand(case.hand, candidates=1)
     frames = [_drawn(frame, meshes, hand) for frame in record["frames"]]
     frames += [np.full_like(frames[0], 255)] * (-len(frames) % min(_ROW, len(frames)))

@@ -76,7 +76,7 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
         return has
     asked = {**request, "count": options.count - has, "seed": options.seed + has}
     result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, stop=stop, **asked)
-    has = add_planned(library, scene, hand, config, result.grasps, options.verify) or has
+    has = add_planned(library, scene, hand, config, result, options.verify) or has
     print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)
     return has
 

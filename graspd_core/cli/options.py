@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 # Metrics in the summary of a run.
-_SHOWN = ("penetration", "contact_area", "epsilon", "robustness")
+_SHOWN = ("payload", "least_friction", "penetration", "contact_area", "epsilon", "robustness")
 # Grasps that it lists; the others it counts.
 _FIRST = 3
 
@@ -40,13 +40,17 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", default=None, metavar="NAME", help="instead of the preset's, at its defaults")
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--mass", type=float, default=0.1, metavar="KG", help="of the object (default 0.1)")
+    parser.add_argument(
+        "--mass", type=float, default=None, metavar="KG",
+        help="of the object; by default the most that a thing of its volume may weigh",
+    )  # fmt: skip
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     parser.add_argument(
         "--deadline", type=float, default=None, metavar="SEC", help="end with what there is then; loading counts"
     )
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
     parser.add_argument("--robust", action="store_true", help="grasps that hold out of place too come first")
+    parser.add_argument("--least-friction", action="store_true", help="measure at how little friction each still holds")
     parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
     parser.add_argument("--threads", type=int, default=1, help="of the optimiser and the trials (default 1)")
 
@@ -69,8 +73,9 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     config = load_preset(options.preset)
     if options.method:
         config = config.with_method(options.method)
-    if options.robust:
-        config = dataclasses.replace(config, robust=dataclasses.replace(config.robust, rank=True))
+    robust = config.robust
+    ranked = {"rank": robust.rank or options.robust, "friction": robust.friction or options.least_friction}
+    config = dataclasses.replace(config, robust=dataclasses.replace(robust, **ranked))
     return config, request
 
 

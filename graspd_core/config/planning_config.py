@@ -87,11 +87,13 @@ class RobustConfig:
         rank: whether that is done; it takes `trials` further hold trials for every verified grasp.
         trials: hold trials of each.
         hold_time: how long each of their six pulls lasts [s].
+        friction: whether the least friction at which each verified grasp holds is measured.
     """
 
     rank: bool = False
     trials: int = 8
     hold_time: float = 0.5
+    friction: bool = False
 
 
 # Shares of grasps that hold on the true object, lower ends of 90 % intervals over 957 grasps of 120 single views of ten

@@ -42,7 +42,8 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
             "source": target.source,
             "sha256": target.sha256,
             "center_of_mass": target.center_of_mass.tolist(),
-            "mass": target.mass,
+            "mass": target.mass if result.mass is None else result.mass,
+            "mass_assumed": target.mass_assumed,
             "friction": target.friction,
             "scale": target.scale,
             "support": result.support

@@ -185,9 +185,10 @@ class GraspLibrary:
         with self._reading() as base:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
-    def of_mesh(self, wanted: LibraryEntry) -> list[LibraryEntry]:
+    def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
         """Entries of the same content whose grasps held under as much as wanted, the most first."""
-        same = {name: getattr(wanted, name) for name in ("mesh_sha256", "hand_content", "mass", "friction")}
+        names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
+        same = {name: getattr(wanted, name) for name in names}
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:

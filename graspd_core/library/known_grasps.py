@@ -49,11 +49,23 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """What grasps are to hold under: mass [kg] and friction of the object, and the trials."""
+    """What grasps are to hold under: mass [kg] and friction of the object, and the trials.
 
-    mass: float
+    A mass that nobody knows, None, is whatever the library has.
+    """
+
+    mass: float | None
     friction: float
     verify: str = "standard"
+
+    def __str__(self) -> str:
+        mass = "any mass" if self.mass is None else f"{self.mass:g} kg"
+        return f"{mass}, friction {self.friction:g}, {self.verify} trials"
+
+    def of(self, entries: Iterable[LibraryEntry]) -> list[LibraryEntry]:
+        """Return the entries of this mass and friction, heaviest first."""
+        same = [e for e in entries if e.friction == self.friction and self.mass in (None, e.mass)]
+        return sorted(same, key=lambda entry: -entry.mass)
 
 
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
@@ -74,7 +86,7 @@ def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, phys
     if len({entry.mesh_sha256 for entry in same}) > 1:
         sources = ", ".join(sorted({entry.source for entry in same}))
         raise ConfigError(f"{name}: the library {library.path} has several: {sources}; name the mesh file")
-    there = [e for e in same if (e.mass, e.friction) == (physics.mass, physics.friction)]
+    there = physics.of(same)
     if not there and len({(entry.mass, entry.friction) for entry in same}) == 1:
         there = same
     entry = _held_entry(library, there, same, name, physics)
@@ -102,7 +114,7 @@ def entry_by_file(
     content = [entry for entry, _ in library.entries(file_sha256=source_hash(path))]
     if not required:
         content = [entry for entry in content if hand is None or entry.hand_content == hand_hash(hand)]
-        same = [e for e in content if (e.scale, e.mass, e.friction) == (scale, physics.mass, physics.friction)]
+        same = [entry for entry in physics.of(content) if entry.scale == scale]
         return next(iter(strict_enough(same, physics.verify)), None)
     if not content:
         before = [entry for entry, _ in library.entries(source=path)]
@@ -114,8 +126,7 @@ def entry_by_file(
         scales = ", ".join(sorted({f"{entry.scale:g}" for entry in content}))
         raise ConfigError(f"{path}: not at scale {scale:g} in the library {library.path}; it has it at {scales}")
     same = _with_hand(library, hand, sized, path)
-    there = [e for e in same if (e.mass, e.friction) == (physics.mass, physics.friction)]
-    return _held_entry(library, there, same, path, physics)
+    return _held_entry(library, physics.of(same), same, path, physics)
 
 
 def _with_hand(
@@ -141,9 +152,8 @@ def _held_entry(
     enough = strict_enough(entries, physics.verify)
     if enough:
         return enough[0]
-    had = ", ".join(sorted({f"{e.mass:g} kg, friction {e.friction:g}, {e.verify} trials" for e in others}))
-    asked = f"{physics.mass:g} kg, friction {physics.friction:g}, {physics.verify} trials"
-    raise ConfigError(f"{what}: not with {asked} in the library {library.path}; it has {had}")
+    had = ", ".join(sorted({str(Physics(e.mass, e.friction, e.verify)) for e in others}))
+    raise ConfigError(f"{what}: not with {physics} in the library {library.path}; it has {had}")
 
 
 def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
@@ -181,7 +191,7 @@ def known_grasps(
 
     Args:
         library: from `GraspLibrary(path).checked()`.
-        scene: known by its mesh, mass and friction; support and obstacles are looked at.
+        scene: known by its mesh, friction and mass, if that was given; support and obstacles are looked at.
         hand: known by its content.
         count: grasps wanted.
         restrictions: as of `plan_grasps`.
@@ -196,7 +206,7 @@ def known_grasps(
     began = time.perf_counter()
     check_request(count=count, seed=0, verify=verify, deadline=None, device="cpu")
     bound = BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
-    entries = library.of_mesh(entry_of(scene.object, hand, verify))
+    entries = library.of_mesh(entry_of(scene.object, hand, verify), any_mass=scene.object.mass_assumed)
     stored = [grasp for entry in entries for grasp in library.grasps(entry, hand)]
     admitted, refused = bound.admit(tuple(wanted(stored)))
     good: list[Grasp] = []
@@ -254,7 +264,7 @@ def known_or_planned(
     planned = plan_grasps(scene, hand, **asked, **request)
     warnings = planned.warnings
     try:
-        add_planned(library, scene, hand, config, planned.grasps, verify, name)
+        add_planned(library, scene, hand, config, planned, verify, name)
     except FormatError as error:
         warnings = (*warnings, f"{error}; what was planned is not kept")
     new = wanted([grasp for grasp in planned.grasps if grasp.usable])
@@ -277,11 +287,11 @@ def add_planned(
     scene: Scene,
     hand: HandModel,
     config: PlanConfig,
-    grasps: Iterable[Grasp],
+    planned: GraspResult,
     verify: str,
     name: str = "",
 ) -> int:
-    """Put the verified ones of a run into the library, with the trial of the object alone; how many it has then.
+    """Put the verified grasps of a run into the library, with the trial of the object alone; how many it has then.
 
     Raises FormatError: the library cannot be written.
     """
@@ -289,10 +299,11 @@ def add_planned(
         return 0
     alone = [
         replace(grasp, trials=tuple(trial for trial in grasp.trials if trial.name == "hold"))
-        for grasp in grasps
+        for grasp in planned.grasps
         if grasp.verdict is Verdict.VERIFIED
     ]
-    return library.add(entry_of(scene.object, hand, verify, name), scene.object, hand, config, alone) if alone else 0
+    target = scene.object if planned.mass is None else scene.object.at_mass(planned.mass)
+    return library.add(entry_of(target, hand, verify, name), target, hand, config, alone) if alone else 0
 
 
 def _held(

@@ -23,7 +23,7 @@ SHAPE_PREFIX = "shape:"
 def load_scene(
     source: str | Path | TriangleMesh,
     *,
-    mass: float | None = 0.1,
+    mass: float | None = None,
     friction: float = 0.6,
     scale: float = 1.0,
     resolution: int = 48,
@@ -36,7 +36,7 @@ def load_scene(
 
     Args:
         source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
-        mass: [kg]; None takes 300 kg/m³ times the volume.
+        mass: [kg]; None assumes the heavy end of what the volume allows, and warns of it.
         friction: Coulomb coefficient between hand and object.
         scale: factor on the file's coordinates to make them metres.
         resolution: the distance grid has at most the cube of it in nodes; `plan_grasps` goes by its preset.

@@ -26,7 +26,7 @@ def scene_from_views(
     target: Target | None = None,
     alone: bool = False,
     settings: SceneConfig | None = None,
-    mass: float | None = 0.1,
+    mass: float | None = None,
     friction: float = 0.6,
     source: str = "cloud",
     resolution: int = 48,
@@ -40,7 +40,7 @@ def scene_from_views(
         target: which of the things seen is meant; without it, the one nearest the first view's axis.
         alone: the views show the object and nothing else, so that all they show is taken.
         settings: of segmentation, reconstruction and obstacles.
-        mass: [kg]; None takes 300 kg/m³ times the volume.
+        mass: [kg]; None assumes the heavy end of what the volume allows, and warns of it.
         friction: Coulomb coefficient between hand and object.
         source: name of the views, for messages.
         resolution: the distance grid has at most the cube of it in nodes.

@@ -33,8 +33,12 @@ from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.runtime.worker_process import start_planning_worker
 from graspd_core.types import Grasp, GraspResult, Outcome, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
+from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
-from graspd_core.verify.verification import rank_by_robustness, trials_ahead
+from graspd_core.verify.verification import greatest_payload, rank_by_robustness, trials_ahead
+
+# Grasps that are weighed where none of them is verified.
+_WEIGHED = 8
 
 
 def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
@@ -116,11 +120,11 @@ def plan_grasps(
         seed=seed,
         timing=_timing(run, scene, found),
         ended_early=run.ended_early,
-        warnings=scene.object.warnings,
+        warnings=scene.object.warnings + _lifted_less(scene, found.mass),
         refused=found.refused,
     )
-    told = "" if run.over() else _why_few(scene, bound, found, result)
-    result = replace(result, message=message or told, support=support)
+    told = "" if run.over() else _why_few(run, scene, bound, found, result)
+    result = replace(result, message=message or told, support=support, mass=found.mass)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 
@@ -145,9 +149,22 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
 
 
-def _why_few(scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:
+def _lifted_less(scene: Scene, mass: float | None) -> tuple[str, ...]:
+    if mass is None:
+        return ()
+    told = f"the hand cannot hold the {scene.object.mass:.2g} kg that were assumed: grasps were tried at {mass:.2g} kg"
+    return (f"{scene.object.source}: {told}",)
+
+
+def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:
     told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
-    return told or (why_trials_failed(scene, result.grasps) if result.outcome is Outcome.TOO_FEW else "")
+    if told or result.outcome is not Outcome.TOO_FEW:
+        return told
+    told = why_trials_failed(scene, result.grasps)
+    if found.good or found.context is None:
+        return told
+    most = greatest_payload(found.context, result.grasps[:_WEIGHED], run.over)
+    return f"{told}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else told
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:

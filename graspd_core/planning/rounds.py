@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+from graspd_core.config import CertaintyConfig
 from graspd_core.errors import ResourceError
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
@@ -19,11 +20,14 @@ from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Snapshot, Stage
+from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.verification import (
     TrialsAhead,
     TriedGrasps,
     VerificationContext,
+    greatest_payload,
+    lighter,
     make_trial_context,
     measured,
     run_trials,
@@ -68,6 +72,11 @@ _SEED_STEP = 1_000_003
 _MANY, _FIRST_BATCH = 8, 2
 
 
+# Grasps that are weighed where none holds the mass assumed, the share of the greatest payload that is tried then, and
+# the share of the assumed mass that this is at most.
+_WEIGHED, _LIFTED, _HALF = 60, 0.8, 0.5
+
+
 @dataclass(frozen=True)
 class RoundsResult:
     """What the rounds of a run found.
@@ -79,6 +88,7 @@ class RoundsResult:
         optimise_time: spent in the method [s].
         first: when the first grasp was verified, a `time.perf_counter()` value.
         refused: candidates that restrictions did not admit to any trial, by reason.
+        mass: that of the trials [kg], where it is less than the one assumed.
     """
 
     began: float
@@ -87,6 +97,7 @@ class RoundsResult:
     optimise_time: float = 0.0
     first: float | None = None
     refused: Counter[str] = field(default_factory=Counter)
+    mass: float | None = None
 
     @property
     def good(self) -> int:
@@ -146,7 +157,9 @@ def run_rounds(
                 tried = TriedGrasps(measured(scene, hand, first) if measure else first)
             elif admitted:
                 if state.context is None:
-                    context = make_trial_context(run, scene, hand, ahead, config.certainty, measure=measure)
+                    context = make_trial_context(
+                        run, scene, hand, ahead, config.certainty, measure=measure, friction=config.robust.friction
+                    )
                     state = replace(state, context=context)
                 if state.context is not None:
                     tried = run_trials(run, state.context, admitted, enough - state.good, state.good)
@@ -157,7 +170,28 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
+        if attempt and not state.good and ahead is not None and scene.object.mass_assumed and state.mass is None:
+            state = _tried_lighter(run, scene, ahead, state, config.certainty, count)
+            if state.good >= count or run.over():
+                break
     return state
+
+
+def _tried_lighter(
+    run: Run, scene: Scene, ahead: TrialsAhead, state: RoundsResult, certainty: CertaintyConfig, count: int
+) -> RoundsResult:
+    """Try the best grasps again at a mass that the hand can lift, where the one that was assumed is too heavy."""
+    if state.context is None:
+        return state
+    best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]
+    most = greatest_payload(state.context, best, run.known_over)
+    mass = min(_LIFTED * most, _HALF * scene.object.mass)
+    if most <= LEAST_PAYLOAD or run.over():
+        return state
+    context = lighter(scene, ahead, state.context, certainty, mass)
+    tried = run_trials(run, context, tuple(replace(grasp, trials=()) for grasp in best), count, 0)
+    grasps = surest_first((*tried.grasps, *others))
+    return replace(state, context=context, mass=mass, grasps=grasps, first=tried.first)
 
 
 def _in_rank_order(

@@ -110,6 +110,15 @@ _ROWS = (
     ),
     Metric("volume", "", 1.0, lambda g: g.wrench_hull[1], "volume of that hull", 3),
     Metric(
+        "payload", "kg", 1.0, None,
+        "greatest mass whose pulls in the hold trial the grasp holds, at its friction, by bisection to a tenth; of "
+        "grasps that passed that trial",
+    ),
+    Metric(
+        "least_friction", "", 1.0, None,
+        "least sliding friction at which it passes the hold trial; measured with `robust.friction` only",
+    ),
+    Metric(
         "robustness", "", 1.0, None,
         "share of noisy trials (below) that a verified grasp held; measured with `robust.rank` only",
     ),

@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
@@ -29,7 +28,7 @@ from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
 from graspd_core.verify.hold_trial import STOPPED, PoseError, displaced, hold_trial, pose_errors
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext
-from graspd_core.verify.world import Protocol, World, at_friction, build_world
+from graspd_core.verify.world import Protocol, World, altered, at_friction, build_world
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -167,7 +166,7 @@ def hypotheses_of(
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
     ]
     slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
-    world = _with_friction(trials.alone, slippery.friction)
+    world = altered(trials.alone, friction=slippery.friction)
     less = Hypothesis(
         f"friction {slippery.friction[0]:.2g}", lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)
     )
@@ -229,12 +228,6 @@ def _hold_in(
             return None
     world = other.result()
     return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
-
-
-def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
-    model = copy(world.model)
-    model.geom_friction[:] = friction
-    return replace(world, model=model, spare=deque())
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:

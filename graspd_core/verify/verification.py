@@ -24,6 +24,7 @@ from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_
 from graspd_core.types import Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
 from graspd_core.verify import metrics
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
+from graspd_core.verify.limits import FINENESS, LEAST_PAYLOAD, least_friction, payload
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
 from graspd_core.verify.robustness import (
@@ -40,7 +41,7 @@ from graspd_core.verify.robustness import (
 )
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds, grasp_trials
-from graspd_core.verify.world import PROTOCOLS, World, at_friction
+from graspd_core.verify.world import PROTOCOLS, World, altered, at_friction
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
@@ -62,6 +63,12 @@ class VerificationContext:
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
     hypotheses: Hypotheses | None = None
+    friction: bool = False
+
+    @property
+    def mass(self) -> float:
+        """What the object weighs in the trials [kg]."""
+        return float(self.trials.alone.model.body_mass[self.trials.alone.object_body])
 
 
 @dataclass(frozen=True)
@@ -94,7 +101,14 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
 
 
 def make_trial_context(
-    run: Run, scene: Scene, hand: HandModel, ahead: TrialsAhead, certainty: CertaintyConfig, *, measure: bool
+    run: Run,
+    scene: Scene,
+    hand: HandModel,
+    ahead: TrialsAhead,
+    certainty: CertaintyConfig,
+    *,
+    measure: bool,
+    friction: bool = False,
 ) -> VerificationContext | None:
     """The contexts, as soon as the worlds are there; None where the run ended first."""
     while not run.over() and not wait([ahead.worlds], timeout=_POLL).done:
@@ -102,7 +116,27 @@ def make_trial_context(
     if run.over() or (worlds := ahead.worlds.result()) is None:
         return None
     hypotheses = hypotheses_of(scene, ahead.other, worlds, certainty.probability)
-    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
+    metrics = partial(_metrics_context, scene, hand) if measure else None
+    return VerificationContext(worlds, metrics, hypotheses, friction)
+
+
+def lighter(
+    scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float
+) -> VerificationContext:
+    """Return the context with an object of less mass [kg]."""
+    trials, shape = context.trials, ahead.other
+    around = trials.around and altered(trials.around, mass=mass)
+    trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
+    other = shape and begin_in_thread("graspd-shapes", lambda: (world := shape.result()) and altered(world, mass=mass))
+    return replace(context, trials=trials, hypotheses=hypotheses_of(scene, other, trials, certainty.probability))
+
+
+def greatest_payload(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> float:
+    """Return the most that one of the grasps holds [kg]."""
+    trials, most = context.trials, LEAST_PAYLOAD
+    for grasp in grasps:
+        most = max(most, payload(trials.alone, grasp, trials.protocol, least=FINENESS * most, stop=stop))
+    return most
 
 
 # Kept for the last few scenes and hands, which are hashed by identity.
@@ -124,6 +158,14 @@ def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tu
     with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="graspd-metrics") as pool:
         metrics = list(pool.map(partial(measure, _metrics_context(scene, hand)), postures))
     return tuple(replace(grasp, metrics=one) for grasp, one in zip(candidates, metrics, strict=True))
+
+
+def _measured(trials: TrialContext, context: MetricsContext, friction: bool, grasp: Grasp) -> GraspMetrics:
+    """Metrics of a grasp that passed its trials, and how much it holds."""
+    found = {**measure(context, grasp.grasp), "payload": payload(trials.alone, grasp, trials.protocol)}
+    if friction:
+        found["least_friction"] = least_friction(trials.alone, grasp, trials.protocol)
+    return GraspMetrics(found)
 
 
 @dataclass(frozen=True)
@@ -181,7 +223,7 @@ def run_trials(
                 trials.close()
             # Behind the report: measuring takes longer than a trial. What failed is not measured.
             if passed and context.metrics is not None:
-                metrics.append(pool.submit(measure, context.metrics(), tried.grasp))
+                metrics.append(pool.submit(_measured, context.trials, context.metrics(), context.friction, tried))
                 # A run that ends now still measures what it found: that is never more than there are threads.
                 wait(metrics[: 1 - threads or None])
             (verified if passed else others).append(tried)
@@ -306,7 +348,12 @@ def verify_grasps(
         verified = tuple(replace(grasp, trials=grasp_trials(worlds, grasp)) for grasp in verified)
     if measure:
         context = _metrics_context(scene, hand)
-        verified = tuple(replace(grasp, metrics=metrics.measure(context, grasp.grasp)) for grasp in verified)
+        verified = tuple(
+            replace(grasp, metrics=_measured(trial_context(scene, hand, verify), context, False, grasp))
+            if grasp.verdict is Verdict.VERIFIED
+            else replace(grasp, metrics=metrics.measure(context, grasp.grasp))
+            for grasp in verified
+        )
     tried = zip(grasps, verified, strict=True)
     return tuple(replace(given, metrics=found.metrics, trials=found.trials) for given, found in tried)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -283,6 +284,21 @@ class World:
     others: tuple[int, ...] = ()
     spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
     watch: Callable[[Any], None] | None = field(default=None, repr=False, compare=False)
+
+
+def altered(world: World, *, mass: float | None = None, friction: Friction | None = None) -> World:
+    """Return the world with an object of another mass [kg], or with another friction of everything."""
+    import mujoco
+
+    model, body = copy(world.model), world.object_body
+    if friction is not None:
+        model.geom_friction[:] = friction
+    if mass is not None:
+        model.body_inertia[body] *= mass / model.body_mass[body]
+        model.body_mass[body] = mass
+        # What MuJoCo derives of the masses softens its contacts.
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(world, model=model, spare=deque())
 
 
 @contextmanager

@@ -327,7 +327,7 @@ def latest_frame(newest: SensorFrame | None, now: int, settings: Settings) -> Se
 
 def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
     """Return a function that reads a mesh."""
-    mass, friction, scale = settings.mass, settings.friction, settings.mesh_scale
+    mass, friction, scale = settings.mass or None, settings.friction, settings.mesh_scale
     return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
 
 

@@ -251,7 +251,7 @@ def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Ta
         target=target,
         alone=not settings.segment,
         settings=load_scene_config(settings.scene_config) if settings.scene_config else None,
-        mass=settings.mass,
+        mass=settings.mass or None,
         friction=settings.friction,
         ahead=ahead,
     )

@@ -157,8 +157,8 @@ def test_noise_grows_from_none_over_a_camera_s_to_more():
 
 
 def test_another_mass_or_grid_leaves_the_shape_alone():
-    thing = load_scene("shape:box", resolution=8).object
-    heavy = map_runs.at_mass(thing, 2.0)
+    thing = load_scene("shape:box", mass=0.1, resolution=8).object
+    heavy = thing.at_mass(2.0)
     assert heavy.mass == 2.0
     np.testing.assert_allclose(heavy.inertia, 20 * thing.inertia)
     assert heavy.sha256 == thing.sha256

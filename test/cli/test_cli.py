@@ -229,6 +229,7 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
 def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path):
     out = tmp_path / "grasps.json"
     command = [*GRASPD, "synthesize", "shape:box", "-n", "32", "--preset", "accurate", "--out", str(out)]
+    command += ["--mass", "0.1"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     assert "optimise" in process.stderr.readline()

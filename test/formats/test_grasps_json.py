@@ -57,7 +57,7 @@ TOP = {
     "grasps",
 }
 HAND = {"name", "urdf", "base_link", "joint_names", "mimic", "mount"}
-OBJECT = {"source", "sha256", "center_of_mass", "mass", "friction", "scale", "support"}
+OBJECT = {"source", "sha256", "center_of_mass", "mass", "mass_assumed", "friction", "scale", "support"}
 TIMING = {"load", "sdf", "compile", "optimise", "verify", "first_verified", "total"}
 GRASP = {
     "rank", "verdict", "reason", "score", "position", "quaternion_wxyz", "joint_positions", "pregrasp_joint_positions",
@@ -67,6 +67,7 @@ GRASP = {
 METRIC_KEYS = {
     "contact_area_cm2", "contact_area_5mm_cm2", "contact_area_10mm_cm2", "contact_links", "penetration_mm",
     "self_penetration_mm", "intersection_volume_cm3", "contact_per_volume_per_cm", "epsilon", "volume", "robustness",
+    "payload_kg", "least_friction",
 }  # fmt: skip
 TRIAL = {"name", "passed", "displacement", "rotation", "reason"}
 VERSION_1 = Path(__file__).parent / "data" / "grasps_v1.json"

@@ -54,7 +54,7 @@ def hand() -> HandModel:
 
 @pytest.fixture(scope="session")
 def scene() -> Scene:
-    return load_scene("shape:sphere")
+    return load_scene("shape:sphere", mass=0.1)
 
 
 @pytest.fixture(scope="session")
@@ -66,7 +66,7 @@ def planned(scene: Scene, hand: HandModel) -> GraspResult:
 def library(tmp_path: Path, scene: Scene, hand: HandModel, planned: GraspResult) -> GraspLibrary:
     library = GraspLibrary(tmp_path / "known.grasps")
     library.create()
-    assert add_planned(library, scene, hand, load_preset("fast"), planned.grasps, "standard") == 4
+    assert add_planned(library, scene, hand, load_preset("fast"), planned, "standard") == 4
     return library
 
 
@@ -80,7 +80,7 @@ from graspd_core.library.grasp_library import GraspLibrary
 
 library = GraspLibrary(Path(sys.argv[1]))
 ((entry, _),) = library.entries()
-hand, target, config = load_hand("allegro_right"), load_scene("shape:sphere").object, load_preset("fast")
+hand, target, config = load_hand("allegro_right"), load_scene("shape:sphere", mass=0.1).object, load_preset("fast")
 grasps = library.grasps(entry, hand)
 for number in range(10**9):
     other = replace(entry, name=f"record{number}", mesh_sha256=f"{number:064}")
@@ -125,12 +125,12 @@ def test_what_is_added_stands_behind_what_was_there(library: GraspLibrary, plann
 def test_a_key_is_the_content_of_object_hand_and_physics(scene: Scene, hand: HandModel):
     entry = entry_of(scene.object, hand, "standard")
     others = [
-        entry_of(load_scene("shape:sphere", scale=1.1).object, hand, "standard"),
+        entry_of(load_scene("shape:sphere", mass=0.1, scale=1.1).object, hand, "standard"),
         entry_of(load_scene("shape:sphere", mass=0.2).object, hand, "standard"),
-        entry_of(load_scene("shape:sphere", friction=0.5).object, hand, "standard"),
+        entry_of(load_scene("shape:sphere", mass=0.1, friction=0.5).object, hand, "standard"),
         entry_of(scene.object, hand, "hard"),
         entry_of(scene.object, replace(hand, effort=hand.effort * 2), "standard"),
-        entry_of(load_scene("shape:box").object, hand, "standard"),
+        entry_of(load_scene("shape:box", mass=0.1).object, hand, "standard"),
     ]
     assert len({entry.key, *(other.key for other in others)}) == 7
     assert replace(entry, name="ball", source="", hand="other").key == entry.key
@@ -263,7 +263,8 @@ def test_a_known_object_alone_is_answered_without_a_trial(library, scene, hand, 
 
 
 def test_an_object_that_is_not_there_has_none(library: GraspLibrary, hand: HandModel):
-    for other in (load_scene("shape:box"), load_scene("shape:sphere", scale=1.1), load_scene("shape:sphere", mass=0.3)):
+    grown = load_scene("shape:sphere", mass=0.1, scale=1.1)
+    for other in (load_scene("shape:box", mass=0.1), grown, load_scene("shape:sphere", mass=0.3)):
         result = known_grasps(library, other, hand)
         assert (result.outcome, result.grasps) == (Outcome.NO_CANDIDATES, ())
 
@@ -336,7 +337,7 @@ def test_what_was_planned_on_a_table_is_kept_as_a_grasp_of_the_object_alone(libr
     about = at_height(scene, hand, planned, 0.1)
     lifted = replace(planned.grasps[0].trials[0], name="lift")
     both = replace(planned.grasps[0], trials=(*planned.grasps[0].trials, lifted))
-    assert add_planned(library, about, hand, load_preset("fast"), [both], "standard") == 5
+    assert add_planned(library, about, hand, load_preset("fast"), replace(planned, grasps=(both,)), "standard") == 5
     ((entry, _),) = library.entries()
     assert [trial.name for trial in library.grasps(entry, hand)[-1].trials] == ["hold"]
 
@@ -346,7 +347,7 @@ def ball(library: GraspLibrary, hand: HandModel, planned: GraspResult, tmp_path:
     """A mesh file that the library knows."""
     path = tmp_path / "ball.obj"
     save_mesh(make_shape("sphere"), path)
-    add_planned(library, load_scene(path), hand, load_preset("fast"), planned.grasps, "standard")
+    add_planned(library, load_scene(path, mass=0.1), hand, load_preset("fast"), planned, "standard")
     return path
 
 
@@ -407,6 +408,6 @@ def test_two_objects_of_one_name_are_told(library, hand, ball, planned, tmp_path
     other = tmp_path / "other" / "ball.obj"
     other.parent.mkdir()
     save_mesh(make_shape("box"), other)
-    add_planned(library, load_scene(other), hand, load_preset("fast"), planned.grasps, "standard")
+    add_planned(library, load_scene(other, mass=0.1), hand, load_preset("fast"), planned, "standard")
     with pytest.raises(ConfigError, match=r"ball: the library .* has several: .*ball\.obj, .*ball\.obj; name the mesh"):
         entry_by_name(library, hand, "ball", PHYSICS)

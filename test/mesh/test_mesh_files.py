@@ -156,10 +156,10 @@ def test_a_stray_vertex_is_dropped_aloud_and_counts_nowhere(tmp_path, stray, use
     box = make_shape("box")
     save_mesh(box, tmp_path / "box.obj")
     text = (tmp_path / "box.obj").read_text() + "v {} {} {}\n".format(*stray) + use
-    from_file = load_scene(write(tmp_path / "box.obj", text), resolution=16)
+    from_file = load_scene(write(tmp_path / "box.obj", text), mass=0.1, resolution=16)
     faces = [[514, 514, 514]] if use.startswith("f 5") else [[0, 0, 514]] if use else np.zeros((0, 3), int)
     spoilt = TriangleMesh(np.vstack([box.vertices, stray]), np.vstack([box.faces, faces]))
-    from_value = load_scene(spoilt, resolution=16)
+    from_value = load_scene(spoilt, mass=0.1, resolution=16)
     for thing in (from_file.object, from_value.object):
         assert np.ptp(thing.mesh.vertices, axis=0) == pytest.approx(2 * np.array(BOX_HALF), abs=1e-7)
         assert thing.volume == pytest.approx(shape_volume("box"), rel=1e-6)

@@ -42,7 +42,7 @@ from graspd_core.verify.robustness import (
 )
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds
-from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+from graspd_core.verify.world import PROTOCOLS, altered, at_friction, build_world
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 GRASP = Grasp(POSTURE, POSTURE, POSTURE, (), 0.0)
@@ -261,15 +261,17 @@ def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
     assert cut == [COARSE_CUTS]
 
 
-def test_less_friction_is_that_of_a_world_built_with_it():
-    scene, hand = load_scene("shape:cylinder"), load_hand("allegro_right")
+def test_less_friction_and_another_mass_are_those_of_a_world_built_with_them():
+    scene, hand = load_scene("shape:cylinder", mass=0.3), load_hand("allegro_right")
     parts, slippery = object_parts(scene.object), at_friction(PROTOCOLS["standard"], 0.2)
-    usual, built = (build_world(hand, scene.object, parts, each) for each in (PROTOCOLS["standard"], slippery))
-    changed = hypotheses._with_friction(usual, slippery.friction)
+    usual = build_world(hand, scene.object, parts, PROTOCOLS["standard"])
+    built = build_world(hand, scene.object.at_mass(0.9), parts, slippery)
+    changed = altered(usual, mass=0.9, friction=slippery.friction)
     grasps = plan_grasps(scene, hand, count=4, preset="fast", verify="none", measure=False).grasps
     results = [[hold_trial(world, grasp, slippery) for grasp in grasps] for world in (built, changed)]
     assert results[0] == results[1]
     assert usual.model.geom_friction[0, 0] == PROTOCOLS["standard"].friction[0]
+    assert usual.model.body_mass[usual.object_body] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(("seen", "hidden"), [(seen_from, True), (seen_all_round, False)])

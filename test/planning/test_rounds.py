@@ -98,7 +98,7 @@ def test_a_plan_is_put_in_order_and_says_by_what():
     assert [p.stage for p in told[-3:]] == [Stage.VERIFY, Stage.VERIFY, Stage.DONE]
     document = result_document(result, scene.object, hand, config)
     assert [g["metrics"]["robustness"] for g in document["grasps"]][:2] == shares
-    assert document["config"]["robust"] == {"rank": True, "trials": 2, "hold_time": 0.1}
+    assert document["config"]["robust"] == {"rank": True, "trials": 2, "hold_time": 0.1, "friction": False}
     # A trial that is cut short says nothing.
     world = build_world(hand, scene.object, object_parts(scene.object), PROTOCOLS["standard"])
     errors = pose_errors(0, 2)

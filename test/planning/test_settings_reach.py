@@ -131,6 +131,7 @@ CASES = {
     "rounds.growth": Case(6.0, TWO_ROUNDS, count=20),
     "rounds.first_budget": Case(1.0, verify="standard", brief=True),
     "robust.rank": held(),
+    "robust.friction": held(),
     "robust.trials": held(),
     "certainty.probability": Case(0.0, HOLDING, "one view", "parallel_gripper", 1, "standard"),
     "robust.hold_time": Case(0.4, HOLDING, hand="parallel_gripper", count=1, verify="full"),
@@ -190,12 +191,12 @@ def another(name: str, value: Any) -> Any:
 def scene(name: str) -> Scene:
     box = make_shape("box")
     if name == "box":
-        return build_scene(box, resolution=12)
+        return build_scene(box, mass=0.1, resolution=12)
     if name == "one view":
-        return scene_from_views(views_of(tabletop("box"), CAMERA, ring_poses(1, elevation=0.8)))
+        return scene_from_views(views_of(tabletop("box"), CAMERA, ring_poses(1, elevation=0.8)), mass=0.1)
     # No hand is clear of a table in the middle of the box.
     guessed = np.random.default_rng(0).random(len(box.vertices))
-    return build_scene(box, resolution=12, confidence=guessed, support=Plane(np.array([0.0, 0.0, 1.0]), 0.0))
+    return build_scene(box, mass=0.1, resolution=12, confidence=guessed, support=Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
 @cache
@@ -226,7 +227,10 @@ def trace(config: PlanConfig, case: Case) -> str:
     things = scene(case.scene), hand(case.hand)
     result = plan_grasps(*things, count=case.count, seed=1, preset=config, verify=case.verify, progress=hear, stop=stop)
     grasps = [
-        (g.score, g.probability, g.contacts, [v.tolist() for p in postures(g) for v in vars(p).values()])
+        (
+            (g.score, g.probability, g.contacts, (g.metrics or {}).get("least_friction")),
+            [v.tolist() for p in postures(g) for v in vars(p).values()],
+        )
         for g in result.grasps
     ]
     return repr((result.outcome, result.method, told, polls, grasps))

@@ -95,7 +95,7 @@ def test_every_seen_point_and_its_shadow_lie_within(seed: int, flat: bool):
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene("shape:box")
+    return load_scene("shape:box", mass=0.1)
 
 
 def box(low, high) -> TriangleMesh:
@@ -172,7 +172,7 @@ def test_a_tray_in_one_piece_leaves_the_object_s_place_free(scene):
 
 
 def test_what_does_not_rise_above_the_support_is_the_support():
-    scene = load_scene("shape:box")
+    scene = load_scene("shape:box", mass=0.1)
     bottom = float(scene.object.mesh.vertices[:, 2].min())
     stands = Scene(scene.object, scene.sdf, scene.timing, support=Plane(np.array([0.0, 0.0, 1.0]), bottom))
     table = box([-1.0, -1.0, bottom - 0.05], [1.0, 1.0, bottom + 0.002])

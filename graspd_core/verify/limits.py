@@ -1,0 +1,83 @@
+"""How much a grasp holds: the greatest mass at its friction, and the least friction at its mass.
+
+Both are found by bisection over trials whose pulls end when their answer is known (`early_stop`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from graspd_core.types import Grasp, StopHook
+from graspd_core.verify.hold_trial import CHECK_EVERY, DIRECTIONS, close_hand, hold_trial, step_until_known
+from graspd_core.verify.world import Protocol, World, altered, at_friction, trial_data
+
+# mujoco is a compiled module without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+# The least and the greatest mass that are asked about [kg].
+LEAST_PAYLOAD, MOST_PAYLOAD = 0.01, 16.0
+# The least share of its friction that is asked about.
+_LEAST_SHARE = 0.02
+# Limits are found to this factor.
+FINENESS = 1.1
+
+
+def payload(
+    world: World,
+    grasp: Grasp,
+    protocol: Protocol,
+    *,
+    least: float = LEAST_PAYLOAD,
+    stop: StopHook = lambda: False,
+) -> float:
+    """Return the greatest mass [kg] whose pulls the grasp holds, zero where it does not hold the `least`.
+
+    The hand closes once on the object's own mass. Each direction is then pulled as hard as the hold trial pulls the
+    mass that is asked about, from the same state.
+    """
+    import mujoco
+
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
+    most = MOST_PAYLOAD
+    try:
+        with trial_data(world) as data:
+            if close_hand(world, data, grasp, protocol, np.zeros(2), stop=stop):
+                return 0.0
+            held = np.empty(mujoco.mj_stateSize(world.model, kind))
+            mujoco.mj_getState(world.model, data, held, kind)
+            for direction in DIRECTIONS[list(protocol.pulls)]:
+
+                def holds(mass: float, direction: np.ndarray = direction) -> bool:
+                    mujoco.mj_setState(world.model, data, held, kind)
+                    data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
+                    return not step_until_known(world, data, protocol, np.zeros(2), steps, stop=stop)
+
+                # Only a direction that is weaker than those before it is looked at closely.
+                if not holds(least):
+                    return 0.0
+                most = most if holds(most) else _greatest(holds, least, most)
+    except mujoco.FatalError:
+        return 0.0
+    return most
+
+
+def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: StopHook = lambda: False) -> float:
+    """Return the least sliding friction at which the grasp passes the hold trial, that of the protocol at most."""
+
+    def holds(fraction: float) -> bool:
+        slippery = at_friction(protocol, Protocol.friction[0] / fraction)
+        return hold_trial(altered(world, friction=slippery.friction), grasp, slippery, stop=stop).passed
+
+    return protocol.friction[0] / _greatest(holds, 1.0, 1 / _LEAST_SHARE)
+
+
+def _greatest(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """Return the greatest value known to hold, between `low` that does and `high` that does not."""
+    while high > FINENESS * low:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
