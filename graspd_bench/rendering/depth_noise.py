@@ -8,7 +8,7 @@ correlated by 0.96 between neighbouring pixels and by 0.6 at a distance of eight
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +20,8 @@ Depth = Float[np.ndarray, "height width"]
 
 # A step of depth between neighbouring pixels beyond this [m] is an edge of something, not a slope.
 EDGE = 0.02
+# Blur of a slow bias, over the height of the image.
+_SLOW = 0.15
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class DepthNoise:
         grazing: surfaces seen at a smaller angle to the line of sight lose pixels, all of them at none [rad].
         baseline: distance between the eyes of a stereo camera [m]; what one of them does not see has no depth.
         step: depth is rounded to multiples of this [m].
+        disparity_step: disparity, focal length times baseline over depth, is rounded to multiples of this [pixels].
+        bias: standard deviation at 1 m of an error that is smooth over the image and grows with depth squared [m].
         nearest, farthest: range beyond which there is no depth [m].
     """
 
@@ -52,6 +56,8 @@ class DepthNoise:
     grazing: float = 0.0
     baseline: float = 0.0
     step: float = 0.0
+    disparity_step: float = 0.0
+    bias: float = 0.0
     nearest: float = 0.0
     farthest: float = float("inf")
 
@@ -98,6 +104,40 @@ HIGH = DepthNoise(
 LEVELS = {"none": NONE, "low": LOW, "default": DEFAULT, "high": HIGH}
 
 
+@dataclass(frozen=True)
+class DepthCamera:
+    """A kind of depth camera: its lens and its faults."""
+
+    lens: PinholeCamera
+    noise: DepthNoise
+
+
+# Stereo of a narrow and of a wide lens (Intel's tuning guide: 0.08 pixels). Structured light with disparity in eighths
+# of a pixel (Khoshelham and Elberink 2012). Time of flight, whose error hardly grows with depth, and which mixes what
+# is before and behind an edge (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m).
+CAMERAS = {
+    "d415": DepthCamera(PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5), DEFAULT),
+    "d435": DepthCamera(
+        PinholeCamera(640, 480, 385.0, 385.0, 319.5, 239.5),
+        replace(DEFAULT, quadratic=4.2e-3, correlation=4.0, baseline=0.05, farthest=3.0),
+    ),
+    "structured_light": DepthCamera(
+        PinholeCamera(640, 480, 575.0, 575.0, 319.5, 239.5),
+        replace(
+            DEFAULT, quadratic=1.4e-3, correlation=3.0, baseline=0.075, step=0.0, disparity_step=0.125, bias=2e-3,
+            nearest=0.4, farthest=4.0,
+        ),
+    ),
+    "time_of_flight": DepthCamera(
+        PinholeCamera(512, 424, 365.0, 365.0, 255.5, 211.5),
+        DepthNoise(
+            floor=1.5e-3, quadratic=3e-4, correlation=1.5, white=0.5, jitter=0.4, flying=0.8, edge_loss=0.1, loss=0.002,
+            grazing=0.15, step=1e-3, bias=1.5e-3, nearest=0.3, farthest=4.0,
+        ),
+    ),
+}  # fmt: skip
+
+
 def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int) -> Depth:
     """The image that a camera with such faults would give of the true `depth` [m]; 0 where it has none.
 
@@ -118,6 +158,11 @@ def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int)
     if noise.floor or noise.quadratic:
         sigma = noise.floor + noise.quadratic * seen**2
         seen = seen + (seen > 0) * sigma * _field(true.shape, noise.correlation, noise.white, rng)
+    if noise.bias:
+        seen = seen + noise.bias * seen**2 * _field(true.shape, _SLOW * true.shape[0], 0.0, rng)
+    if noise.disparity_step:
+        scale = camera.fx * noise.baseline / noise.disparity_step
+        seen = np.where(seen > 0, scale / np.round(scale / np.maximum(seen, 1e-9)).clip(1), 0.0)
     if noise.step:
         seen = noise.step * np.round(seen / noise.step)
     return np.where(holes | (seen < noise.nearest) | (seen > noise.farthest), 0.0, seen.clip(0.0))

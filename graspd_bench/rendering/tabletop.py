@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from graspd_bench.rendering.depth_noise import NONE, DepthNoise, add_noise
 from graspd_bench.rendering.render import look_at, render_scene
-from graspd_core.mesh.mesh_files import mass_properties
+from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
@@ -30,6 +30,8 @@ CAMERA = PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5)
 
 # Authored shapes that would topple as they are authored.
 LYING = ("capsule", "hammer")
+# Cosine of a pose that counts as standing.
+_UPRIGHT = 0.999
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,42 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
     turn = quaternion_between(down, np.array([0.0, 0.0, -1.0]), around=perpendicular(down))
     pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(turn)).numpy()
     return _set_down(mesh, pose, centre)
+
+
+def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+    """A pose on z = 0 in which the mesh rests, with a random turn about the vertical.
+
+    Half of those that can stand as they are do so. The others come to rest as they fall, from any direction.
+    """
+    import trimesh
+
+    centre = mass_properties(mesh)[1]
+    hull = trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull
+    poses, shares = trimesh.poses.compute_stable_poses(hull, center_mass=centre, sigma=0.0, n_samples=1, threshold=0.01)
+    poses, shares = np.asarray(poses), np.asarray(shares)
+    standing = np.flatnonzero(poses[:, 2, 2] > _UPRIGHT)
+    upright = len(standing) > 0 and rng.random() < 0.5
+    pose = np.eye(4)
+    pose[:3, :3] = poses[standing[0] if upright else rng.choice(len(poses), p=shares / shares.sum())][:3, :3]
+    turn, a = np.eye(4), rng.uniform(0, 2 * np.pi)
+    turn[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    return _set_down(mesh, turn @ pose, centre)
+
+
+def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random.Generator) -> tuple[TriangleMesh, ...]:
+    """Things at rest beside a target, each in a direction of its own, 2 to 5 cm away from all before it."""
+    from scipy.spatial import KDTree
+
+    placed, begun = [target], rng.uniform(0, 2 * np.pi)
+    for number, other in enumerate(others):
+        resting = moved(other, resting_pose(other, rng))
+        angle = begun + 2 * np.pi * (number + rng.uniform(-0.2, 0.2)) / len(others)
+        way, gap = np.array([np.cos(angle), np.sin(angle), 0.0]), rng.uniform(0.02, 0.05)
+        about = KDTree(np.concatenate([surface_samples(mesh, 1500, 0)[0] for mesh in placed]))
+        points = surface_samples(resting, 1500, 0)[0]
+        reach = next(d for d in np.arange(0.0, 1.0, 0.005) if about.query(points + d * way)[0].min() > gap)
+        placed.append(moved(resting, _translation(*(reach * way))))
+    return tuple(placed[1:])
 
 
 def ring_poses(
