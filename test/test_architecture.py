@@ -17,29 +17,11 @@ ROOT = Path(__file__).parents[1]
 MAX_LINES, MIN_LINES, MAX_FUNCTION_LINES, MAX_POSITIONAL, MAX_FILES = 600, 40, 60, 7, 25
 # Private metaphors of earlier code: none may be part of a name again, nor of a file's.
 METAPHORS = set(
-    [
-        "allround",
-        "atlas",
-        "court",
-        "dust",
-        "elsewhere",
-        "intake",
-        "judge",
-        "judged",
-        "laps",
-        "outlets",
-        "perceive",
-        "rival",
-        "rivals",
-        "rung",
-        "rungs",
-        "shelf",
-        "sighting",
-        "specks",
-        "synthesise",
-        "tally",
-        "trust",
-    ]
+    re.findall(
+        r"\w+",
+        "allround atlas court dust elsewhere intake judge judged laps outlets perceive rival "
+        "rivals rung rungs shelf sighting specks synthesise tally trust",
+    )
 )
 # Nor may prose use these; what else the words above mean in plain English is a writer's business.
 PRIVATE_PHRASE = re.compile(
@@ -87,7 +69,7 @@ MAY_IMPORT = {
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 24_900,
+    "graspd_core": 24_600,
     "graspd_ros": 4_700,
     "graspd_bench": 7_800,
     "graspd_dataset": 2_900,
@@ -368,7 +350,7 @@ def test_no_file_outside_the_packages_is_too_long():
     ("path", "source", "culprit"),
     [
         ("graspd_core/mesh/sdf.py", "from graspd_core.hands.model import HandModel", "hands.model"),
-        ("graspd_core/optimize/graspd2022/contact_dynamics.py", "from ...planning import rounds", "planning"),
+        ("graspd_core/optimize/graspd2022/graspd2022.py", "from ...planning import rounds", "planning"),
         (
             "graspd_core/verify/metrics.py",
             "def f():\n    from graspd_core.optimize.losses import g",
@@ -412,7 +394,7 @@ def test_the_checker_sees_a_planted_breach(path: str, source: str, culprit: str)
         ("graspd_core/verify/world.py", "def build():\n    import mujoco"),
         ("graspd_core/mesh/mesh_files.py", "if TYPE_CHECKING:\n    import trimesh"),
         ("graspd_core/optimize/problem.py", "from graspd_core.optimize.losses import support"),
-        ("graspd_core/optimize/graspd2022/graspd2022.py", "from .contact_dynamics import step"),
+        ("graspd_core/optimize/graspd2022/graspd2022.py", "from .graspd2022_config import step"),
         ("graspd_ros/node.py", "import rclpy\nfrom graspd_core import plan_grasps"),
     ],
 )

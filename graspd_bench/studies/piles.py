@@ -37,11 +37,11 @@ from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.se3 import random_rotations, rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Posture, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings
 from graspd_core.verify.world import PROTOCOLS, FreeBody
+from graspd_dataset.run_records import markdown_table
 
 # Things in a scene.
 SIZES, MOST_THINGS = (3, 5, 8, 12), 24

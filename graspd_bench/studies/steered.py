@@ -23,8 +23,8 @@ from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.regions import Box, entered
 from graspd_core.planning.steering import Steering
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Verdict
+from graspd_dataset.run_records import markdown_table
 
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")

@@ -20,8 +20,14 @@ from jaxtyping import Float
 
 from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import HandModel, JointKind, Primitive, PrimitiveKind
-from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
-from graspd_core.hands.readers.joint_limits import Coupling, JointSpec, resolved_couplings
+from graspd_core.hands.readers.build_model import (
+    Coupling,
+    JointSpec,
+    LinkSpec,
+    assemble,
+    refuse_crowds,
+    resolved_couplings,
+)
 from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull
 from graspd_core.hands.readers.xml_io import FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
