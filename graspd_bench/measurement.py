@@ -22,7 +22,7 @@ from graspd_bench.study import Case, Record, raw_grasps
 from graspd_bench.trials import gravity_trial
 from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import object_hash, thing_name
+from graspd_core.mesh.shapes import object_hash
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.plan_config import PlanConfig, to_mapping
 from graspd_core.perception.load_scene import load_scene
@@ -34,7 +34,7 @@ from graspd_core.verify.hold_trial import hold_trial, noisy_share, pose_errors
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_dataset.run_records import Stopwatch
+from graspd_dataset.run_records import Stopwatch, thing_name
 
 # One trial of one grasp: figures by name.
 Trial = Callable[[Grasp], dict[str, Any]]

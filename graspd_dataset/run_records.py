@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import graspd_core
+from graspd_core.mesh.mesh_files import MESH_ENDINGS
 
 # Parts of graspd_core that no figure depends on.
 _BESIDE = ("cli", "io", "doctor.py")
@@ -97,6 +98,13 @@ def commit() -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip()
+
+
+def thing_name(source: Any) -> str:
+    """What an object goes by: the shape, or the file without its ending; other values as they are."""
+    text = f"{source:g}" if isinstance(source, float) else str(source)
+    path = Path(text)
+    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def finite(value: Any) -> Any:

@@ -332,12 +332,11 @@ def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
         welded = [c for c, j in joints.items() if above[c] == parent and j.get("type") == "fixed" and c not in kept]
         kept.update(welded)
         waiting += welded
-    dropped = {chain[-1], *links} - kept | {chain[-1]}
     for element in root.findall("link"):
         if element.get("name") not in kept:
             root.remove(element)
     for child, element in joints.items():
-        if child in dropped or child not in kept:
+        if child not in kept or child == chain[-1]:
             root.remove(element)
 
 

@@ -31,6 +31,9 @@ LIFT = 0.1
 STEPS = (5, 2, 5)
 # Rows of the way at the ends of these steps.
 STAGE_ROWS = (0, STEPS[0], STEPS[0] + STEPS[1], sum(STEPS))
+# How much each waypoint, by row, has of each stage: nearest neighbours blend on a line.
+_ALONG = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
+_SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 
 
 def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
@@ -58,14 +61,6 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
         for key in ("position", "quaternion_wxyz")
     )
     return position, quaternion
-
-
-def _shares() -> Float[np.ndarray, "way 4"]:
-    along = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
-    return np.maximum(1.0 - np.abs(along[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
-
-
-_SHARES = _shares()
 
 
 # No joint moves farther between two waypoints [rad].

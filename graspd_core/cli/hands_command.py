@@ -87,7 +87,7 @@ def as_text(hand: HandModel) -> str:
         "",
         "links (joint, mass, solids, contact candidates)",
     ]
-    moving, depth = _joint_of_link(hand), link_depths(hand.link_parent)
+    moving, depth = hand.link_joint_names, link_depths(hand.link_parent)
     for link, name in enumerate(hand.link_names):
         solids = Counter(_solid(p.kind, len(p.vertices)) for p in hand.primitives_of[link])
         told = ", ".join(f"{n} x {solid}" if n > 1 else solid for solid, n in solids.items()) or "no solids"
@@ -132,12 +132,6 @@ def as_yaml(hand: HandModel, urdf: str) -> str:
             # Written out: YAML reads 1e-05 as text.
             lines.append(f"  {_quoted(name)}: {np.format_float_positional(value, trim='0')}")
     return "\n".join(lines) + "\n"
-
-
-def _joint_of_link(hand: HandModel) -> list[str]:
-    coupled = {mimic.link: mimic.name for mimic in hand.mimics}
-    joints = enumerate(hand.link_joint.tolist())
-    return [coupled.get(link) or (hand.joint_names[joint] if joint >= 0 else "") for link, joint in joints]
 
 
 def _solid(kind: str, corners: int) -> str:

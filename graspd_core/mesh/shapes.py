@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from math import pi
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -169,13 +168,6 @@ SHAPES: dict[str, Callable[[], TriangleMesh]] = {
     "l_block": _l_block,
     "hammer": _hammer,
 }
-
-
-def thing_name(source: Any) -> str:
-    """What an object goes by: the shape, or the file without its ending; other values as they are."""
-    text = f"{source:g}" if isinstance(source, float) else str(source)
-    path = Path(text)
-    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
