@@ -178,7 +178,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     count = starts.shape[1]
     owner = torch.arange(len(starts)).repeat_interleave(count)
     solved = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
-    q, owner = nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
+    q, owner = _nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
     if not len(q):
         return q, owner
     hits = hits_of_support(arm, task.scene, task.base, placed(arm.capsules, arm_links(arm, q))[:2])
@@ -193,7 +193,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     return q[kept], owner[kept]
 
 
-def nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
+def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
     """The same postures with joints turned by full turns to where they are nearest to the seed within their limits."""
     turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
