@@ -17,13 +17,13 @@ import psutil
 import torch
 
 from graspd_core import load_hand, load_scene, plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.runtime.worker_process import resident_mb
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.guarded_calls import Limits
 from graspd_dataset.ray_engine import RayEngine, ray_running
 from graspd_dataset.run_dataset import run_blocks
+from graspd_dataset.run_records import markdown_table
 
 
 def loop(blocks: Sequence[Block]) -> tuple[float, float, int]:

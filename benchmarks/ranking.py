@@ -31,10 +31,10 @@ from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import load_preset, method_row
 from graspd_core.optimize.ranking import FARTHEST, log_odds, ranking_figures
 from graspd_core.perception.scene import Scene, object_parts
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+from graspd_dataset.run_records import markdown_table
 
 SHIPS = Path(ranking.__file__).with_suffix(".npz")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")

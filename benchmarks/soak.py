@@ -28,7 +28,7 @@ from graspd_bench.result_store import write_record
 from graspd_bench.run_studies import Job, run_job
 from graspd_bench.study import Case, Record, Sections
 from graspd_bench.tables import fill, sourced, written
-from graspd_core.runtime.records import code_version, markdown_table
+from graspd_dataset.run_records import code_version, markdown_table
 
 PARTS = Path(__file__).with_name("soak_parts.py")
 SAMPLE_PERIOD = 5.0  # seconds between two looks at the node's memory

@@ -33,10 +33,10 @@ from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, Scene, build_scene, object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.feasibility import kind_of
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world
+from graspd_dataset.run_records import markdown_table
 
 # Where a cell lies on an axis of its map: a number, or the name of an object.
 Place = float | str

@@ -22,19 +22,19 @@ from graspd_bench.study import PROTOCOL_MASS, Case, Record, raw_grasps
 from graspd_bench.trials import gravity_trial
 from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import object_hash, thing_name
+from graspd_core.mesh.shapes import object_hash
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.plan_config import PlanConfig, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import Stopwatch
 from graspd_core.types import Grasp, Progress, Stage, TrialResult, TriangleMesh, Verdict
 from graspd_core.verify.hold_trial import TRIALS as NOISY_TRIALS
 from graspd_core.verify.hold_trial import hold_trial, noisy_share, pose_errors
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_dataset.run_records import Stopwatch, thing_name
 
 # One trial of one grasp: figures by name.
 Trial = Callable[[Grasp], dict[str, Any]]

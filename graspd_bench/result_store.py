@@ -14,7 +14,7 @@ from pathlib import Path
 from graspd_bench.study import Case, Record
 from graspd_core.errors import FormatError
 from graspd_core.io.grasps_json import save_text
-from graspd_core.runtime.records import code_version, commit, finite
+from graspd_dataset.run_records import code_version, commit, finite
 
 FORMAT, VERSION = "graspd/bench", 2
 # Files of this package that the figures of every study depend on.

@@ -23,7 +23,7 @@ from graspd_bench.study import Case, Picture, Record, Request, Study
 from graspd_bench.study_registry import STUDIES
 from graspd_bench.tables import sourced
 from graspd_core.errors import ConfigError
-from graspd_core.runtime.records import failure, finite, forget_peak, peak_mb
+from graspd_dataset.run_records import failure, finite, forget_peak, peak_mb
 
 # How often a stop is looked for [s].
 _POLL = 0.2

@@ -10,13 +10,14 @@ from typing import Any
 from graspd_core.errors import ConfigError, MeshError
 from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import SHAPES, object_hash, object_sources, thing_name
+from graspd_core.mesh.shapes import SHAPES, object_hash, object_sources
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp
+from graspd_dataset.run_records import thing_name
 
 Record = dict[str, Any]
 

@@ -12,8 +12,8 @@ from graspd_bench.study import Picture, Record, Sections
 from graspd_bench.suites import DECADES
 from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import save_text
-from graspd_core.runtime.records import markdown_table
 from graspd_core.verify.metrics import METRICS
+from graspd_dataset.run_records import markdown_table
 
 
 def provenance(command: str, records: Sequence[Record]) -> str:

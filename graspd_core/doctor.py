@@ -30,6 +30,7 @@ _LIBRARIES = {
     "pyyaml": "yaml",
     "matplotlib": "matplotlib",
 }
+_LIBRARY = "import {module}; from importlib.metadata import version; print(version({name!r}))"
 _TORCH = """
 import torch
 torch.linalg.inv(torch.eye(3))
@@ -96,7 +97,7 @@ def run_checks() -> list[Check]:
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
         ("compiled kernel", _KERNEL, f"torch does its work, 30 times slower: {_SETUP}", False),
-        *((name, _import_probe(name, module), _SETUP, True) for name, module in _LIBRARIES.items()),
+        *((name, _LIBRARY.format(module=module, name=name), _SETUP, True) for name, module in _LIBRARIES.items()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
         ("pybullet", _BULLET, "only benchmarks need it: make setup, on Python 3.11", False),
         ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup (docs/ros.md)", False),
@@ -138,10 +139,6 @@ def main() -> int:
     checks = run_checks()
     sys.stdout.write(format_checks(checks) + "\n")
     return 0 if all(check.ok for check in checks if check.needed) else 1
-
-
-def _import_probe(distribution: str, module: str) -> str:
-    return f"import {module}; from importlib.metadata import version; print(version({distribution!r}))"
 
 
 def _check_python() -> Check:

@@ -44,7 +44,7 @@ class TransformBuffer:
     def __init__(self, history: int | None = HISTORY) -> None:
         self._history = history
         self._links: dict[str, _Link] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def add(
         self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"], stamp: int = 0, static: bool = False
@@ -76,8 +76,10 @@ class TransformBuffer:
         """
         target, source = _name(target), _name(source)
         with self._lock:
+            known = self.frames()
             for name in (target, source):
-                self._refuse_unknown(name)
+                if name not in known:
+                    raise TransformError(f"unknown frame {name!r}; known: {', '.join(known) or 'none'}")
             up_target, up_source = self._chain(target), self._chain(source)
             common = next((name for name in up_source if name in up_target), None)
             if common is None:
@@ -96,20 +98,12 @@ class TransformBuffer:
     def frames(self) -> tuple[str, ...]:
         """Every frame heard of, in alphabetical order."""
         with self._lock:
-            return self._frames()
+            return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
 
     def clear(self) -> None:
         """Forget everything, as when time has jumped back."""
         with self._lock:
             self._links.clear()
-
-    def _frames(self) -> tuple[str, ...]:
-        return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
-
-    def _refuse_unknown(self, name: str) -> None:
-        known = self._frames()
-        if name not in known:
-            raise TransformError(f"unknown frame {name!r}; known: {', '.join(known) or 'none'}")
 
     def _chain(self, name: str) -> list[str]:
         chain = [name]

@@ -19,7 +19,6 @@ from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, Scene, near_scene, object_parts, object_sharp_points
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
-from graspd_core.runtime.records import code_version, forget_peak, peak_mb
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
@@ -28,6 +27,7 @@ from graspd_dataset.dataset_store import parquet_bytes
 from graspd_dataset.guarded_calls import Limits, MadeBlock, ReadyObject, call_guarded, close_child
 from graspd_dataset.ray_engine import pickled_hand
 from graspd_dataset.record_schema import arrow_schema, object_schema
+from graspd_dataset.run_records import code_version, forget_peak, peak_mb
 
 # Scenes and hands that a process keeps, so that consecutive blocks share what is built for them.
 _KEPT = 4

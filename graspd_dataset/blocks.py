@@ -14,10 +14,11 @@ import numpy as np
 
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import hand_hash
-from graspd_core.mesh.shapes import object_hash, object_sources, thing_name
+from graspd_core.mesh.shapes import object_hash, object_sources
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.planning.plan_grasps import check_request
 from graspd_dataset.dataset_store import SCHEMA_VERSION
+from graspd_dataset.run_records import thing_name
 
 Measured = Literal["verified", "all", "none"]
 MEASURED: tuple[str, ...] = get_args(Measured)

@@ -155,7 +155,7 @@ def block_of(pickled: bytes, hand: bytes, shared: bytes) -> MadeBlock:
 
 def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report:
     """Write down what failed."""
-    from graspd_core.runtime.records import failure
+    from graspd_dataset.run_records import failure
 
     record = failure(error, _KINDS.get(type(error), "raised"))
     told = {"key": job.key, "asked": job.asked, **record}

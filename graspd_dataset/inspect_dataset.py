@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from graspd_core.errors import FormatError
-from graspd_core.runtime.records import markdown_table
 from graspd_dataset.block_rows import kind_of_reason
 from graspd_dataset.blocks import content_key
 from graspd_dataset.dataset_store import DatasetStore, block_path, key_of, read_parquet
 from graspd_dataset.record_schema import arrow_schema
+from graspd_dataset.run_records import markdown_table
 
 _REASONS = 8
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from graspd_core.runtime.records import markdown_table
 from graspd_core.verify.metrics import METRICS
+from graspd_dataset.run_records import markdown_table
 
 
 @dataclass(frozen=True)

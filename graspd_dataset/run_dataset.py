@@ -16,12 +16,12 @@ from datetime import date
 from typing import Any
 
 from graspd_core.errors import ConfigError
-from graspd_core.runtime.records import code_version, commit
 from graspd_dataset.blocks import Block, DatasetObject, DatasetRequest, by_object, content_key
 from graspd_dataset.dataset_store import FORMAT, SCHEMA_VERSION, DatasetStore, keys_below
 from graspd_dataset.guarded_calls import Report
 from graspd_dataset.inspect_dataset import DatasetStats, reason_lines, stats_table
 from graspd_dataset.ray_engine import RayEngine
+from graspd_dataset.run_records import code_version, commit
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from typing import Any, Literal
 from graspd_core.errors import GraspdError
 from graspd_core.mesh.topology import far_centre
 from graspd_core.perception.scene import ObjectModel, Scene, moved_grasp, moved_object, object_parts
-from graspd_core.runtime.records import peak_mb
 from graspd_core.types import Grasp, GraspResult, TriangleMesh, Verdict
+from graspd_dataset.run_records import peak_mb
 
 Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
 

@@ -36,9 +36,9 @@ from graspd_core.hands.model import HandModel
 from graspd_core.optimize.restrictions import BoundRestriction, Refusal
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.se3 import SE3, axis_rotation
 from graspd_core.types import ArmPath, Grasp, Plane, Progress, TriangleMesh
+from graspd_dataset.run_records import markdown_table
 
 # Authored shapes that are tried in two places each.
 SHAPES = ("box", "mug", "hammer", "bottle", "torus", "cylinder", "plate", "l_block", "sphere", "bowl")

@@ -22,11 +22,11 @@ from graspd_core.hands.library import hand_names
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, object_parts
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Plane, TriangleMesh
 from graspd_core.verify.hold_trial import displaced, hold_trial, pose_errors
 from graspd_core.verify.lift_trial import lift_trial
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+from graspd_dataset.run_records import markdown_table
 
 # Thin things: an authored shape, and factors on its three extents.
 THIN = (("shape:plate", (1.0, 1.0, 0.3)), ("shape:box", (0.2, 0.2, 2.0)), ("shape:box", (0.1, 0.5, 2.0)))

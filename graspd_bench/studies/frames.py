@@ -25,8 +25,8 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target, segment
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Verdict
+from graspd_dataset.run_records import markdown_table
 
 # Clouds are compared by the cubes of this side that they touch [m].
 CUBE = 0.005

@@ -24,15 +24,15 @@ from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Secti
 from graspd_core.errors import ConfigError
 from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.shapes import object_hash, thing_name
+from graspd_core.mesh.shapes import object_hash
 from graspd_core.mesh.surface_queries import DistanceQuery, inside, make_distance_query, signed_distance
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_dataset.run_records import markdown_table, thing_name
 
 # Distances within which skin counts as touching [m]: the project's own, and two that others use.
 CONTACT_DISTANCES = (0.002, 0.005, 0.010)

@@ -21,16 +21,15 @@ from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Secti
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import thing_name
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import METRICS, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_dataset.complete_grasps import by_object, complete_grasps
 from graspd_dataset.foreign_grasps import ImportedGrasp, foreign_files, read_foreign
+from graspd_dataset.run_records import markdown_table, thing_name
 
 # Whose grasps, in the order of the table.
 SOURCES = {"imported": "imported", "ranked": "graspd, as ranked", "planned": "graspd, verified"}

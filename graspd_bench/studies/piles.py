@@ -27,7 +27,7 @@ from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import SHAPES, object_hash, thing_name
+from graspd_core.mesh.shapes import SHAPES, object_hash
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.cloud.camera import cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
@@ -37,11 +37,11 @@ from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.se3 import random_rotations, rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Posture, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings
 from graspd_core.verify.world import PROTOCOLS, FreeBody
+from graspd_dataset.run_records import markdown_table, thing_name
 
 # Things in a scene.
 SIZES, MOST_THINGS = (3, 5, 8, 12), 24

@@ -15,14 +15,13 @@ from jaxtyping import Float
 
 from graspd_bench.charts import figure, save
 from graspd_bench.study import ObjectCase, Picture, Record, Request, Sections, object_cases
-from graspd_core.mesh.shapes import thing_name
 from graspd_core.optimize.plan_config import method_row
 from graspd_core.perception.scene import object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Verdict
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
+from graspd_dataset.run_records import markdown_table, thing_name
 
 # Shapes whose grasps do not all survive an error of 5 mm and 5°.
 SHAPES = ("shape:box", "shape:plate", "shape:torus", "shape:bottle", "shape:l_block", "shape:hammer")

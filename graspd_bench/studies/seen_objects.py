@@ -23,7 +23,6 @@ from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import load_mesh, surface_samples
 from graspd_core.mesh.sdf import build_sdf
-from graspd_core.mesh.shapes import thing_name
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.scene import Obstacle, Scene, build_scene, object_parts
@@ -31,11 +30,11 @@ from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, GraspResult, Verdict
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.lift_trial import lift_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_dataset.run_records import markdown_table, thing_name
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
 # Cameras; 0 plans on the true mesh.

@@ -17,11 +17,10 @@ from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_availabl
 from graspd_bench.study import ObjectCase, Record, Request, Sections, all_shapes, object_cases, raw_grasps
 from graspd_bench.trials import build_frozen_world, displacement_trial
 from graspd_core.errors import ConfigError
-from graspd_core.mesh.shapes import thing_name
 from graspd_core.perception.scene import object_parts
-from graspd_core.runtime.records import markdown_table
 from graspd_core.verify.hold_trial import displaced, hold_trial, pose_error
 from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_dataset.run_records import markdown_table, thing_name
 
 # Seconds of each pull, in both simulators; MuJoCo tries the full length as well.
 PULL = 0.5

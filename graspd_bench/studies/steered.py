@@ -18,13 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from graspd_bench.study import ObjectCase, Record, Request, Sections, find_objects
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import thing_name
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.regions import Box, entered
 from graspd_core.planning.steering import Steering
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Grasp, Verdict
+from graspd_dataset.run_records import markdown_table, thing_name
 
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")

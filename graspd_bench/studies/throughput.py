@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases
-from graspd_core.mesh.shapes import SHAPES, thing_name
+from graspd_core.mesh.shapes import SHAPES
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.runtime.records import markdown_table
 from graspd_core.types import Verdict
+from graspd_dataset.run_records import markdown_table, thing_name
 
 THREADS = (1, 2)
 # Of the plan that goes before, with another seed, so that the object is known: its grid, parts and worlds are there.

@@ -212,7 +212,7 @@ ROBOT_DESCRIPTION = "robot_description"
 
 
 @dataclass(frozen=True)
-class MountEntry:
+class _MountEntry:
     """Where a hand's base link sits on the tip: position [m] and unit quaternion, w first."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -231,7 +231,7 @@ class ArmFile:
         name: of the arm; empty: the file's.
         seed: joint values by name; what is not named is in the middle of its limits [rad] or [m].
         limits: narrower limits by joint name, lower and upper [rad] or [m].
-        mounts: `MountEntry`s by the hand's name; other hands sit as their own description says.
+        mounts: `_MountEntry`s by the hand's name; other hands sit as their own description says.
     """
 
     urdf: str = ""
@@ -262,11 +262,11 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     path, entries = read_arm_file(name_or_path)
     urdf = path.parent / entries.urdf
     if not from_robot_description(entries):
-        return make_arm(entries, urdf, read_xml(urdf), str(path))
+        return _make_arm(entries, urdf, read_xml(urdf), str(path))
     if not robot_description:
         told = "is what the node hears at its start, where its parameter arm names this file; else name a file"
         raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} {told}")
-    return make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
+    return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
 
 
 def from_robot_description(entries: ArmFile) -> bool:
@@ -289,7 +289,7 @@ def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
     return path, entries
 
 
-def make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
+def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
     """The arm that a description makes of a URDF, whose elements are taken over. Raises: see `load_arm`."""
     _keep_chain(root, entries.base, entries.tip, where)
     chain = read_urdf(urdf, root)
@@ -332,12 +332,11 @@ def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
         welded = [c for c, j in joints.items() if above[c] == parent and j.get("type") == "fixed" and c not in kept]
         kept.update(welded)
         waiting += welded
-    dropped = {chain[-1], *links} - kept | {chain[-1]}
     for element in root.findall("link"):
         if element.get("name") not in kept:
             root.remove(element)
     for child, element in joints.items():
-        if child in dropped or child not in kept:
+        if child not in kept or child == chain[-1]:
             root.remove(element)
 
 
@@ -375,7 +374,7 @@ def _number(value: object) -> bool:
 
 
 def _mount(given: Any, tip: str, where: str) -> Mount:
-    entry = from_mapping(MountEntry, given, where)
+    entry = from_mapping(_MountEntry, given, where)
     length = float(np.linalg.norm(entry.quaternion_wxyz))
     if abs(length - 1.0) > 1e-2:
         raise ConfigError(f"{where}.quaternion_wxyz: a unit quaternion has length 1, not {length:.3g}")

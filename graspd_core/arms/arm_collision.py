@@ -117,7 +117,7 @@ def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "b
 
 
 def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    capsules = capsules_of_hand(hand)
+    capsules = _capsules_of_hand(hand)
     fingers = forward(make_kinematics(hand, dtype=joints.dtype), joints)
     base = links[:, arm.tip].compose(tip_hand(arm, hand))
     start, end, radius = placed(capsules, fingers)
@@ -126,8 +126,7 @@ def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tup
 
 # Hands and arms are hashed by identity.
 @lru_cache(maxsize=8)
-def capsules_of_hand(hand: HandModel) -> Capsules:
-    """A capsule about each solid of a hand."""
+def _capsules_of_hand(hand: HandModel) -> Capsules:
     return capsules_about(hand.primitives)
 
 
@@ -135,7 +134,8 @@ def capsules_of_hand(hand: HandModel) -> Capsules:
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
     """Capsules to hold against each other: no neighbours, none that touch in the seed posture."""
     group = arm.chain.link_group[arm.capsules.link]
-    above = np.array([_group_above(arm, g) for g in group.tolist()])
+    parent = arm.chain.link_parent[group]
+    above = np.where(parent < 0, -1, arm.chain.link_group[parent])
     first, second = np.triu_indices(len(group), 1)
     near = (group[first] == group[second]) | (above[first] == group[second]) | (above[second] == group[first])
     first, second = first[~near], second[~near]
@@ -143,11 +143,6 @@ def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]
     gap = segment_distance(start[first], end[first], start[second], end[second]) - radius[first] - radius[second]
     clear = (gap > 0).numpy()
     return first[clear], second[clear]
-
-
-def _group_above(arm: Arm, group: int) -> int:
-    parent = arm.chain.link_parent[group]
-    return -1 if parent < 0 else int(arm.chain.link_group[parent])
 
 
 @lru_cache(maxsize=8)

@@ -31,6 +31,9 @@ LIFT = 0.1
 STEPS = (5, 2, 5)
 # Rows of the way at the ends of these steps.
 STAGE_ROWS = (0, STEPS[0], STEPS[0] + STEPS[1], sum(STEPS))
+# How much each waypoint, by row, has of each stage: nearest neighbours blend on a line.
+_ALONG = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
+_SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 
 
 def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
@@ -58,14 +61,6 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
         for key in ("position", "quaternion_wxyz")
     )
     return position, quaternion
-
-
-def _shares() -> Float[np.ndarray, "way 4"]:
-    along = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
-    return np.maximum(1.0 - np.abs(along[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
-
-
-_SHARES = _shares()
 
 
 # No joint moves farther between two waypoints [rad].
@@ -183,7 +178,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     count = starts.shape[1]
     owner = torch.arange(len(starts)).repeat_interleave(count)
     solved = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
-    q, owner = nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
+    q, owner = _nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
     if not len(q):
         return q, owner
     hits = hits_of_support(arm, task.scene, task.base, placed(arm.capsules, arm_links(arm, q))[:2])
@@ -198,7 +193,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     return q[kept], owner[kept]
 
 
-def nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
+def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
     """The same postures with joints turned by full turns to where they are nearest to the seed within their limits."""
     turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)

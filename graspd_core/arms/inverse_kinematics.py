@@ -186,7 +186,9 @@ class StartTable:
 @lru_cache(maxsize=8)
 def start_table(arm: Arm) -> StartTable:
     """The table of an arm, made once; the same every time."""
-    q = _clear_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
+    q = random_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
+    hits = hits_of_self(arm, arm_links(arm, q))
+    q = q[(hits.depth <= 0).all(-1)] if hits.what else q
     links, shoulder = arm_links(arm, q), _shoulder(arm)
     tip, (start, end, _) = links[:, arm.tip], placed(arm.capsules, links)
     return StartTable(q, tip_features(tip), shoulder, _away(tip, shoulder), start, end)
@@ -209,12 +211,6 @@ def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[T
     half = np.where(arm.chain.slides, 0.5 * (arm.upper - arm.lower), np.minimum(0.5 * (arm.upper - arm.lower), np.pi))
     drawn = 2.0 * torch.rand(count, len(middle), generator=generator, dtype=torch.float64) - 1.0
     return torch.as_tensor(middle) + torch.as_tensor(half) * drawn
-
-
-def _clear_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[Tensor, "clear joints"]:
-    q = random_postures(arm, count, generator)
-    hits = hits_of_self(arm, arm_links(arm, q))
-    return q[(hits.depth <= 0).all(-1)] if hits.what else q
 
 
 def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:

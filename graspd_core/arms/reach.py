@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.arms.arm_paths import LIFT, ArmTask, arm_paths, make_task, tip_poses
@@ -15,7 +14,7 @@ from graspd_core.arms.inverse_kinematics import start_table, within_reach
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import drawn_back
 from graspd_core.hands.model import HandModel
-from graspd_core.optimize.restrictions import BoundRestriction, Refusal
+from graspd_core.optimize.restrictions import Allowed, BoundRestriction, JointRows, Places, Refusal, Turns
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Grasp
@@ -76,12 +75,7 @@ class BoundReach(BoundRestriction):
             f"{longest:.2f} m far"
         )
 
-    def starts(
-        self,
-        positions: Float[np.ndarray, "batch 3"],
-        quaternions: Float[np.ndarray, "batch 4"],
-        joints: Float[np.ndarray, "batch joints"],
-    ) -> Bool[np.ndarray, "batch"]:
+    def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Which initial poses are no farther away than the arm reaches, nor nearer; retreated and lifted ones too."""
         task, at = self.task, torch.as_tensor(positions)
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))

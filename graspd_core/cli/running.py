@@ -180,11 +180,7 @@ SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd
 
 
 def sibling(module: str) -> Any:
-    """Import a module of a package beside graspd_core.
-
-    Raises:
-        ConfigError: the package is not installed.
-    """
+    """Import a module of a package beside graspd_core. Raises ConfigError: the package is not installed."""
     package = module.partition(".")[0]
     if find_spec(package) is None:
         raise ConfigError(f"{package} is not installed; run: pip install graspd")

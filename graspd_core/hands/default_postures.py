@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.hands.fingers import (
@@ -101,7 +101,8 @@ def around_ball(
         optimiser.step()
     with torch.no_grad():
         final, values = cost(), posture().numpy()
-        best = int((final + _OVERLAP * torch.as_tensor(_worst_overlap(hand, values, *surface))).argmin())
+        overlap = np.where(_joined_links(hand), 0.0, link_overlaps(hand, values, *surface)).max(axis=(1, 2))
+        best = int((final + _OVERLAP * torch.as_tensor(overlap)).argmin())
         return values[best].copy(), goal.ball + fingers.length * shift[best].numpy()
 
 
@@ -133,16 +134,11 @@ def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
     return aside
 
 
-def _worst_overlap(
-    hand: HandModel,
-    q: Float[np.ndarray, "postures joints"],
-    points: Float[np.ndarray, "samples 3"],
-    links: Int[np.ndarray, "samples"],
-) -> Float[np.ndarray, "postures"]:
+def _joined_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
+    """Which links are welded to each other, or one joint apart."""
     groups = hand.link_group
     above = np.where(hand.link_parent >= 0, groups[np.maximum(hand.link_parent, 0)], -1)[groups]
-    joined = (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
-    return np.where(joined, 0.0, link_overlaps(hand, q, points, links)).max(axis=(1, 2))
+    return (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
 
 
 # Radii of the balls that fingertips close and open around, and the ball's distance from the palm, in finger lengths.
@@ -162,11 +158,7 @@ def default_palm(hand: HandModel) -> HandModel:
         names = ", ".join(hand.joint_names[joint] for joint in fingers.wrist)
         warnings.append(f"joints that carry the palm, left at zero: {names}; grasps are those of the palm there")
     return replace(
-        hand,
-        palm_center=_center(hand, fingers, normal),
-        palm_normal=normal,
-        approach=normal,
-        warnings=tuple(warnings),
+        hand, palm_center=_center(hand, fingers, normal), palm_normal=normal, approach=normal, warnings=tuple(warnings)
     )
 
 

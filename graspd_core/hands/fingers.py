@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.hands.kinematics import in_base, link_poses, point_jacobian
+from graspd_core.hands.kinematics import LinkNumbers, LinkPoints, LinkPoses, in_base, link_poses, point_jacobian
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import surface_points
 
@@ -65,7 +65,7 @@ def find_fingers(hand: HandModel) -> Fingers:
         while group > 0 and group not in solid:
             group = above[group]
         leaves.add(group)
-    leaves = {g for g in leaves if g > 0 and not any(_is_above(g, other, above) for other in leaves - {g})}
+    leaves = {g for g in leaves if g > 0 and not any(g in _chain(other, above)[1:] for other in leaves - {g})}
     chains = [_chain(leaf, above) for leaf in sorted(leaves)] or [[int(heads[-1]), 0]]
     palm = next(g for g in chains[0][1:] if all(g in chain for chain in chains))
     wrist = sorted({int(hand.link_joint[g]) for g in _chain(palm, above)[:-1]})
@@ -108,17 +108,9 @@ def _chain(group: int, above: dict[int, int]) -> list[int]:
     return chain
 
 
-def _is_above(group: int, other: int, above: dict[int, int]) -> bool:
-    return group in _chain(other, above)[1:]
-
-
 def _mates(
-    hand: HandModel,
-    points: Float[np.ndarray, "tips 3"],
-    links: Int[np.ndarray, "tips"],
-    straight: Float[np.ndarray, "tips 3"],
-    wrist: list[int],
-) -> tuple[Bool[np.ndarray, "tips"], Float[np.ndarray, "3"]]:
+    hand: HandModel, points: LinkPoints, links: LinkNumbers, straight: LinkPoints, wrist: list[int]
+) -> tuple[Bool[np.ndarray, "points"], Float[np.ndarray, "3"]]:
     """Which fingers point and bend the same way, and which way they bend; none and zero for a gripper."""
     q = straight_joints(hand)
     travel = 0.5 * (hand.lower + hand.upper) - q
@@ -150,11 +142,7 @@ def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 
 
 
 def _group_surface(
-    hand: HandModel,
-    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
-    group: int,
-    count: int,
-    rng: np.random.Generator,
+    hand: HandModel, poses: LinkPoses, group: int, count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "points 3"]:
     rotations, translations = poses
     solids = [solid for solid in hand.primitives if hand.link_group[solid.link] == group]

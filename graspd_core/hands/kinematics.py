@@ -12,12 +12,18 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh, joined
+
+# Joint values of one posture; points [m] and the link of each; `T_base_link` of every link, turns and origins [m].
+JointValues = Float[np.ndarray, "joints"]
+LinkPoints = Float[np.ndarray, "points 3"]
+LinkNumbers = Int[np.ndarray, "points"]
+LinkPoses = tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]]
 
 # From how far a hand comes to its pregrasp, straight along its approach [m].
 RETREAT = 0.1
@@ -150,10 +156,7 @@ def points_in_base(
 
 
 def point_jacobian(
-    hand: HandModel,
-    q: Float[np.ndarray, "joints"],
-    points: Float[np.ndarray, "points 3"],
-    links: Int[np.ndarray, "points"],
+    hand: HandModel, q: JointValues, points: LinkPoints, links: LinkNumbers
 ) -> Float[np.ndarray, "points 3 joints"]:
     """Geometric Jacobian of link-frame points, base frame, at one posture: `dx = J dq`, joint torques `τ = Σ Jᵀ f`.
 
@@ -163,7 +166,10 @@ def point_jacobian(
     rotation, translation = link_poses(hand, q)
     x = in_base((rotation, translation), points, links)
     jacobian = np.zeros((len(points), 3, hand.num_joints))
-    behind = _descendants(hand)
+    # Which link, by row, every other one hangs on.
+    behind = np.eye(hand.num_links, dtype=bool)
+    for link in range(1, hand.num_links):
+        behind[:, link] |= behind[:, hand.link_parent[link]]
     for link in np.flatnonzero(hand.link_joint >= 0):
         axis = rotation[link] @ hand.joint_axis[link]
         revolute = hand.joint_kind[link] == "revolute"
@@ -172,29 +178,16 @@ def point_jacobian(
     return jacobian
 
 
-def link_poses(
-    hand: HandModel, q: Float[np.ndarray, "joints"]
-) -> tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]]:
+def link_poses(hand: HandModel, q: JointValues) -> LinkPoses:
     """`T_base_link` of every link at one posture in float64 numpy [m]."""
     links = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q)[None].double())[0]
     return links.rotation.numpy(), links.translation.numpy()
 
 
-def in_base(
-    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
-    points: Float[np.ndarray, "points 3"],
-    links: Int[np.ndarray, "points"],
-) -> Float[np.ndarray, "points 3"]:
+def in_base(poses: LinkPoses, points: LinkPoints, links: LinkNumbers) -> LinkPoints:
     """Link-frame points in the base frame [m], at the poses that `link_poses` gives."""
     rotations, translations = poses
     return np.einsum("pij,pj->pi", rotations[links], points) + translations[links]
-
-
-def _descendants(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    behind = np.eye(hand.num_links, dtype=bool)
-    for link in range(1, hand.num_links):
-        behind[:, link] |= behind[:, hand.link_parent[link]]
-    return behind
 
 
 def drawn_back(
@@ -241,7 +234,7 @@ def _coefficients(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     return constant, sine, cosine, slide
 
 
-def hand_mesh(hand: HandModel, q: Float[np.ndarray, "joints"]) -> TriangleMesh:
+def hand_mesh(hand: HandModel, q: JointValues) -> TriangleMesh:
     """Every collision primitive at joint values q, base frame [m]: closed bodies that overlap, not one solid.
 
     Curved faces are inscribed, with vertices on the true surface.

@@ -23,13 +23,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.se3 import SE3, safe_norm
 
+# Points, and a distance of each; a size of a solid, one for all points or one for each [m].
+_Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
+_Length = float | Float[Tensor, "*#batch"]
 # Primitives of which planes and bounds are remembered: those of the most crowded hand.
 _MOST = 2048
 
 
-def primitive_sdf(primitive: Primitive, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
     """Signed distance [m] of points in the link's frame to one primitive."""
     rotation, translation = (torch.as_tensor(a).to(points) for a in (primitive.rotation, primitive.translation))
     local = (points - translation) @ rotation
@@ -92,48 +96,39 @@ def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 @lru_cache(maxsize=_MOST)
 def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Float[np.ndarray, "planes"]]:
     """Distinct face planes `n·x = d` of a hull in its own frame: outward unit normals and offsets [m]."""
-    a, b, c = (primitive.vertices[primitive.faces[:, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
+    cross = scaled_normals(primitive.vertices, primitive.faces)
     area = np.linalg.norm(cross, axis=1)
     keep = area > 1e-14
     normals = cross[keep] / area[keep, None]
-    planes = np.column_stack([normals, (normals * a[keep]).sum(1)])
+    planes = np.column_stack([normals, (normals * primitive.vertices[primitive.faces[keep, 0]]).sum(1)])
     # Coplanar triangles of one facet make one plane (rounded to 1e-9, far below what a mesh file resolves).
     planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
     return planes[:, :3], planes[:, 3]
 
 
-def sphere_sdf(points: Float[Tensor, "*batch 3"], radius: float | Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+def sphere_sdf(points: _Places, radius: _Length) -> _Distances:
     """Distance [m] to a sphere about the origin."""
     return safe_norm(points) - radius
 
 
-def capsule_sdf(
-    points: Float[Tensor, "*batch 3"],
-    radius: float | Float[Tensor, "*#batch"],
-    half_length: float | Float[Tensor, "*#batch"],
-) -> Float[Tensor, "*batch"]:
+def capsule_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
     """Distance [m] to a capsule along z: all points within `radius` of the segment |z| ≤ `half_length`."""
     z = points[..., 2]
     beyond = z.sign() * (z.abs() - half_length).clamp_min(0.0)
     return safe_norm(torch.cat([points[..., :2], beyond[..., None]], -1)) - radius
 
 
-def box_sdf(points: Float[Tensor, "*batch 3"], half_extents: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch"]:
+def box_sdf(points: _Places, half_extents: Float[Tensor, "*#batch 3"]) -> _Distances:
     """Distance [m] to an axis-aligned box about the origin."""
     return corner_sdf(points.abs() - half_extents)
 
 
-def cylinder_sdf(
-    points: Float[Tensor, "*batch 3"],
-    radius: float | Float[Tensor, "*#batch"],
-    half_length: float | Float[Tensor, "*#batch"],
-) -> Float[Tensor, "*batch"]:
+def cylinder_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
     """Distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
     return corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
 
 
-def corner_sdf(past: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
     """Return the distance [m] to a corner of `n` orthogonal faces, from the signed distances past each face."""
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
 
@@ -235,10 +230,7 @@ def _to_solids(
 
 
 def pair_distance(
-    solids: CollisionTensors,
-    links: SE3,
-    points: Float[Tensor, "batch pairs 3"],
-    which: Int[Tensor, "batch pairs"],
+    solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch pairs 3"], which: Int[Tensor, "batch pairs"]
 ) -> Float[Tensor, "batch pairs"]:
     """Signed distance [m] of base-frame points each to one solid."""
     rows = torch.arange(len(points), device=points.device)[:, None]
@@ -247,16 +239,12 @@ def pair_distance(
     return local_distance(solids, local, which)
 
 
-def local_distance(
-    solids: CollisionTensors, local: Float[Tensor, "*batch 3"], which: Int[Tensor, "*batch"]
-) -> Float[Tensor, "*batch"]:
+def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, "*batch"]) -> _Distances:
     """Signed distance [m] of points in the frame of a solid to it, each to one."""
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 
-def _distance(
-    local: Float[Tensor, "*batch 3"], core: Tensor, radius: Tensor, is_round: Tensor
-) -> Float[Tensor, "*batch"]:
+def _distance(local: _Places, core: Tensor, radius: Tensor, is_round: Tensor) -> _Distances:
     reach = local.abs()
     radial = safe_norm(reach[..., :2])
     x = torch.where(is_round > 0, radial, reach[..., 0])

@@ -183,6 +183,14 @@ class HandModel:
         return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
 
     @cached_property
+    def link_joint_names(self) -> tuple[str, ...]:
+        """Name of the joint that moves each link against its parent, coupled ones too; empty where none does."""
+        names = [self.joint_names[joint] if joint >= 0 else "" for joint in self.link_joint.tolist()]
+        for mimic in self.mimics:
+            names[mimic.link] = mimic.name
+        return tuple(names)
+
+    @cached_property
     def link_multiplier(self) -> Float[np.ndarray, "links"]:
         """Travel of each link's own joint for one radian or metre of `link_joint`: one where it is that joint."""
         multiplier = np.ones(self.num_links)
@@ -216,21 +224,10 @@ class HandModel:
 
 def all_joint_names(hand: HandModel) -> tuple[str, ...]:
     """Names of all movable joints, coupled ones too, in depth-first order: what goes to files and messages."""
-    return tuple(name for name, _, _, _ in _movable(hand))
+    return tuple(name for name in hand.link_joint_names if name)
 
 
 def all_joint_positions(hand: HandModel, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "movable"]:
     """Values of `all_joint_names` at actuated values q [rad] or [m]."""
-    return np.array([multiplier * q[joint] + offset for _, joint, multiplier, offset in _movable(hand)])
-
-
-def _movable(hand: HandModel) -> list[tuple[str, int, float, float]]:
-    """Name, actuated joint, multiplier and offset of every movable joint, in the order of their links."""
-    coupled = {mimic.link: mimic for mimic in hand.mimics}
-    rows: list[tuple[str, int, float, float]] = []
-    for link, joint in enumerate(hand.link_joint.tolist()):
-        if link in coupled:
-            rows.append((coupled[link].name, joint, coupled[link].multiplier, coupled[link].offset))
-        elif joint >= 0:
-            rows.append((hand.joint_names[joint], joint, 1.0, 0.0))
-    return rows
+    moved = hand.link_joint >= 0
+    return hand.link_multiplier[moved] * q[hand.link_joint[moved]] + hand.link_shift[moved]

@@ -7,7 +7,7 @@ uniform by area. Feature points are what a sparse random set misses: edges, corn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
@@ -16,14 +16,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import HandError
-from graspd_core.hands.kinematics import in_base, link_poses
+from graspd_core.hands.kinematics import LinkNumbers, LinkPoses, in_base, link_poses
 from graspd_core.hands.link_distance import primitive_sdf, within_bounds
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.mesh.convex_parts import even_directions
 from graspd_core.mesh.sharp_features import farthest_first
 from graspd_core.mesh.surface_queries import closest_points, make_surface
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.runtime import disk_cache as cache
 
 Points = Float[np.ndarray, "points 3"]
+# Points in link frames [m], the link of each, and the area that each stands for [m²].
+Samples = tuple[Points, LinkNumbers, Float[np.ndarray, "points"]]
 
 
 def primitive_area(primitive: Primitive) -> float:
@@ -37,7 +41,7 @@ def primitive_area(primitive: Primitive) -> float:
         return 4.0 * np.pi * size[0] * (size[0] + size[1])
     if primitive.kind == "cylinder":
         return 2.0 * np.pi * size[0] * (size[0] + 2.0 * size[1])
-    return float(_triangle_areas(primitive).sum())
+    return 0.5 * float(np.linalg.norm(scaled_normals(primitive.vertices, primitive.faces), axis=1).sum())
 
 
 def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[Points, Points]:
@@ -68,12 +72,9 @@ def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points
 
 
 def outermost(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
-    """The points that lie farthest out along `count` directions, which are spread evenly on a golden spiral."""
-    index = np.arange(count) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * index / count), np.pi * (1 + 5**0.5) * index
-    rays = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
+    """The points that lie farthest out along `count` directions, which are spread evenly."""
     # By parts: a fine mesh has a hundred thousand points.
-    parts = np.array_split(rays, -(-count // 64), axis=1)
+    parts = np.array_split(even_directions(count), -(-count // 64), axis=1)
     return points[np.unique(np.concatenate([(points @ part).argmax(0) for part in parts]))]
 
 
@@ -117,17 +118,12 @@ def _round(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[
 
 
 def _hull(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[Points, Points]:
-    areas = _triangle_areas(primitive)
+    areas = np.linalg.norm(scaled_normals(primitive.vertices, primitive.faces), axis=1)
     chosen = primitive.faces[rng.choice(len(areas), size=count, p=areas / areas.sum())]
     a, b, c = (primitive.vertices[chosen[:, i]] for i in range(3))
     u, v = rng.uniform(size=(2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a + u * (b - a) + v * (c - a), _unit(np.cross(b - a, c - a))
-
-
-def _triangle_areas(primitive: Primitive) -> Float[np.ndarray, "faces"]:
-    a, b, c = (primitive.vertices[primitive.faces[:, i]] for i in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def _box_edges(half: Float[np.ndarray, "3"], spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
@@ -207,9 +203,7 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
     return replace(hand, **kept(hand, f"candidates-{count}", 1, shapes, build))
 
 
-def candidates(
-    hand: HandModel, count: int, seed: int
-) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"], Int[np.ndarray, "count"]]:
+def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, LinkNumbers]:
     """Evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
 
     Corners of boxes that face the grasp are always in, since they are what sinks in unnoticed; then farthest-point
@@ -231,12 +225,7 @@ def candidates(
     picked = _farthest(placed, groups, weights, corners, count)
     # Sampled once more among themselves, so that the first few of them are not the corners alone.
     picked = picked[_farthest(placed[picked], groups[picked], weights[picked], np.zeros(0, int), count)]
-    return _on_skin(hand, pool.take(picked))
-
-
-def _on_skin(
-    hand: HandModel, pool: _Pool
-) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"], Int[np.ndarray, "count"]]:
+    pool = pool.take(picked)
     points, normals = pool.points.copy(), pool.normals.copy()
     for link, skin in hand.skins:
         own = pool.links == link
@@ -244,9 +233,7 @@ def _on_skin(
     return points, normals, pool.links
 
 
-def dense_samples(
-    hand: HandModel, *, count: int = 4000, seed: int = 1
-) -> tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"], Float[np.ndarray, "samples"]]:
+def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Samples:
     """At least `count` random points of the outer surface for judging: points in link frames [m], links, areas [m²].
 
     Independent of the candidates. The areas sum to the area of the hand's outer surface.
@@ -264,9 +251,7 @@ def dense_samples(
     return pool.points, pool.links, pool.areas
 
 
-def kept_dense_samples(
-    hand: HandModel, *, count: int, seed: int
-) -> tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"], Float[np.ndarray, "samples"]]:
+def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
     """`dense_samples`, remembered on disk by the hand's content."""
 
     def build() -> dict[str, np.ndarray]:
@@ -298,33 +283,29 @@ def kept(
     return cache.remember(f"hand-{content}-{what}", build, valid)
 
 
+def _pool(
+    hand: HandModel, parts: Sequence[tuple[np.ndarray, ...]], areas: np.ndarray, corner: Bool[np.ndarray, "points"]
+) -> _Pool:
+    """The points and normals of each of the hand's primitives together."""
+    points, normals = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    counts = [len(part[0]) for part in parts]
+    links, source = np.repeat([p.link for p in hand.primitives], counts), np.repeat(np.arange(len(counts)), counts)
+    return _Pool(points, normals, links, source, areas, corner)
+
+
 def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool:
     areas = np.array([primitive_area(p) for p in hand.primitives])
     # A few for the smallest solid too, but not thousands because there are thousands of solids.
     least = np.clip(count // len(areas), 1, 8)
     counts = np.maximum(least, np.ceil(count * areas / areas.sum())).astype(int)
     parts = [surface_points(p, int(n), rng) for p, n in zip(hand.primitives, counts, strict=True)]
-    return _Pool(
-        points=np.concatenate([points for points, _ in parts]),
-        normals=np.concatenate([normals for _, normals in parts]),
-        links=np.repeat([p.link for p in hand.primitives], counts),
-        source=np.repeat(np.arange(len(counts)), counts),
-        areas=np.repeat(areas / counts, counts),
-        corner=np.zeros(counts.sum(), dtype=bool),
-    )
+    return _pool(hand, parts, np.repeat(areas / counts, counts), np.zeros(counts.sum(), dtype=bool))
 
 
 def _feature_pool(hand: HandModel) -> _Pool:
     parts = [feature_points(p, spacing=0.004) for p in hand.primitives]
-    counts = [len(points) for points, _, _ in parts]
-    pool = _Pool(
-        points=np.concatenate([part[0] for part in parts]),
-        normals=np.concatenate([part[1] for part in parts]),
-        links=np.repeat([p.link for p in hand.primitives], counts),
-        source=np.repeat(np.arange(len(counts)), counts),
-        areas=np.zeros(sum(counts)),
-        corner=np.concatenate([part[2] for part in parts]),
-    )
+    corner = np.concatenate([part[2] for part in parts])
+    pool = _pool(hand, parts, np.zeros(len(corner)), corner)
     # Of thousands of solids no more than can be looked at: every so many-th, so that all have their share.
     total = len(pool.points)
     return pool if total <= _MOST_FEATURES else pool.take(np.linspace(0, total - 1, _MOST_FEATURES).astype(int))
@@ -374,11 +355,7 @@ def _by_group(hand: HandModel) -> dict[int, list[tuple[int, Primitive]]]:
     return found
 
 
-def _distance(
-    poses: tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]],
-    primitive: Primitive,
-    points: Float[np.ndarray, "points 3"],
-) -> Float[np.ndarray, "points"]:
+def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[np.ndarray, "points"]:
     """Signed distance [m] of base-frame points to one primitive, at one posture; infinite off its bounds."""
     rotations, translations = poses
     local = (points - translations[primitive.link]) @ rotations[primitive.link]
@@ -432,12 +409,8 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
 
 
 def _farthest(
-    points: Float[np.ndarray, "points 3"],
-    groups: Int[np.ndarray, "points"],
-    weights: Float[np.ndarray, "points"],
-    chosen: Int[np.ndarray, "seeds"],
-    count: int,
-) -> Int[np.ndarray, "count"]:
+    points: Points, groups: LinkNumbers, weights: Float[np.ndarray, "points"], chosen: np.ndarray, count: int
+) -> Int[np.ndarray, "picked"]:
     """Farthest-point sampling of weighted distances; points of different groups are infinitely far from each other."""
     members = {group: np.flatnonzero(groups == group) for group in np.unique(groups)}
 

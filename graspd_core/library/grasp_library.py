@@ -75,10 +75,11 @@ class LibraryEntry:
 
 def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") -> LibraryEntry:
     """The entry of an object as it was loaded."""
-    file = target.source.startswith(SHAPE_PREFIX) or Path(target.source).is_file()
-    source = absolute(target.source) if file else ""
+    shape = target.source.startswith(SHAPE_PREFIX)
+    source = absolute(target.source) if shape or Path(target.source).is_file() else ""
+    called = target.source.removeprefix(SHAPE_PREFIX) if shape else Path(target.source).stem
     return LibraryEntry(
-        name=name or entry_name(target.source, target.scale),
+        name=name or (called if target.scale == 1.0 else f"{called}@{target.scale:g}"),
         source=source,
         file_sha256=source_hash(source) if source else "",
         mesh_sha256=target.sha256,
@@ -89,12 +90,6 @@ def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") 
         hand=hand.name,
         hand_content=hand_hash(hand),
     )
-
-
-def entry_name(source: str, scale: float) -> str:
-    """What an object of a file or a shape is called: mug, or mug@0.5."""
-    stem = source.removeprefix(SHAPE_PREFIX) if source.startswith(SHAPE_PREFIX) else Path(source).stem
-    return stem if scale == 1.0 else f"{stem}@{scale:g}"
 
 
 def absolute(source: str) -> str:

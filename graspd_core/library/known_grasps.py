@@ -81,7 +81,9 @@ def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, phys
     if not called:
         names = library.names()
         shown = (difflib.get_close_matches(name, names, _MOST_NAMED) or names)[:_MOST_NAMED]
-        raise ConfigError(f"{name[:128]!r} is not in the library {library.path}; it has {_listed(shown, names)}")
+        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
+        told = f"{', '.join(shown) or 'none'}{more}"
+        raise ConfigError(f"{name[:128]!r} is not in the library {library.path}; it has {told}")
     same = _with_hand(library, hand, called, name)
     if len({entry.mesh_sha256 for entry in same}) > 1:
         sources = ", ".join(sorted({entry.source for entry in same}))
@@ -143,11 +145,7 @@ def _with_hand(
 
 
 def _held_entry(
-    library: GraspLibrary,
-    entries: Sequence[LibraryEntry],
-    others: Sequence[LibraryEntry],
-    what: str,
-    physics: Physics,
+    library: GraspLibrary, entries: Sequence[LibraryEntry], others: Sequence[LibraryEntry], what: str, physics: Physics
 ) -> LibraryEntry:
     enough = strict_enough(entries, physics.verify)
     if enough:
@@ -161,11 +159,6 @@ def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
         f"{entry.source}: the mesh has changed since {entry.name} came into the library {library.path}; build it again "
         f"with `graspd library build {entry.source} --out {library.path}`, or put the old file back"
     )
-
-
-def _listed(shown: Sequence[str], names: Sequence[str]) -> str:
-    more = len(names) - len(shown)
-    return (", ".join(shown) or "none") + (f" and {more} more" if more else "")
 
 
 # Where hand or object is nearer to something than this [m], a grasp is tried again.
@@ -313,7 +306,9 @@ def _held(
     scene, far = near_scene(scene)
     near = [moved_grasp(grasp, -far) for grasp in grasps]
     gaps = clearance(scene, hand, near)
-    gaps = np.minimum(gaps, NEAR / 2) if _hemmed_in(scene) else gaps
+    vertices = torch.as_tensor(scene.object.mesh.vertices)
+    if any(float(sample_sdf(o.sdf, vertices.to(o.sdf.field))[0].min()) < NEAR for o in scene.obstacles):
+        gaps = np.minimum(gaps, NEAR / 2)
     # Those that need no trial come first.
     for index in np.argsort(gaps < NEAR, kind="stable"):
         grasp, gap = grasps[index], gaps[index]
@@ -348,11 +343,6 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
     ways = [("pregrasp", "grasp"), ("grasp", "squeeze")]
     gaps = [gap_on_the_way(obstacles, kinematics, ends(a), ends(b), NEAR) for a, b in ways]
     return torch.stack(gaps).amin(0).numpy()
-
-
-def _hemmed_in(scene: Scene) -> bool:
-    vertices = torch.as_tensor(scene.object.mesh.vertices)
-    return any(float(sample_sdf(o.sdf, vertices.to(o.sdf.field))[0].min()) < NEAR for o in scene.obstacles)
 
 
 def _rows(values: Sequence[np.ndarray]) -> torch.Tensor:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.types import TriangleMesh
 
 # A piece is tiny below this share of the extent of the piece with the most area, and what stays must hold this share of
@@ -31,7 +32,7 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     if count == 1:
         return mesh, 0
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
     area = np.bincount(piece, weights=area)
     extent = _extents(corners, piece)
     tiny = extent < TINY * extent[area.argmax()]
@@ -101,7 +102,7 @@ def _points(
     """Corners of all faces and points spread over them by area, and the piece that each is of."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
     chosen = rng.choice(len(area), _SAMPLES, p=area / area.sum())
     spread = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), _SAMPLES), corners[chosen])
     used, first = np.unique(mesh.faces, return_index=True)

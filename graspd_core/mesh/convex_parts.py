@@ -200,13 +200,9 @@ def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> 
 def _bulges_between(sdf: GridSDF, one: Points, others: list[Points]) -> Float[np.ndarray, "_"]:
     if not others:
         return np.zeros(0)
-    first, *rest = (_few(points) for points in (one, *others))
+    first, *rest = (_evenly(points, PAIRED_POINTS)[:, None] for points in (one, *others))
     middles = (first[:, None] + np.array(rest)[:, None]) / 2
     return np.quantile(_outside(sdf, middles.reshape(-1, 3)).reshape(len(rest), -1), PAIRED_QUANTILE, axis=1)
-
-
-def _few(points: Points) -> Float[np.ndarray, "few 1 3"]:
-    return points[np.linspace(0, len(points) - 1, PAIRED_POINTS).astype(int), None]
 
 
 def _bulge(sdf: GridSDF, cluster: Points) -> float:
@@ -251,9 +247,18 @@ def _outside(sdf: GridSDF, points: Points) -> Float[np.ndarray, "_"]:
 
 
 def _thin(points: Points, most: int) -> Points:
-    if len(points) <= most:
-        return points
-    return points[np.linspace(0, len(points) - 1, most).astype(int)]
+    return points if len(points) <= most else _evenly(points, most)
+
+
+def _evenly(points: Points, count: int) -> Float[np.ndarray, "count 3"]:
+    return points[np.linspace(0, len(points) - 1, count).astype(int)]
+
+
+def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
+    """Unit directions spread evenly on a golden spiral, a column each."""
+    turn = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * turn / count), np.pi * (1 + 5**0.5) * turn
+    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
@@ -264,10 +269,7 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
     corners = points[hull.vertices]
     if len(corners) > most:
         corners = _thin(corners, CHOICE * most)
-        turn = np.arange(most // 2) + 0.5
-        polar, azimuth = np.arccos(1 - 2 * turn / len(turn)), np.pi * (1 + 5**0.5) * turn
-        rays = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
-        chosen = set((corners @ rays).argmax(0).tolist())
+        chosen = set((corners @ even_directions(most // 2)).argmax(0).tolist())
         while len(chosen) < most:
             found = _hull(corners[sorted(chosen)])
             if found is None:

@@ -17,20 +17,10 @@ from jaxtyping import Float
 from torch.quasirandom import SobolEngine
 
 from graspd_core.errors import MeshError
+from graspd_core.mesh import topology
 from graspd_core.mesh.collada import read_dae
 from graspd_core.mesh.components import drop_small_components, face_components
 from graspd_core.mesh.surface_queries import winding_inside
-from graspd_core.mesh.topology import (
-    drop_degenerate,
-    drop_repeated,
-    drop_strays,
-    far_centre,
-    is_closed,
-    is_oriented,
-    merge_vertices,
-    moved_mesh,
-    orient,
-)
 from graspd_core.types import TriangleMesh
 
 # The largest extent that a mesh may have [m]: what lies outside is a mistake of units, not a thing to grasp.
@@ -171,7 +161,8 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     mesh, warnings = _without_strays(TriangleMesh(vertices, faces), str(path))
     # Those of an OBJ its reader has left out without a word.
     warnings += _strays_told(str(path), named - len(vertices))
-    if text and not text.endswith((b"\n", b"\r")) and _is_open(mesh):
+    torn = text and not text.endswith((b"\n", b"\r")) and np.ptp(mesh.vertices, axis=0).max() < 1e6
+    if torn and not topology.is_closed(TriangleMesh(*topology.merge_vertices(mesh))):
         warnings += (f"{path}: the last line has no end and the surface is not closed: the file may be cut off",)
     return TriangleMesh(mesh.vertices * scale, mesh.faces), warnings
 
@@ -223,13 +214,13 @@ def check_mesh(
         if small:
             warnings.append(f"{source}: dropped {small} tiny pieces that float clear of the rest")
     faces = mesh.faces
-    if not is_oriented(faces):
-        faces = orient(mesh.vertices, faces)
+    if not topology.is_oriented(faces):
+        faces = topology.orient(mesh.vertices, faces)
         warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
     # Simplifying can tear a surface; that is no fault of the input, and the winding number bears it.
-    if not is_closed(clean) and not is_closed(given):
+    if not topology.is_closed(clean) and not topology.is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
     return clean, (*_doubted_size(clean, source, scale), *warnings)
 
@@ -263,12 +254,12 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
     Exact for one closed, consistently wound body; otherwise summed over points where the winding number says
     inside (about 1 % of volume). A surface that encloses nothing counts as a solid of its bounding box.
     """
-    far = far_centre(mesh.vertices)
+    far = topology.far_centre(mesh.vertices)
     if far.any():
         # Moments about the origin would lose all digits.
-        volume, centre, inertia = mass_properties(moved_mesh(mesh, -far))
+        volume, centre, inertia = mass_properties(topology.moved_mesh(mesh, -far))
         return volume, centre + far, inertia
-    if is_closed(mesh) and is_oriented(mesh.faces) and not face_components(mesh).any():
+    if topology.is_closed(mesh) and topology.is_oriented(mesh.faces) and not face_components(mesh).any():
         return _solid_moments(mesh)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     # A flat sheet still needs a box of some thickness for its inertia to be positive.
@@ -285,14 +276,13 @@ def surface_samples(
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
     """Points spread evenly by area, and the unit normals of their faces."""
     rng = np.random.default_rng(seed)
-    corners = mesh.vertices[mesh.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = topology.scaled_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(cross, axis=1)
     # One point per equal slice of the total area: as random as needed, with far fewer gaps than independent draws.
     slices = (np.arange(count) + rng.random(count)) / count * area.sum()
     chosen = np.minimum(np.searchsorted(np.cumsum(area), slices), len(area) - 1)
     root, along = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
-    a, b, c = corners[chosen].transpose(1, 0, 2)
+    a, b, c = mesh.vertices[mesh.faces[chosen]].transpose(1, 0, 2)
     points = (1 - root) * a + root * ((1 - along) * b + along * c)
     return points, cross[chosen] / np.maximum(area[chosen], 1e-300)[:, None]
 
@@ -333,7 +323,7 @@ def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tupl
         raise MeshError(f"{source}: empty mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces)")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise MeshError(f"{source}: faces name vertices outside 0 to {len(mesh.vertices) - 1}")
-    mesh, strays = drop_strays(mesh)
+    mesh, strays = topology.drop_strays(mesh)
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices).all(1)).sum())
         raise MeshError(f"{source}: {bad} of {len(mesh.vertices)} vertices are NaN or infinite")
@@ -342,10 +332,6 @@ def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tupl
 
 def _strays_told(source: str, strays: int) -> tuple[str, ...]:
     return (f"{source}: dropped {strays} stray vertices that no face uses",) if strays > 0 else ()
-
-
-def _is_open(mesh: TriangleMesh) -> bool:
-    return bool(np.ptp(mesh.vertices, axis=0).max() < 1e6) and not is_closed(TriangleMesh(*merge_vertices(mesh)))
 
 
 def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
@@ -363,9 +349,9 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
     """Coincident vertices merged and degenerate and repeated faces dropped, and how many of each."""
-    vertices, faces = merge_vertices(mesh)
-    distinct = drop_degenerate(vertices, faces)
-    unique = drop_repeated(distinct)
+    vertices, faces = topology.merge_vertices(mesh)
+    distinct = topology.drop_degenerate(vertices, faces)
+    unique = topology.drop_repeated(distinct)
     if len(unique) == 0:
         raise MeshError(f"{source}: no face has an area; a triangle mesh with a surface is needed")
     return TriangleMesh(vertices, unique), len(faces) - len(distinct), len(distinct) - len(unique)

@@ -21,6 +21,9 @@ from graspd_core.mesh.topology import is_closed
 from graspd_core.se3 import EPSILON, safe_norm
 from graspd_core.types import TriangleMesh
 
+# A vector, and a length, of each node [m].
+_Vectors, _Lengths = Float[np.ndarray, "3 x y z"], Float[np.ndarray, "x y z"]
+
 # Nearer to the surface than this share of a cell, the direction to it is rounding noise: the face's normal is taken.
 NEAR_SURFACE = 1e-3
 
@@ -152,9 +155,7 @@ def is_solid(sdf: GridSDF) -> bool:
     return bool((sdf.field[0] < 0).any())
 
 
-def _closest_to_nodes(
-    surface: Surface, nodes: Float[np.ndarray, "3 x y z"], spacing: float
-) -> tuple[Float[np.ndarray, "3 x y z"], Float[np.ndarray, "3 x y z"]]:
+def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tuple[_Vectors, _Vectors]:
     """Points of the surface, exactly the closest ones within `BAND`, and the normals of their faces, zero beyond it.
 
     The middle node of each block is exact too. Its distance less the way to a node bounds the node's distance from
@@ -180,9 +181,7 @@ def _closest_to_nodes(
     return closest, normals
 
 
-def _sweep(
-    nodes: Float[np.ndarray, "3 x y z"], closest: Float[np.ndarray, "3 x y z"], squared: Float[np.ndarray, "x y z"]
-) -> None:
+def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
     """Give each node, in place, the point of its neighbour where that is nearer to it, along each axis and back."""
     for axis in range(3):
         # Views with this axis first: what is written to them is written to the arrays.
@@ -196,9 +195,7 @@ def _sweep(
             best[here][nearer] = distance[nearer]
 
 
-def _inside(
-    mesh: TriangleMesh, nodes: Float[np.ndarray, "3 x y z"], distance: Float[np.ndarray, "x y z"], spacing: float
-) -> Bool[np.ndarray, "x y z"]:
+def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: float) -> Bool[np.ndarray, "x y z"]:
     """The nodes' side of the surface.
 
     Around a closed surface the winding number is constant wherever one can walk without crossing it, and two
@@ -223,10 +220,7 @@ def _inside(
 
 
 def _field(
-    offset: Float[np.ndarray, "3 x y z"],
-    normals: Float[np.ndarray, "3 x y z"],
-    inside: Bool[np.ndarray, "x y z"],
-    spacing: float,
+    offset: _Vectors, normals: _Vectors, inside: Bool[np.ndarray, "x y z"], spacing: float
 ) -> Float[np.ndarray, "4 x y z"]:
     """φ and its unit gradient (x − c)/φ; on the surface the gradient is the face's normal, turned outwards."""
     distance = _length(offset)

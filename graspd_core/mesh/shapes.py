@@ -1,8 +1,8 @@
-"""Authored test objects, each the size of something a hand picks up, with closed-form volumes.
+"""Authored test objects, each the size of something a hand picks up.
 
-Curved surfaces are tessellated with vertices on the true surface, so a mesh's volume is up to 1 % below the closed
-form. The mug (cup and handle) and the hammer (shaft and head) are overlapping closed bodies: their inside is where the
-winding number is not zero.
+Curved surfaces are tessellated with vertices on the true surface, so that a mesh has up to 1 % less volume. The mug
+(cup and handle) and the hammer (shaft and head) are overlapping closed bodies: their inside is where the winding number
+is not zero.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from itertools import pairwise
-from math import asin, pi, sqrt
+from math import pi
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -44,13 +42,6 @@ def make_shape(name: str) -> TriangleMesh:
     if name not in SHAPES:
         raise MeshError(f"unknown shape {name!r}; valid shapes: {', '.join(sorted(SHAPES))}")
     return SHAPES[name]()
-
-
-def shape_volume(name: str) -> float:
-    """Closed-form volume [m³] of an authored shape; overlaps count once. Raises MeshError for an unknown name."""
-    if name not in VOLUMES:
-        raise MeshError(f"unknown shape {name!r}; valid shapes: {', '.join(sorted(VOLUMES))}")
-    return VOLUMES[name]()
 
 
 def _sphere() -> TriangleMesh:
@@ -164,27 +155,6 @@ def _subdivide(mesh: TriangleMesh, times: int) -> TriangleMesh:
     return TriangleMesh(np.asarray(vertices), np.asarray(faces))
 
 
-def _mug_volume() -> float:
-    """Cup, half-ring handle, and the handle's two arms from the cup's outer wall to the bend.
-
-    An arm of width 2w is a box less the cylinder x² + y² < R²: ∫ (x_end − √(R² − y²)) dy over |y| < w.
-    """
-    r, h, wall, w = MUG_RADIUS, MUG_HALF, MUG_WALL, HANDLE_HALF_WIDTH
-    cup = pi * r**2 * 2 * h - pi * (r - wall) ** 2 * (2 * h - wall)
-    bend = pi / 2 * (HANDLE_OUTER**2 - HANDLE_INNER**2) * 2 * w
-    arm = (2 * w * HANDLE_ARM - (w * sqrt(r**2 - w**2) + r**2 * asin(w / r))) * (HANDLE_OUTER - HANDLE_INNER)
-    return cup + bend + 2 * arm
-
-
-def _bottle_volume() -> float:
-    parts = pairwise(BOTTLE_PROFILE)
-    return sum(pi / 3 * (z1 - z0) * (r0 * r0 + r0 * r1 + r1 * r1) for (r0, z0), (r1, z1) in parts)
-
-
-def _box_volume(half: tuple[float, float, float]) -> float:
-    return 8 * half[0] * half[1] * half[2]
-
-
 SHAPES: dict[str, Callable[[], TriangleMesh]] = {
     "sphere": _sphere,
     "box": lambda: _box(BOX_HALF),
@@ -198,27 +168,6 @@ SHAPES: dict[str, Callable[[], TriangleMesh]] = {
     "l_block": _l_block,
     "hammer": _hammer,
 }
-
-VOLUMES: dict[str, Callable[[], float]] = {
-    "sphere": lambda: 4 / 3 * pi * SPHERE_RADIUS**3,
-    "box": lambda: _box_volume(BOX_HALF),
-    "cylinder": lambda: pi * CYLINDER_RADIUS**2 * 2 * CYLINDER_HALF,
-    "capsule": lambda: pi * CAPSULE_RADIUS**2 * (2 * CAPSULE_HALF + 4 / 3 * CAPSULE_RADIUS),
-    "plate": lambda: _box_volume(PLATE_HALF),
-    "torus": lambda: 2 * pi**2 * TORUS_MAJOR * TORUS_MINOR**2,
-    "mug": _mug_volume,
-    "bowl": lambda: 2 / 3 * pi * (BOWL_RADIUS**3 - (BOWL_RADIUS - BOWL_WALL) ** 3),
-    "bottle": _bottle_volume,
-    "l_block": lambda: (L_LONG + L_SHORT - L_THICK) * L_THICK * 2 * L_HALF_WIDTH,
-    "hammer": lambda: _box_volume(HEAD_HALF) + pi * SHAFT_RADIUS**2 * (HEAD_LOW - SHAFT_LOW),
-}
-
-
-def thing_name(source: Any) -> str:
-    """What an object goes by: the shape, or the file without its ending; other values as they are."""
-    text = f"{source:g}" if isinstance(source, float) else str(source)
-    path = Path(text)
-    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def object_sources(sources: Sequence[str]) -> tuple[str, ...]:

@@ -12,8 +12,10 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import DistanceQuery, make_distance_query, signed_distance
-from graspd_core.mesh.topology import packed_rows
+from graspd_core.mesh.topology import packed_rows, scaled_normals
 from graspd_core.types import TriangleMesh
+
+Points = Float[np.ndarray, "n 3"]
 
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
@@ -25,9 +27,7 @@ THIN_WALLED = 0.6
 _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
-def sharp_points(
-    mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL
-) -> tuple[Float[np.ndarray, "points 3"], float]:
+def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL) -> tuple[Points, float]:
     """Evenly spread surface points [m] with less than a probe's depth of material below them.
 
     A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
@@ -47,18 +47,16 @@ def sharp_points(
     samples, sample_normals = surface_samples(mesh, pool // 6, seed)
     share = float(_is_thin(query, samples, sample_normals, 2 * _PROBE).mean())
     if share > THIN_WALLED:
-        walls = share * 0.5 * float(np.linalg.norm(_scaled_normals(mesh), axis=1).sum())
+        walls = share * 0.5 * float(np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1).sum())
         count = min(max(count, round(walls / _AREA_OF_POINT)), _MOST * count)
     return sharp[farthest_points(sharp, count)], share
 
 
-def _is_thin(
-    query: DistanceQuery, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], probe: float
-) -> Bool[np.ndarray, "n"]:
+def _is_thin(query: DistanceQuery, points: Points, normals: Points, probe: float) -> Bool[np.ndarray, "n"]:
     return -signed_distance(query, points - probe * normals) < (1 - _SHARP) * probe
 
 
-def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
+def farthest_points(points: Points, count: int) -> np.ndarray:
     """Indices of at most `count` points by farthest-point sampling, starting from the first."""
     if len(points) == 0:
         return np.zeros(0, dtype=int)
@@ -96,7 +94,7 @@ def farthest_first(
     return np.array(picked, dtype=np.int64)
 
 
-def neighbours_together(points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:
+def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
     """An order of points in which those that follow each other lie near each other, by halving along the widest side.
 
     Every sixteen from the first lie together, and so do any eight or four of them.
@@ -110,17 +108,12 @@ def neighbours_together(points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray
     return np.concatenate([first[neighbours_together(points[first])], rest[neighbours_together(points[rest])]])
 
 
-def _scaled_normals(mesh: TriangleMesh) -> Float[np.ndarray, "faces 3"]:
-    corners = mesh.vertices[mesh.faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
     """Vertices, points along edges, and surface samples, with normals: the places where something sharp may be.
 
     At most `size` of each.
     """
-    scaled = _scaled_normals(mesh)
+    scaled = scaled_normals(mesh.vertices, mesh.faces)
     vertex_normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(vertex_normals, mesh.faces[:, corner], scaled)

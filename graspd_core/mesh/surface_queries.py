@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from graspd_core.mesh.topology import cut_long_faces
+from graspd_core.mesh.topology import cut_long_faces, scaled_normals
 from graspd_core.types import TriangleMesh
 
 
@@ -139,8 +139,7 @@ def make_surface(mesh: TriangleMesh) -> Surface:
 
     vertices = np.ascontiguousarray(mesh.vertices, dtype=float)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    cross = np.cross(b - a, c - a)
+    cross = scaled_normals(vertices, faces)
     normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
     hierarchy = igl.AABB()
     hierarchy.init(vertices, faces)

@@ -63,10 +63,16 @@ def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     return TriangleMesh(mesh.vertices[used], number[mesh.faces]), int((~used).sum())
 
 
+def scaled_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"]:
+    """Normals of faces, as long as twice their area [m²]."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
+
+
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
     """The faces with an area (height above 1e-9 of the longest side)."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.linalg.norm(scaled_normals(vertices, faces), axis=1)
     longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
     return faces[area > 1e-9 * longest + 1e-30]
 

@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import QhullError
 from torch import Tensor
 
 from graspd_core.hands.fingers import find_fingers, placed_tips
 from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_kinematics, points_in_base
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.optimize.loop import Joints, Poses, Positions, Values
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
@@ -133,7 +135,9 @@ def _draw_pool(
     rotation = rotation_from_axis_angle(facing, _uniform(-np.pi, np.pi, count, generator)) @ rotation
     standoff = _uniform(*_PALM_STANDOFF, count, generator)
     grip = torch.as_tensor(hand.palm_center).repeat(count, 1)
-    joints = _open_joints(hand, count, generator)
+    lower, upper = torch.as_tensor(hand.lower), torch.as_tensor(hand.upper)
+    noise = _JOINT_NOISE * (torch.rand(count, len(lower), generator=generator, dtype=torch.float64) - 0.5)
+    joints = (torch.as_tensor(hand.open_posture) + noise * (upper - lower)).clamp(lower, upper)
     if fingertips:
         some = _uniform(0.0, 1.0, count, generator) < fingertips
         share = torch.where(some, _uniform(*_SHARE_CLOSED, count, generator), 0.0)[:, None]
@@ -147,13 +151,6 @@ def _draw_pool(
 
 def _uniform(low: float, high: float, count: int, generator: torch.Generator) -> Float[Tensor, "count"]:
     return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
-
-
-def _open_joints(hand: HandModel, count: int, generator: torch.Generator) -> Float[Tensor, "count joints"]:
-    spread = torch.as_tensor(hand.upper - hand.lower)
-    noise = _JOINT_NOISE * (torch.rand(count, len(spread), generator=generator, dtype=torch.float64) - 0.5)
-    joints = torch.as_tensor(hand.open_posture) + noise * spread
-    return joints.clamp(torch.as_tensor(hand.lower), torch.as_tensor(hand.upper))
 
 
 def _aimed(
@@ -271,17 +268,7 @@ def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
 
 def convex_hull(mesh: TriangleMesh) -> TriangleMesh:
     """Return the convex hull of a mesh, or the mesh if it is flat and has none."""
-    from scipy.spatial import ConvexHull, QhullError
-
     try:
-        hull = ConvexHull(mesh.vertices)
+        return hull_surface(mesh.vertices)
     except QhullError:
         return mesh
-    corners = hull.points[hull.simplices]
-    # Qhull leaves the winding to chance; its equations point outwards.
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = (normals * hull.equations[:, :3]).sum(-1) < 0
-    faces = hull.simplices.astype(np.int64)
-    faces[inward] = faces[inward][:, ::-1]
-    used, compact = np.unique(faces, return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))

@@ -16,13 +16,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graspd_core.hands.kinematics import RETREAT, Kinematics, drawn_back, forward, link_poses, place_points, placement
+from graspd_core.hands.kinematics import (
+    RETREAT,
+    Kinematics,
+    drawn_back,
+    forward,
+    in_base,
+    link_poses,
+    place_points,
+    placement,
+)
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.hands.surface_points import outermost
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.optimize.loop import Distances, Points, Poses, Values
-from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # Shares of the straight way from the retreat to the pregrasp at which the hand is looked at, and of that to the grasp.
@@ -64,8 +73,10 @@ def make_obstacle_tensors(
     scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype
 ) -> ObstacleTensors | None:
     """Lay the obstacles out as this hand meets them, None if it meets none. Kept for the last few scenes and hands."""
-    obstacles = [n for n in scene.obstacles if _in_reach(n, scene, hand)]
-    if scene.support is None and not obstacles:
+    vertices = torch.as_tensor(scene.object.mesh.vertices)
+    gaps = [float(sample_sdf(thing.sdf, vertices.to(thing.sdf.field))[0].min()) for thing in scene.obstacles]
+    reached = [thing for thing, gap in zip(scene.obstacles, gaps, strict=True) if gap < hand_reach(hand) + RETREAT]
+    if scene.support is None and not reached:
         return None
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -83,28 +94,19 @@ def make_obstacle_tensors(
         sphere_radii=tensor(sphere_radii),
         normal=None if scene.support is None else tensor(scene.support.normal),
         offset=0.0 if scene.support is None else scene.support.offset,
-        sdfs=tuple(n.sdf.to(device, dtype) for n in obstacles),
+        sdfs=tuple(n.sdf.to(device, dtype) for n in reached),
         approach=tensor(hand.approach),
     )
-
-
-def _in_reach(neighbour: Obstacle, scene: Scene, hand: HandModel) -> bool:
-    reach = hand_reach(hand) + RETREAT
-    gap, _ = sample_sdf(neighbour.sdf, torch.as_tensor(scene.object.mesh.vertices).to(neighbour.sdf.field))
-    return float(gap.min()) < reach
 
 
 def hand_reach(hand: HandModel) -> float:
     """Return the distance from the middle of the palm to the farthest point of the open hand [m]."""
     corners, radii, links = extreme_points(hand)
-    rotations, translations = link_poses(hand, hand.open_posture)
-    placed = np.einsum("pij,pj->pi", rotations[links], corners) + translations[links]
+    placed = in_base(link_poses(hand, hand.open_posture), corners, links)
     return float((np.linalg.norm(placed - hand.palm_center, axis=1) + radii).max())
 
 
-def extreme_points(
-    hand: HandModel,
-) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
+def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
     """Return points in link frames [m] and radii [m] of balls whose convex hull is each solid, and their links."""
     solids = extreme_points_of_solids(hand)
     points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)

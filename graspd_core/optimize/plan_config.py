@@ -88,11 +88,7 @@ def method_names() -> tuple[str, ...]:
 
 
 def method_row(name: Any, where: str = "config") -> Method:
-    """Return the row of a method.
-
-    Raises:
-        ConfigError: there is no such method.
-    """
+    """Return the row of a method. Raises ConfigError: there is no such method."""
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
         raise ConfigError(f"{where}.method: {shown(name)} is not one of {', '.join(method_names())}")
     if name not in METHODS:

@@ -159,6 +159,7 @@ def make_hand_tensors(
         members = _members(groups[:count], present)
         return PointSet(placement(hand.num_links, points, index(links)), index(links), index(members))
 
+    far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
     solids = make_collision_tensors(hand, device, dtype)
     same = hand.link_group[solids.link.cpu().numpy()][:, None] == of_link[first]
     place = np.where(same.any(1), same.argmax(1), len(present))
@@ -173,7 +174,7 @@ def make_hand_tensors(
         spheres=_sphere_tensors(hand, device, dtype),
         lower=tensor(hand.lower),
         upper=tensor(hand.upper),
-        pivot=tensor(_pivot(hand)),
+        pivot=tensor(hand.palm_center if far else np.zeros(3)),
         joint_scale=tensor(hand.joint_scale),
     )
 
@@ -212,11 +213,6 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
         length=scene.object.radius,
         confidence=confidence,
     )
-
-
-def _pivot(hand: HandModel) -> Float[np.ndarray, "3"]:
-    far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
-    return hand.palm_center if far else np.zeros(3)
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
@@ -349,13 +345,6 @@ def feature_distance(
     return pair_distance(problem.hand.solids, placed.links, in_base[rows, pairs // count], solids), solids
 
 
-def _nearest_of_group(
-    distance: Float[Tensor, "batch pairs"], groups: Int[Tensor, "batch pairs"], count: int
-) -> Float[Tensor, "batch groups"]:
-    start = distance.new_full((len(distance), count + 1), torch.inf)
-    return start.scatter_reduce(1, groups, distance, "amin")[:, :count]
-
-
 def _wrench_resistance(
     problem: Problem,
     points: Points,
@@ -403,7 +392,10 @@ def evaluate(
     if len(features):
         edge, solids = feature_distance(problem, features, placed)
         sunk = sunk + losses.penetration(edge, torch.zeros_like(radius))
-        gap = torch.minimum(gap, _nearest_of_group(edge, problem.hand.group_of_solid[solids], gap.shape[-1]))
+        # One place more, for solids without a group.
+        start = gap.new_full((len(gap), gap.shape[-1] + 1), torch.inf)
+        nearest = start.scatter_reduce(1, problem.hand.group_of_solid[solids], edge, "amin")
+        gap = torch.minimum(gap, nearest[:, :-1])
     return Terms(
         wrench_resistance=_wrench_resistance(
             problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)

@@ -21,6 +21,12 @@ from graspd_core.optimize.loop import Positions, Values
 from graspd_core.perception.scene import Obstacle, Scene, moved_grasp, moved_obstacle
 from graspd_core.types import Grasp
 
+# Initial poses as rows: origins of the base [m], unit quaternions wxyz, joint values; and which of them are allowed.
+Places = Float[np.ndarray, "batch 3"]
+Turns = Float[np.ndarray, "batch 4"]
+JointRows = Float[np.ndarray, "batch joints"]
+Allowed = Bool[np.ndarray, "batch"]
+
 
 @dataclass(frozen=True)
 class Roll:
@@ -109,12 +115,7 @@ class BoundRestriction:
         """What the search keeps the hand off, beside the scene's own obstacles. No trial knows of it."""
         return ()
 
-    def starts(
-        self,
-        positions: Float[np.ndarray, "batch 3"],
-        quaternions: Float[np.ndarray, "batch 4"],
-        joints: Float[np.ndarray, "batch joints"],
-    ) -> Bool[np.ndarray, "batch"]:
+    def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Return which initial poses may lead to an admissible grasp. Positions [m], unit quaternions wxyz."""
         return np.ones(len(positions), dtype=bool)
 
@@ -155,12 +156,7 @@ class BoundRestrictions:
         obstacles = tuple(moved_obstacle(o, -self.origin) for one in self.each for o in one.obstacles)
         return replace(scene, obstacles=(*scene.obstacles, *obstacles)) if obstacles else scene
 
-    def starts(
-        self,
-        positions: Float[np.ndarray, "batch 3"],
-        quaternions: Float[np.ndarray, "batch 4"],
-        joints: Float[np.ndarray, "batch joints"],
-    ) -> Bool[np.ndarray, "batch"]:
+    def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Return which initial poses all restrictions allow. What one forbids is not shown to the next."""
         allowed = np.ones(len(positions), dtype=bool)
         for one in self.each:

@@ -66,7 +66,8 @@ def make_obstacles(
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
         whole = _obstacle(seen, support, settings.padding)
-        if not _swallows(whole, target, settings.padding):
+        at = torch.as_tensor(target.vertices).to(whole.sdf.field)
+        if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
             found.append(whole)
             continue
         # A tray, a box or a ring about the object: its hull is no obstacle but the object's own place.
@@ -78,11 +79,6 @@ def make_obstacles(
 def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle:
     mesh = padded_hull(points, support, padding)
     return Obstacle(mesh, build_sdf(mesh, resolution=GRID_RESOLUTION, padding=0.02))
-
-
-def _swallows(neighbour: Obstacle, target: TriangleMesh, padding: float) -> bool:
-    at = torch.as_tensor(target.vertices).to(neighbour.sdf.field)
-    return bool((sample_sdf(neighbour.sdf, at)[0] < -2 * padding).any())
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
@@ -126,6 +122,8 @@ def with_neighbours(
     settings = settings or SceneConfig()
     mesh, reach = scene.object.mesh, settings.segmentation.obstacle_range
     low, high = mesh.vertices.min(0) - reach, mesh.vertices.max(0) + reach
+    support = scene.support
+    level = 0.0 if support is None else support.offset + settings.obstacles.padding
     found, same = [], []
     for name, shapes in things.items():
         near = [s for s in shapes if (s.vertices.min(0) <= high).all() and (s.vertices.max(0) >= low).all()]
@@ -133,7 +131,7 @@ def with_neighbours(
             same.append(f"collision object {name!r} fills the object's own place: taken for the object, no obstacle")
             continue
         points = [_points_within(shape, low, high) for shape in near]
-        found += [p for p in points if len(p) and _rises(p, scene.support, settings.obstacles.padding)]
+        found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]
     obstacles = make_obstacles(found, None, mesh, reach, settings.obstacles) if found else ()
     warnings = (*scene.object.warnings, *same)
     return replace(scene, object=replace(scene.object, warnings=warnings), obstacles=(*scene.obstacles, *obstacles))
@@ -176,7 +174,3 @@ def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.n
         surface = TriangleMesh(vertices, faces.astype(np.int64))
         points += [_hull_corners(vertices[np.unique(faces)]), surface_samples(surface, count, 0)[0]]
     return np.concatenate(points) if points else np.zeros((0, 3))
-
-
-def _rises(points: Float[np.ndarray, "_ 3"], support: Plane | None, margin: float) -> bool:
-    return support is None or float((points @ support.normal).max()) > support.offset + margin

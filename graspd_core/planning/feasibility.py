@@ -16,11 +16,12 @@ from functools import lru_cache
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.topology import packed_rows
+from graspd_core.mesh.topology import packed_rows, scaled_normals
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Verdict
 
@@ -104,12 +105,11 @@ def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
     """Points of the object's surface and their outward unit normals."""
     mesh = scene.object.mesh
     points, normals = surface_samples(mesh, _SAMPLES, seed=0)
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = scaled_normals(mesh.vertices, mesh.faces)
     doubled = np.linalg.norm(across, axis=-1)
     # A face without area has no normal.
     real = doubled > 1e-12
-    middles, across = corners[real].mean(1), across[real] / doubled[real, None]
+    middles, across = mesh.vertices[mesh.faces[real]].mean(1), across[real] / doubled[real, None]
     return np.concatenate([points, middles]), np.concatenate([normals, across])
 
 
@@ -120,8 +120,6 @@ def _one_sided(
 
     The first patch in which none does ends the search.
     """
-    from scipy.spatial import KDTree
-
     tree = KDTree(points)
     _, first = np.unique(packed_rows(np.round(points / (radius / 4)).astype(np.int64)), return_index=True)
     return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)

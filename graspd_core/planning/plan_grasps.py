@@ -22,13 +22,7 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.scene import (
-    Scene,
-    moved_grasp,
-    near_scene,
-    object_sdf,
-    sample_confidence,
-)
+from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_sdf, sample_confidence
 from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.runtime.worker_process import start_planning_worker

@@ -17,12 +17,22 @@ import torch
 from jaxtyping import Bool, Float
 
 from graspd_core.errors import ConfigError, shown
-from graspd_core.hands.kinematics import RETREAT, link_poses
+from graspd_core.hands.kinematics import RETREAT, in_base, link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.optimize.initial_poses import closing_axis, depth_of_starts
-from graspd_core.optimize.restrictions import Aim, BoundRestriction, BoundRestrictions, Refusal, Roll
+from graspd_core.optimize.restrictions import (
+    Aim,
+    Allowed,
+    BoundRestriction,
+    BoundRestrictions,
+    JointRows,
+    Places,
+    Refusal,
+    Roll,
+    Turns,
+)
 from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Sphere, boxes_in_reach, entered, numbers
 from graspd_core.se3 import rotation_from_quaternion
@@ -179,12 +189,7 @@ class BoundSteering(BoundRestriction):
             "into what the object stands on; ask for a direction from the free side, or a wider approach_angle"
         )
 
-    def starts(
-        self,
-        positions: Float[np.ndarray, "batch 3"],
-        quaternions: Float[np.ndarray, "batch 4"],
-        joints: Float[np.ndarray, "batch joints"],
-    ) -> Bool[np.ndarray, "batch"]:
+    def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Hands whose palm lies in no avoided box, there and at the retreat; their aim sees to all else."""
         if not self.steering.avoid:
             return np.ones(len(positions), dtype=bool)
@@ -196,40 +201,24 @@ class BoundSteering(BoundRestriction):
         """The candidates that are as asked for; the first wish that one misses is why it is refused."""
         if not grasps:
             return grasps
-        missed = {
-            f"outside the approach cone of {np.degrees(self.steering.approach_angle):.0f} degrees": self._off_cone(
-                grasps
-            ),
-            "with another roll": self._off_roll(grasps),
-            "with a contact outside the region": self._off_region(grasps),
-            "with a link in an avoided box": self._in_boxes(grasps),
-        }
+        asked, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
+        if wanted.direction is not None:
+            angles = np.array([angle_of_approach(self.hand, grasp, wanted.direction) for grasp in grasps])
+            told = f"outside the approach cone of {np.degrees(asked.approach_angle):.0f} degrees"
+            missed[told] = angles > asked.approach_angle + _ROUNDING
+        if wanted.roll is not None:
+            quaternions = np.stack([grasp.grasp.quaternion_wxyz for grasp in grasps])
+            turns = rotation_from_quaternion(torch.as_tensor(quaternions).double())
+            missing = wanted.roll.missing(turns @ torch.as_tensor(self.hand.approach), turns)
+            missed["with another roll"] = np.abs(missing.numpy()) > asked.roll_tolerance + _ROUNDING
+        if asked.region is not None:
+            outside = np.array([outside_region(asked.region, grasp) for grasp in grasps])
+            missed["with a contact outside the region"] = outside > CONTACT_TOLERANCE
+        stages = [[getattr(grasp, stage) for grasp in grasps] for stage in ("pregrasp", "grasp", "squeeze")]
+        in_boxes = [entered(self.hand, postures, asked.avoid) for postures in stages]
+        missed["with a link in an avoided box"] = np.any(in_boxes, axis=0)
         reasons = [next((why for why, rows in missed.items() if rows[i]), "") for i in range(len(grasps))]
         return [Refusal(why) if why else grasp for why, grasp in zip(reasons, grasps, strict=True)]
-
-    def _off_cone(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
-        if self.wanted.direction is None:
-            return np.zeros(len(grasps), dtype=bool)
-        angles = [angle_of_approach(self.hand, grasp, self.wanted.direction) for grasp in grasps]
-        return np.array(angles) > self.steering.approach_angle + _ROUNDING
-
-    def _off_roll(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
-        if self.wanted.roll is None:
-            return np.zeros(len(grasps), dtype=bool)
-        turned = rotation_from_quaternion(torch.as_tensor(np.stack([g.grasp.quaternion_wxyz for g in grasps])).double())
-        missing = self.wanted.roll.missing(turned @ torch.as_tensor(self.hand.approach), turned)
-        return np.abs(missing.numpy()) > self.steering.roll_tolerance + _ROUNDING
-
-    def _off_region(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
-        if self.steering.region is None:
-            return np.zeros(len(grasps), dtype=bool)
-        return np.array([outside_region(self.steering.region, grasp) > CONTACT_TOLERANCE for grasp in grasps])
-
-    def _in_boxes(self, grasps: Sequence[Grasp]) -> Bool[np.ndarray, "grasps"]:
-        stages = ("pregrasp", "grasp", "squeeze")
-        return np.any(
-            [entered(self.hand, [getattr(g, stage) for g in grasps], self.steering.avoid) for stage in stages], axis=0
-        )
 
 
 def angle_of_approach(hand: HandModel, grasp: Grasp, direction: Float[np.ndarray, "3"]) -> float:
@@ -247,9 +236,8 @@ def outside_region(region: Region, grasp: Grasp) -> float:
 
 def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
     """Unit direction that rolls are measured by, square to the approach, base frame; see `Steering`."""
-    rotations, translations = link_poses(hand, hand.open_posture)
     links = hand.candidate_link
-    points = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
+    points = in_base(link_poses(hand, hand.open_posture), hand.candidate_points, links)
     tips = [points[hand.link_group[links] == group].mean(0) for group in hand.fingertip_groups]
     ahead = np.mean(tips, axis=0) - hand.palm_center
     side = ahead - (ahead @ hand.approach) * hand.approach

@@ -426,7 +426,7 @@ class Responses:
         if settings.marker_geometry != "visual":
             return self._hand.primitives
         if self._visuals is None:
-            from graspd_core.hands.readers.visual_solids import visual_solids
+            from graspd_core.hands.readers.urdf import visual_solids
 
             try:
                 self._visuals = visual_solids(self._hand, settings.hand_prefix)

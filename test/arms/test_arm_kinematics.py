@@ -27,8 +27,7 @@ from graspd_core.arms.inverse_kinematics import (
     tip_chain,
 )
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_core.hands.readers.build_model import LinkSpec, assemble
-from graspd_core.hands.readers.joint_limits import JointSpec
+from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3, axis_rotation, random_rotations
 

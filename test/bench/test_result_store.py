@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+import graspd_core
 from graspd_bench import result_store as store
 from graspd_bench.measurement import Cell, run_cell
 from graspd_bench.run_studies import ENVIRONMENT, Job, run_cases, run_job
@@ -20,8 +21,8 @@ from graspd_core.errors import GraspdError, MeshError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, to_mapping
-from graspd_core.runtime import records
 from graspd_core.types import TriangleMesh
+from graspd_dataset import run_records
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "allegro_right", 0, 4, ("standard", "hard"))
 
@@ -117,16 +118,16 @@ def test_a_file_name_is_for_the_eye_and_safe():
 
 
 def test_the_code_is_of_the_package_the_kernel_and_what_a_study_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    released, digest = records.code_version().split("+")
+    released, digest = run_records.code_version().split("+")
     assert released
     assert len(digest) == 12
-    assert store.bench_version(("stress/*.py",)) != store.bench_version(()) != records.code_version()
+    assert store.bench_version(("stress/*.py",)) != store.bench_version(()) != run_records.code_version()
     root = tmp_path / "graspd_core"
-    for file in ("runtime/records.py", "optimize/kernel/src/step.cpp", "cli/run.py"):
+    for file in ("runtime/disk_cache.py", "optimize/kernel/src/step.cpp", "cli/run.py"):
         (root / file).parent.mkdir(parents=True, exist_ok=True)
         (root / file).write_text("1")
-    monkeypatch.setattr(records, "__file__", str(root / "runtime" / "records.py"))
-    fresh = records.code_version.__wrapped__
+    monkeypatch.setattr(graspd_core, "__file__", str(root / "__init__.py"))
+    fresh = run_records.code_version.__wrapped__
     before = fresh()
     (root / "cli" / "run.py").write_text("2")
     assert fresh() == before

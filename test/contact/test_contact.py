@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.optimize.graspd2022.contact_dynamics import (
+from graspd_core.optimize.graspd2022.graspd2022 import (
     FreeBody,
     contact_forces,
     euler_step,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shape_volumes import shape_volume
 
 from graspd_core.errors import MeshError
 from graspd_core.mesh.collada import read_dae
@@ -25,7 +26,7 @@ from graspd_core.mesh.mesh_files import (
     surface_samples,
     unit_advice,
 )
-from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape, shape_volume
+from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape
 from graspd_core.mesh.topology import is_closed, is_oriented
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import TriangleMesh
@@ -271,10 +272,9 @@ def test_a_shape_has_the_volume_of_its_formula_and_needs_no_cleaning(name):
     assert np.abs((mesh.vertices.min(0) + mesh.vertices.max(0)) / 2).max() < 0.03
 
 
-@pytest.mark.parametrize("ask", [make_shape, shape_volume])
-def test_unknown_shape_lists_the_valid_ones(ask):
+def test_unknown_shape_lists_the_valid_ones():
     with pytest.raises(MeshError, match=r"teapot.*bottle, bowl, box"):
-        ask("teapot")
+        make_shape("teapot")
 
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"

@@ -11,8 +11,7 @@ from torch import Tensor
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
-from graspd_core.optimize.graspd2022.contact_dynamics import make_body
-from graspd_core.optimize.graspd2022.graspd2022 import Graspd2022, published_starts
+from graspd_core.optimize.graspd2022.graspd2022 import Graspd2022, make_body, published_starts
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.optimize.loop import Poses
 from graspd_core.optimize.problem import Problem, build_problem

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from shape_volumes import shape_volume
 
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA as D415
@@ -13,7 +14,7 @@ from graspd_bench.rendering.tabletop import TabletopScene, depth_views, ring_pos
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
-from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape, shape_volume
+from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape
 from graspd_core.mesh.surface_queries import inside, make_distance_query, unsigned_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from shape_volumes import shape_volume
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.errors import CloudError, MeshError
@@ -14,7 +15,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.io.grasps_json import grasps_of, load_document, save_result
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.mesh.shapes import make_shape, shape_volume
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.topology import far_centre
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths

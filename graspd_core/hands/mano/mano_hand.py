@@ -165,6 +165,26 @@ _DENSITY = 1100.0
 
 
 @dataclass(frozen=True, eq=False)
+class _Rest:
+    """A shape at rest: its skin [m], the body that each vertex belongs to, joints, fingertips [m], the palm's normal.
+
+    `frames` are the anatomical ones. All is in the model's axes.
+    """
+
+    data: ManoData
+    vertices: Float[np.ndarray, "vertices 3"]
+    joints: Float[np.ndarray, "16 3"]
+    owner: Int[np.ndarray, "vertices"]
+    tips: Float[np.ndarray, "5 3"]
+    normal: Float[np.ndarray, "3"]
+    frames: Float[np.ndarray, "16 3 3"]
+
+    def in_body(self, body: int) -> Float[np.ndarray, "vertices 3"]:
+        """Vertices in the frame of a body [m]."""
+        return (self.vertices - self.joints[body]) @ self.frames[body]
+
+
+@dataclass(frozen=True, eq=False)
 class ManoHand:
     """A MANO model of one shape, as a hand and as a skin.
 
@@ -207,11 +227,10 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     owner = data.weights.argmax(1)
     tips = _fingertips(vertices, joints, owner)
     normal = palm_normal(data, joints)
-    frames = anatomical_frames(joints, tips, normal)
-    hand = _bare_hand(data, vertices, joints, owner, tips, normal, frames)
-    skins = _skins(hand, data, vertices, joints, owner, frames)
-    hand = replace(hand, adjacent=adjacent_links(hand), skins=skins)
-    return ManoHand(with_candidates(hand, candidates), data, shape, frames)
+    still = _Rest(data, vertices, joints, owner, tips, normal, anatomical_frames(joints, tips, normal))
+    hand = _bare_hand(still)
+    hand = replace(hand, adjacent=adjacent_links(hand), skins=_skins(hand, still))
+    return ManoHand(with_candidates(hand, candidates), data, shape, still.frames)
 
 
 def _float64(data: ManoData) -> Skin:
@@ -228,23 +247,16 @@ def _fingertips(
     return np.array(tips)
 
 
-def _bare_hand(
-    data: ManoData,
-    vertices: Float[np.ndarray, "vertices 3"],
-    joints: Float[np.ndarray, "16 3"],
-    owner: Int[np.ndarray, "vertices"],
-    tips: Float[np.ndarray, "5 3"],
-    normal: Float[np.ndarray, "3"],
-    frames: Float[np.ndarray, "16 3 3"],
-) -> HandModel:
+def _bare_hand(still: _Rest) -> HandModel:
     """Tree, limits, hulls and masses; no candidates yet.
 
     A body hangs from its parent by two massless links and its own: flexion, abduction, twist.
     """
-    tree, link_of = _tree(joints, frames)
+    data, normal = still.data, still.normal
+    tree, link_of = _tree(still.joints, still.frames)
     count = len(tree["link_names"])
     hulls = {
-        body: _hull(data, BODIES[body], link_of[body], (vertices[owner == body] - joints[body]) @ frames[body])
+        body: _hull(data, BODIES[body], link_of[body], still.in_body(body)[still.owner == body])
         for body in range(len(BODIES))
     }
     mass, com, inertia = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -259,11 +271,11 @@ def _bare_hand(
         joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in HINGES),
         lower=lower,
         upper=upper,
-        effort=efforts(joints, tips),
+        effort=efforts(still.joints, still.tips),
         velocity=np.full(count - 1, np.inf),
         open_posture=opened,
         closed_posture=closed,
-        palm_center=_palm_center(hulls[0], joints, normal),
+        palm_center=_palm_center(hulls[0], still.joints, normal),
         palm_normal=normal,
         approach=normal,
         link_joint=np.arange(-1, count - 1),
@@ -279,18 +291,12 @@ def _bare_hand(
     )
 
 
-def _skins(
-    hand: HandModel,
-    data: ManoData,
-    vertices: Float[np.ndarray, "vertices 3"],
-    joints: Float[np.ndarray, "16 3"],
-    owner: Int[np.ndarray, "vertices"],
-    frames: Float[np.ndarray, "16 3 3"],
-) -> tuple[tuple[int, TriangleMesh], ...]:
+def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
     """Each body's link, and in its frame the faces of the skin that have a vertex of it."""
-    own = [data.faces[(owner[data.faces] == body).any(1)] for body in range(len(BODIES))]
+    faces = still.data.faces
+    own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
     return tuple(
-        (hand.link_index[name], TriangleMesh((vertices - joints[body]) @ frames[body], own[body]))
+        (hand.link_index[name], TriangleMesh(still.in_body(body), own[body]))
         for body, name in enumerate(BODIES)
         if len(own[body])
     )

@@ -20,8 +20,14 @@ from jaxtyping import Float
 
 from graspd_core.errors import HandError, shown
 from graspd_core.hands.model import HandModel, JointKind, Primitive, PrimitiveKind
-from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
-from graspd_core.hands.readers.joint_limits import Coupling, JointSpec, resolved_couplings
+from graspd_core.hands.readers.build_model import (
+    Coupling,
+    JointSpec,
+    LinkSpec,
+    assemble,
+    refuse_crowds,
+    resolved_couplings,
+)
 from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull
 from graspd_core.hands.readers.xml_io import FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
@@ -35,7 +41,7 @@ _CORNERS_OF_ELLIPSOID = 200
 
 
 @dataclass(frozen=True, eq=False)
-class MeshAsset:
+class _MeshAsset:
     """A mesh of the file.
 
     Attributes:
@@ -51,12 +57,8 @@ class MeshAsset:
     vertices: Float[np.ndarray, "_ 3"]
 
 
-def read_assets(path: Path, spec: Any) -> dict[str, MeshAsset]:
-    """The meshes of a parsed file by name.
-
-    Raises:
-        HandError: one is moved or turned, or has no size.
-    """
+def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
+    """The meshes of a parsed file by name. Raises HandError: one is moved or turned, or has no size."""
     assets = {}
     for mesh in spec.meshes:
         if np.any(mesh.refpos) or not np.array_equal(mesh.refquat, (1, 0, 0, 0)):
@@ -65,7 +67,7 @@ def read_assets(path: Path, spec: Any) -> dict[str, MeshAsset]:
             raise fault(path, mesh, f"<mesh scale={shown(list(mesh.scale))}>: a factor cannot be zero")
         file = str(Path(spec.meshdir) / mesh.file) if mesh.file else ""
         vertices = np.array(mesh.uservert, dtype=float).reshape(-1, 3)
-        assets[mesh.name or Path(mesh.file).stem] = MeshAsset(_place(mesh), file, np.array(mesh.scale), vertices)
+        assets[mesh.name or Path(mesh.file).stem] = _MeshAsset(_place(mesh), file, np.array(mesh.scale), vertices)
     return assets
 
 
@@ -82,7 +84,7 @@ def _place(element: Any) -> Element:
     return place
 
 
-def type_name(element: Any) -> str:
+def _type_name(element: Any) -> str:
     """The type of a geom or joint as MJCF writes it."""
     return element.type.name.partition("_")[2].lower()
 
@@ -92,16 +94,16 @@ def pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -
     return rotation_from_quaternion(torch.as_tensor(np.array(quaternion))).numpy(), np.array(position)
 
 
-def check_type(path: Path, geom: Any, assets: Mapping[str, MeshAsset]) -> None:
+def check_type(path: Path, geom: Any, assets: Mapping[str, _MeshAsset]) -> None:
     """Raise HandError for a geom of a type that is not read, or a mesh that the file does not hold."""
-    kind, known = type_name(geom), (*_SIZES, "mesh")
+    kind, known = _type_name(geom), (*_SIZES, "mesh")
     if kind not in known or (geom.meshname and kind != "mesh"):
         raise fault(path, geom, f"<geom type={kind!r}> is not read; known: {', '.join(known)}")
     if kind == "mesh" and geom.meshname not in assets:
         raise fault(path, geom, f"names the mesh {geom.meshname!r}; known: {', '.join(assets) or 'none'}")
 
 
-def read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
+def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
     """One geom as a primitive of link zero: ellipsoids and meshes, of which `hull` is one, as hulls.
 
     Raises:
@@ -110,7 +112,7 @@ def read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> P
     rotation, translation = pose(model.geom_pos[geom.id], model.geom_quat[geom.id])
     if hull is not None:
         return Primitive(0, "hull", rotation, translation, (), hull.vertices, hull.faces)
-    kind = type_name(geom)
+    kind = _type_name(geom)
     size = model.geom_size[geom.id, : _SIZES[kind]].copy()
     if not (size <= LARGEST_SIZE).all():
         raise fault(path, geom, f"<geom size='{size}'>: larger than {LARGEST_SIZE:g} m; lengths are in metres")
@@ -122,7 +124,7 @@ def read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> P
     return Primitive(0, "hull", rotation, translation, (), ball.vertices, ball.faces)
 
 
-def asset_hull(path: Path, mesh: MeshAsset, corners: int) -> TriangleMesh:
+def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
     """The hull of a mesh, of some `corners` at most [m].
 
     Raises:
@@ -157,7 +159,7 @@ class _Parts:
     path: Path
     spec: Any
     model: Any
-    meshes: dict[int, MeshAsset]
+    meshes: dict[int, _MeshAsset]
     links: list[LinkSpec] = field(default_factory=list)
     joints: list[JointSpec] = field(default_factory=list)
     labels: dict[int, str] = field(default_factory=dict)
@@ -180,7 +182,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     base, warnings = world.bodies[0], []
     if world.geoms:
         warnings.append("geoms of the world itself were dropped")
-    free = any(type_name(joint) == "free" for joint in base.joints)
+    free = any(_type_name(joint) == "free" for joint in base.joints)
     if free:
         warnings.append(f"the free joint of the base {base.name!r} was dropped")
     hangs = bool(base.joints) and not free
@@ -221,7 +223,7 @@ def _compiled(path: Path, root: ET.Element) -> _Parts:
         element.attrib.pop("material", None)
     try:
         spec = mujoco.MjSpec.from_string(as_text(root))
-        assets, meshes = read_assets(path, spec), []
+        assets, meshes = _read_assets(path, spec), []
         for geom in spec.geoms:
             in_world, name = geom.parent.name == "world", geom.meshname
             if not in_world:
@@ -277,9 +279,9 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
 def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
     """The joint that moves as the file says, of one that stands where it says."""
     model, number = parts.model, joint.id
-    kind = _KINDS.get(type_name(joint))
+    kind = _KINDS.get(_type_name(joint))
     if kind is None:
-        raise fault(parts.path, joint, f"is of type {type_name(joint)!r}; known: {', '.join(_KINDS)}")
+        raise fault(parts.path, joint, f"is of type {_type_name(joint)!r}; known: {', '.join(_KINDS)}")
     axis, rotation, translation = np.array(model.jnt_axis[number]), placed.rotation, placed.translation
     # At `ref` the joint is as drawn; a joint value of zero lies that far back.
     if kind == "revolute":
@@ -312,8 +314,8 @@ def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
     corners, found = corners_each(len(parts.meshes)), []
     for geom in colliding or body.geoms:
         mesh = parts.meshes.get(geom.id)
-        hull = None if mesh is None else asset_hull(parts.path, mesh, corners)
-        found.append(read_geom(parts.path, parts.model, geom, hull))
+        hull = None if mesh is None else _asset_hull(parts.path, mesh, corners)
+        found.append(_read_geom(parts.path, parts.model, geom, hull))
         _refuse_far(parts, geom, found[-1].translation)
     return tuple(found)
 

@@ -1,12 +1,14 @@
 """URDF to `HandModel`: what descriptions in use get wrong is mended with a warning or refused by name.
 
-Boxes, spheres, cylinders and capsules stay as they are; meshes become convex hulls.
+Boxes, spheres, cylinders and capsules stay as they are; meshes become convex hulls. What a hand looks like is read for
+pictures alone.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,41 +17,35 @@ from jaxtyping import Float
 
 from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind, Primitive, PrimitiveKind
-from graspd_core.hands.readers.build_model import LinkSpec, assemble, refuse_crowds
-from graspd_core.hands.readers.joint_limits import JointSpec, read_couplings
+from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, read_couplings, refuse_crowds
 from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull, whole_mesh
 from graspd_core.hands.readers.xml_io import read_numbers, read_origin, read_xml, wrong
+from graspd_core.mesh.convex_parts import limited_hull
+from graspd_core.mesh.mesh_files import simplify
 from graspd_core.types import TriangleMesh
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
+# Triangles of all meshes that a viewer draws of a hand together, and of each.
+_MOST_TRIANGLES, _FEWEST_TRIANGLES = 4000, 60
+# Simplifying gets stuck on torn surfaces, and may lose a thin part: what stays so many times too fine, or comes out
+# smaller than this, is drawn as its hull.
+_STUCK, _SHRUNK = 1.5, 0.95
 
 
-def read_primitives(path: Path, link: ET.Element, corners: int) -> tuple[list[Primitive], bool]:
-    """The primitives of one `<link>`, link number zero, and whether they are those of its visuals.
-
-    A link without `<collision>` collides with what it shows. A mesh is a hull of `corners` at most.
-
-    Raises:
-        HandError: a shape is unknown, has no positive size, or its mesh cannot be found or read.
-    """
-    elements = colliding(link)
-    shown = bool(elements) and elements[0].tag == "visual"
-    hull = partial(mesh_hull, corners=corners)
-    return [_read_primitive(path, element, hull) for element in elements], shown
-
-
-def read_visuals(path: Path, link: ET.Element) -> list[Primitive]:
-    """What one `<link>` shows, link number zero: as `read_primitives`, but meshes are whole and need not be convex."""
-    return [_read_primitive(path, element, whole_mesh) for element in link.findall("visual")]
-
-
-def colliding(link: ET.Element) -> list[ET.Element]:
-    """The elements of a `<link>` that its solids are read from."""
+def _colliding(link: ET.Element) -> list[ET.Element]:
+    """The elements of a `<link>` that its solids are read from: where nothing collides, those that it shows."""
     return link.findall("collision") or link.findall("visual")
 
 
-def _read_primitive(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:
+def _shapes(
+    path: Path, elements: Sequence[ET.Element], read_mesh: Callable[..., TriangleMesh]
+) -> tuple[Primitive, ...]:
+    return tuple(_read_shape(path, element, read_mesh) for element in elements)
+
+
+def _read_shape(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:
+    """A `<collision>` or `<visual>` as a primitive of link zero; `read_mesh` gives the mesh of a file [m]."""
     rotation, translation = read_origin(path, element)
     geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
@@ -127,17 +123,56 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     _refuse_xacro(path, root)
     links, joints, dropped = _below_world(path, links, joints)
     specs = [_read_joint(path, joint) for joint in joints]
-    corners = corners_each(sum(shape.find("geometry/mesh") is not None for link in links for shape in colliding(link)))
+    corners = corners_each(sum(shape.find("geometry/mesh") is not None for link in links for shape in _colliding(link)))
+    hull = partial(mesh_hull, corners=corners)
     bodies, shown = [], []
     for link in links:
-        primitives, from_visuals = read_primitives(path, link, corners)
-        if from_visuals:
-            shown.append(str(link.get("name")))
-        bodies.append(LinkSpec(str(link.get("name")), *_inertial(path, link), tuple(primitives)))
+        name, elements = str(link.get("name")), _colliding(link)
+        if elements and elements[0].tag == "visual":
+            shown.append(name)
+        bodies.append(LinkSpec(name, *_inertial(path, link), _shapes(path, elements, hull)))
     if shown:
         dropped.append(f"no <collision>, so the <visual> is taken: {', '.join(shown)}")
     name = str(root.get("name") or path.stem)
     return assemble(path, name, bodies, specs, read_couplings(path, joints), tuple(dropped))
+
+
+def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
+    """The shapes that a viewer draws, placed as `hand.primitives` are; a mesh is a `hull` that need not be convex.
+
+    Meshes of more than 4000 triangles together are simplified to as many, at most half as many again. A link without
+    visuals has its collision solids, and so has a hand that no URDF describes.
+
+    Args:
+        hand: any loaded hand.
+        prefix: that it was loaded with.
+
+    Raises:
+        HandError: a file cannot be read.
+    """
+    path = Path(hand.urdf)
+    if path.suffix == ".pkl" or (root := read_xml(path)).tag != "robot":
+        return hand.primitives
+    found: list[Primitive] = []
+    for link in root.findall("link"):
+        index = hand.link_index.get(f"{prefix}{link.get('name')}")
+        if index is not None:
+            found += [replace(shape, link=index) for shape in _shapes(path, link.findall("visual"), whole_mesh)]
+    shown = {shape.link for shape in found}
+    share = _MOST_TRIANGLES / max(sum(len(shape.faces) for shape in found), 1)
+    return (*(_simpler(shape, share) for shape in found), *(s for s in hand.primitives if s.link not in shown))
+
+
+def _simpler(shape: Primitive, share: float) -> Primitive:
+    """A mesh with a share of its triangles."""
+    count = max(int(len(shape.faces) * share), _FEWEST_TRIANGLES)
+    if shape.kind != "hull" or len(shape.faces) <= count:
+        return shape
+    mesh = simplify(TriangleMesh(shape.vertices, shape.faces), count)
+    extents = [np.ptp(vertices, axis=0) for vertices in (mesh.vertices[np.unique(mesh.faces)], shape.vertices)]
+    if len(mesh.faces) > count * _STUCK or (extents[0] < _SHRUNK * extents[1]).any():
+        mesh = limited_hull(shape.vertices, count // 2)
+    return replace(shape, vertices=mesh.vertices, faces=mesh.faces)
 
 
 def below_link(path: Path, root: ET.Element, link: str) -> None:

@@ -165,33 +165,22 @@ def _parsed(path: Path, text: str) -> Element:
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Rotation and translation [m] of an element's `<origin>`; identity where it has none."""
+    """Rotation and translation [m] of an element's `<origin>`; identity where it has none.
+
+    Raises HandError: it holds no numbers, or is farther away than anything in a hand is.
+    """
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
-    rpy = read_numbers(path, origin, "rpy", 3, "0 0 0")
-    return rotation_from_rpy(rpy), read_position(path, origin, "xyz")
-
-
-def read_position(path: Path, element: ET.Element, key: str) -> Float[np.ndarray, "3"]:
-    """Three coordinates [m], zero where absent.
-
-    Raises:
-        HandError: they are not numbers, or farther away than anything in a hand is.
-    """
-    position = read_numbers(path, element, key, 3, "0 0 0")
+    rpy, position = (read_numbers(path, origin, key, 3, "0 0 0") for key in ("rpy", "xyz"))
     if np.abs(position).max() > FARTHEST:
-        text = f"<{element.tag} {key}={element.get(key)!r}>"
-        raise wrong(path, element, f"{text}: more than {FARTHEST:g} m away; lengths are in metres")
-    return position
+        text = f"<{origin.tag} xyz={origin.get('xyz')!r}>"
+        raise wrong(path, origin, f"{text}: more than {FARTHEST:g} m away; lengths are in metres")
+    return rotation_from_rpy(rpy), position
 
 
 def read_numbers(path: Path, element: ET.Element, key: str, count: int, default: str) -> Float[np.ndarray, "n"]:
-    """An attribute of `count` finite numbers.
-
-    Raises:
-        HandError: it holds something else.
-    """
+    """An attribute of `count` finite numbers. Raises HandError: it holds something else."""
     text = element.get(key) or default
     try:
         values = np.array([float(word) for word in text.split()])

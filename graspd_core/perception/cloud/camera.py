@@ -158,11 +158,7 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
     # Derivative of the radial factor by s.
     growth = (k1 + s * (2 * k2 + s * 3 * k3) - radial * (k4 + s * (2 * k5 + s * 3 * k6))) / below
     image = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x),
-            y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
+        [x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1
     )
     a = radial + 2 * x * x * growth + 2 * p1 * y + 6 * p2 * x
     b = 2 * x * y * growth + 2 * p1 * x + 2 * p2 * y
@@ -182,14 +178,15 @@ def reaches_image_border(
     local = (points - eye) @ view_frame(PointCloud(points, eye))
     ahead = local[:, 2] > 1e-3
     plane, mine = local[ahead, :2] / local[ahead, 2:], mine[ahead]
-    if _well_within(plane[mine], plane[:: 1 + len(plane) // HULL_POINTS], width):
+    own, others, some = plane[mine], plane[~mine], convex_hull(plane[:: 1 + len(plane) // HULL_POINTS])
+    sides = [] if some is None else some.equations
+    if some is not None and all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in sides):
         return False
     hull = convex_hull(plane)
     if hull is None:
         return False
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * longest_side(plane)
-    own, others = plane[mine], plane[~mine]
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
         # The object's few points first: most sides are none of theirs.
         near = own[own @ np.array(normal) + offset > -width]
@@ -201,11 +198,6 @@ def reaches_image_border(
         if _filled(np.concatenate([near, beside]), start, end) >= MIN_FILLED_SHARE:
             return True
     return False
-
-
-def _well_within(own: Float[np.ndarray, "own 2"], some: Float[np.ndarray, "some 2"], width: float) -> bool:
-    hull = convex_hull(some)
-    return hull is not None and all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in hull.equations)
 
 
 def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:

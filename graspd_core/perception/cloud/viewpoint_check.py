@@ -109,18 +109,16 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     normal = normals[best] * (1.0 if (viewpoint - corners[best, 0]) @ normals[best] > 0 else -1.0)
     height = (points - corners[best, 0]) @ normal
     on = np.abs(height) < PLANE_TOLERANCE
-    if on.mean() < PLANE_SHARE or not _flat(points[on]):
+    if on.mean() < PLANE_SHARE:
+        return False
+    offset = points[on] - points[on].mean(0)
+    if not np.linalg.svd(offset, compute_uv=False)[2] < PLANE_NOISE * np.sqrt(len(offset)):
         return False
     first = perpendicular(normal)
     flat = points @ np.column_stack([first, np.cross(normal, first)])
     over = Delaunay(flat[on]).find_simplex(flat) >= 0
     near, far = (over & (side > 1.5 * PLANE_TOLERANCE) & (side < THING_HEIGHT) for side in (height, -height))
     return bool(far.mean() > MAX_HIDDEN_SHARE and far.sum() > near.sum())
-
-
-def _flat(points: Points) -> bool:
-    offset = points - points.mean(0)
-    return bool(np.linalg.svd(offset, compute_uv=False)[2] < PLANE_NOISE * np.sqrt(len(points)))
 
 
 def _some(points: Points, viewpoint: Vector) -> Float[np.ndarray, "m 3"]:

@@ -17,6 +17,9 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, least_axes, longest_side
@@ -65,8 +68,6 @@ OUTLINE_SHARE = 0.6
 
 def link_length(points: Points, settings: SegmentationConfig) -> float:
     """Points this near belong together [m]: less than the gap, unless the points are too sparse."""
-    from scipy.spatial import KDTree
-
     if len(points) < 5:
         return settings.gap
     some = points[:: max(1, len(points) // SPACING_SAMPLES)]
@@ -88,8 +89,6 @@ def link_points(
         link: points this near are neighbours [m].
         neighbour_share: points with a smaller share of the median number of neighbours are strays.
     """
-    from scipy.spatial import KDTree
-
     label = np.full(len(points), -1)
     if len(points) == 0:
         return label
@@ -141,8 +140,6 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
         height: of the points above the support [m].
         spacing: of the points [m].
     """
-    from scipy.spatial import KDTree
-
     if len(points) < 2 * _NEIGHBOURS:
         return ()
     tree = KDTree(points)
@@ -209,9 +206,6 @@ def _bend(
 
 def _linked(kept: Bool[np.ndarray, "n"], links: Int[np.ndarray, "links 2"]) -> Int[np.ndarray, "n"]:
     """The connected part that each of the kept points is of; -1 of the others."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     one, other = links[kept[links].all(1)].T
     graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(kept), len(kept)))
     return np.where(kept, connected_components(graph, directed=False)[1], -1)
@@ -292,7 +286,7 @@ def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, v
     below = piece - height[:, None] * support.plane.normal
     for eye in viewpoints:
         (seen, near), (foot, far) = _directions(piece, eye), _directions(below, eye)
-        apart, which = _tree(seen).query(foot)
+        apart, which = KDTree(seen).query(foot)
         if np.mean((apart * near[which] <= link) & (near[which] < far)) >= HIDDEN_FOOT_SHARE:
             return False
     return True
@@ -316,13 +310,7 @@ def _directions(points: Points, eye: Vector) -> tuple[Points, Float[np.ndarray, 
 
 
 def _apart(a: Points, b: Float[np.ndarray, "m 3"]) -> float:
-    return float(_tree(a).query(b)[0].min())
-
-
-def _tree(points: Points):
-    from scipy.spatial import KDTree
-
-    return KDTree(points)
+    return float(KDTree(a).query(b)[0].min())
 
 
 def _share_within(small: Points, large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:

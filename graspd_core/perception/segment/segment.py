@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
@@ -128,16 +128,11 @@ def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: Segmentatio
     label[ground.left] = found
     for k in range(int(label.max(initial=-1)) + 1):
         rows = np.flatnonzero(label == k)
-        if scene.count[rows].sum() < settings.min_points or _tiny(scene, rows, ground, settings):
+        own, part = scene.mean[rows], ground.support
+        small = scene.count[rows].sum() < settings.min_points or extent(own) < settings.smallest_object
+        if small or (part is not None and part.height(own).max() < settings.smallest_object):
             label[rows] = -1
     return renumber(label)
-
-
-def _tiny(scene: VoxelScene, rows: Int[np.ndarray, "rows"], ground: Ground, settings: SegmentationConfig) -> bool:
-    points = scene.mean[rows]
-    if extent(points) < settings.smallest_object:
-        return True
-    return ground.support is not None and float(ground.support.height(points).max()) < settings.smallest_object
 
 
 def _candidates(parted: _Parted) -> list[int]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, convex_hull
@@ -87,8 +88,6 @@ def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask
 
 def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
     """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
-    from scipy.spatial import KDTree
-
     height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
     band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
     band = band[part.beneath(scene.mean[band], 2 * margin)]
@@ -139,22 +138,16 @@ def stands_on(
     flat = thing @ part.axes
     # From above, a round body hides as much of its height as half its width.
     hidden = HIDDEN_HEIGHT_SHARE * float(np.ptp(flat, axis=0).max())
-    hidden = settings.largest_object if _upright(part, thing, viewpoints) else max(settings.contact, hidden)
+    sight = viewpoints - thing.mean(0)
+    upright = (sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all()
+    hidden = settings.largest_object if upright else max(settings.contact, hidden)
     if _clearance(part, thing, distance) > hidden:
         return False
-    over = part.beneath(thing, settings.gap).mean() >= 0.5
-    return bool(over) and part.area >= settings.support_area_ratio * _outline_area(flat)
-
-
-def _upright(part: FlatPart, thing: Points, viewpoints: Eyes) -> bool:
-    sight = viewpoints - thing.mean(0)
-    return bool((sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all())
+    if part.beneath(thing, settings.gap).mean() < 0.5:
+        return False
+    hull = convex_hull(flat)
+    return hull is None or part.area >= settings.support_area_ratio * float(hull.volume)
 
 
 def _clearance(part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"]) -> float:
     return float((part.height(thing) - part.tolerance(distance)).min())
-
-
-def _outline_area(flat: Float[np.ndarray, "n 2"]) -> float:
-    hull = convex_hull(flat)
-    return 0.0 if hull is None else float(hull.volume)

@@ -10,7 +10,7 @@ import pytest
 from graspd_core.errors import HandError
 from graspd_core.hands.library import hand_names, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.readers.visual_solids import visual_solids
+from graspd_core.hands.readers.urdf import visual_solids
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.types import TriangleMesh

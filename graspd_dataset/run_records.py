@@ -15,6 +15,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import graspd_core
+from graspd_core.mesh.mesh_files import MESH_ENDINGS
+
 # Parts of graspd_core that no figure depends on.
 _BESIDE = ("cli", "io", "doctor.py")
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -72,7 +75,7 @@ def code_version(sources: tuple[str, ...] = ()) -> str:
     They are those of graspd_core but for `_BESIDE`, the kernel's C++ among them, and the files that the globs `sources`
     name beside graspd_core.
     """
-    root = Path(__file__).parents[1]
+    root = Path(graspd_core.__file__).parent
     files = {path for pattern in ("*.py", "*.cpp", "*.h", "*.hpp") for path in root.rglob(pattern)}
     counted = {path for path in files if path.relative_to(root).parts[0] not in _BESIDE}
     counted.update(path for pattern in sources for path in root.parent.glob(pattern))
@@ -95,6 +98,13 @@ def commit() -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip()
+
+
+def thing_name(source: Any) -> str:
+    """What an object goes by: the shape, or the file without its ending; other values as they are."""
+    text = f"{source:g}" if isinstance(source, float) else str(source)
+    path = Path(text)
+    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def finite(value: Any) -> Any:
