@@ -87,16 +87,17 @@ MAY_IMPORT = {
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 24_900,
+    # 150 more: overlaps of the hand with itself, and grasps that give way where they sink in.
+    "graspd_core": 25_050,
     "graspd_ros": 4_700,
     "graspd_bench": 7_800,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
-    "test": 28_300,
+    "test": 28_520,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 19_800, "graspd_ros.node": 23_600}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 19_950, "graspd_ros.node": 23_750}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

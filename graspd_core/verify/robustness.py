@@ -26,7 +26,7 @@ from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, build_scene
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
-from graspd_core.verify.hold_trial import STOPPED, PoseError, displaced, hold_trial, pose_errors
+from graspd_core.verify.hold_trial import STOPPED, PoseError, displaced, hold_trial, out_of_place, pose_errors
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext
 from graspd_core.verify.world import Protocol, World, at_friction, build_world
@@ -228,7 +228,7 @@ def _hold_in(
         if stop():
             return None
     world = other.result()
-    return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
+    return None if world is None else hold_trial(world, grasp, out_of_place(protocol), stop=stop)
 
 
 def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
@@ -238,7 +238,8 @@ def _with_friction(world: World, friction: tuple[float, float, float]) -> World:
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:
-    return hold_trial(trials.alone, displaced(grasp, *error, trials.alone.center_of_mass), trials.protocol, stop=stop)
+    there = displaced(grasp, *error, trials.alone.center_of_mass)
+    return hold_trial(trials.alone, there, out_of_place(trials.protocol), stop=stop)
 
 
 @lru_cache(maxsize=4)
