@@ -160,15 +160,11 @@ def close_hand(
 def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
     """Why a grasp is refused before the hand moves, empty if it is not: deep in the object, or links in each other.
 
-    That is geometry: the hand is put there, and MuJoCo's collision detection tells the depths. Restore the state after.
+    That is geometry: the hand is put there, and MuJoCo's collision detection tells the depths.
     """
-    import mujoco
-
     deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
     for name, limit in deepest.items():
-        set_hand_pose(world, data, getattr(grasp, name))
-        mujoco.mj_kinematics(world.model, data)
-        mujoco.mj_collision(world.model, data)
+        place_hand(world, data, getattr(grasp, name))
         if (depth := start_penetration(world, data)) > limit:
             return f"the {name} penetrates the object by {depth * 1e3:.1f} mm"
         if fault := self_fault(world, data, protocol):
@@ -207,6 +203,15 @@ def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
     data.mocap_pos[0] = posture.position
     data.mocap_quat[0] = posture.quaternion_wxyz
     data.ctrl[:] = posture.joint_positions
+
+
+def place_hand(world: World, data: Any, posture: Posture) -> None:
+    """Put the hand where a posture says, and find its contacts there."""
+    import mujoco
+
+    set_hand_pose(world, data, posture)
+    mujoco.mj_kinematics(world.model, data)
+    mujoco.mj_collision(world.model, data)
 
 
 def set_joints(world: World, data: Any, values: np.ndarray) -> None:

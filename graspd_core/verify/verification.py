@@ -102,7 +102,8 @@ def make_trial_context(
     if run.over() or (worlds := ahead.worlds.result()) is None:
         return None
     hypotheses = hypotheses_of(scene, ahead.other, worlds, certainty.probability)
-    return VerificationContext(worlds, partial(_metrics_context, scene, hand) if measure else None, hypotheses)
+    make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
+    return VerificationContext(worlds, make if measure else None, hypotheses)
 
 
 # Kept for the last few scenes and hands, which are hashed by identity.
@@ -305,7 +306,8 @@ def verify_grasps(
         worlds = trial_context(scene, hand, verify)
         verified = tuple(replace(grasp, trials=grasp_trials(worlds, grasp)) for grasp in verified)
     if measure:
-        context = _metrics_context(scene, hand)
+        world = None if verify == "none" else trial_context(scene, hand, verify).alone
+        context = replace(_metrics_context(scene, hand), world=world)
         verified = tuple(replace(grasp, metrics=metrics.measure(context, grasp.grasp)) for grasp in verified)
     tried = zip(grasps, verified, strict=True)
     return tuple(replace(given, metrics=found.metrics, trials=found.trials) for given, found in tried)
