@@ -92,11 +92,11 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_100,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
-    "test": 28_450,
+    "test": 28_700,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 19_950, "graspd_ros.node": 23_750}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 20_050, "graspd_ros.node": 23_850}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
@@ -368,7 +368,7 @@ def test_no_file_outside_the_packages_is_too_long():
     ("path", "source", "culprit"),
     [
         ("graspd_core/mesh/sdf.py", "from graspd_core.hands.model import HandModel", "hands.model"),
-        ("graspd_core/optimize/graspd2022/contact_dynamics.py", "from ...planning import rounds", "planning"),
+        ("graspd_core/optimize/graspd2022/graspd2022.py", "from ...planning import rounds", "planning"),
         (
             "graspd_core/verify/metrics.py",
             "def f():\n    from graspd_core.optimize.losses import g",
@@ -412,7 +412,7 @@ def test_the_checker_sees_a_planted_breach(path: str, source: str, culprit: str)
         ("graspd_core/verify/world.py", "def build():\n    import mujoco"),
         ("graspd_core/mesh/mesh_files.py", "if TYPE_CHECKING:\n    import trimesh"),
         ("graspd_core/optimize/problem.py", "from graspd_core.optimize.losses import support"),
-        ("graspd_core/optimize/graspd2022/graspd2022.py", "from .contact_dynamics import step"),
+        ("graspd_core/optimize/graspd2022/graspd2022.py", "from .graspd2022_config import step"),
         ("graspd_ros/node.py", "import rclpy\nfrom graspd_core import plan_grasps"),
     ],
 )

@@ -177,12 +177,13 @@ def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: Trian
 
 def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
     """How many grasps pass the hold trial on an object, in a world of its own."""
-    from graspd_core.verify.hold_trial import hold_trial
+    from graspd_core.verify.hold_trial import hold_trial, out_of_place
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
     protocol, far = at_friction(PROTOCOLS["standard"], target.friction), far_centre(target.mesh.vertices)
     target = moved_object(target, -far)
     world = build_world(hand, target, object_parts(target), protocol)
+    protocol = out_of_place(protocol)
     return sum(hold_trial(world, moved_grasp(grasp, -far), protocol).passed for grasp in grasps)
 
 

@@ -23,7 +23,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.types import Grasp, Plane, TriangleMesh
-from graspd_core.verify.hold_trial import displaced, hold_trial, pose_errors
+from graspd_core.verify.hold_trial import displaced, hold_trial, out_of_place, pose_errors
 from graspd_core.verify.lift_trial import lift_trial
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
@@ -92,10 +92,11 @@ def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
     table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()) - 1.0)
     around = build_world(hand, scene.object, parts, standard, table)
 
-    def hold(world: Any, protocol: Any, out_of_place: bool = False) -> Trial:
+    def hold(world: Any, protocol: Any, moved: bool = False) -> Trial:
         def trial(grasp: Grasp, full: bool, error: Any) -> Any:
-            grasp = displaced(grasp, error[0], error[1], center) if out_of_place else grasp
-            return hold_trial(world, grasp, replace(protocol, full_length=full))
+            grasp = displaced(grasp, error[0], error[1], center) if moved else grasp
+            physics = out_of_place(protocol) if moved else protocol
+            return hold_trial(world, grasp, replace(physics, full_length=full))
 
         return trial
 

@@ -31,7 +31,7 @@ from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
 from graspd_core.types import Grasp, GraspResult, Verdict
-from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.lift_trial import lift_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
@@ -140,6 +140,8 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
     parts = object_parts(truth.object)
     world = build_world(hand, truth.object, parts, protocol)
     table = build_world(hand, truth.object, parts, protocol, stage.support, truth.obstacles)
+    # How deep a grasp of what was seen lies in the true object is no fault of the grasp.
+    protocol = out_of_place(protocol)
     one = [hold_trial(world, grasp, protocol) for grasp in _verified(first)]
     holds = [(grasp, hold_trial(world, grasp, protocol)) for grasp in _verified(many)]
     lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]

@@ -38,6 +38,8 @@ def run_simulators(case: ObjectCase) -> Record:
     hand, scene = case.load()
     first = raw_grasps(scene, hand, case.config, case.count, case.seed)
     parts, standard = object_parts(scene.object), PROTOCOLS["standard"]
+    # Bullet refuses no posture: the physics are compared.
+    standard = replace(standard, max_grasp_penetration=np.inf, max_self_penetration=np.inf)
     short = replace(standard, hold_time=PULL)
     world = build_world(hand, scene.object, parts, standard)
     bullet, frozen = build_bullet_world(hand, scene.object, parts), build_frozen_world(hand, scene.object, parts)

@@ -20,6 +20,8 @@ Points = Float[np.ndarray, "n 3"]
 # How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
+# Cosine of half the angle at which an edge is no longer flat.
+_FLAT_EDGE = float(np.cos(np.deg2rad(10.0)))
 # Share of thin surface from which an object counts as thin-walled.
 THIN_WALLED = 0.6
 # A finger goes through a wall between points that are far apart: a thin-walled object has at least one point on so much
@@ -54,6 +56,27 @@ def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _
 
 def _is_thin(query: DistanceQuery, points: Points, normals: Points, probe: float) -> Bool[np.ndarray, "n"]:
     return -signed_distance(query, points - probe * normals) < (1 - _SHARP) * probe
+
+
+def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray, "points 3"]:
+    """Points evenly along the edges where faces meet at more than 20°, or end [m]; `count`, none on a smooth mesh."""
+    scaled, faces = scaled_normals(mesh.vertices, mesh.faces), mesh.faces
+    normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]))
+    _, first, of, faces_at = np.unique(packed_rows(sides), return_index=True, return_inverse=True, return_counts=True)
+    turned = np.zeros((len(first), 3))
+    np.add.at(turned, of, np.tile(normals, (3, 1)))
+    # Two normals that enclose an angle add up to twice the cosine of its half.
+    sharp = (faces_at != 2) | (np.linalg.norm(turned, axis=1) < 2 * _FLAT_EDGE)
+    start, end = mesh.vertices[sides[first[sharp]].T]
+    lengths = np.linalg.norm(end - start, axis=1)
+    if not lengths.sum() > 0:
+        return np.zeros((0, 3))
+    rng = np.random.default_rng(seed)
+    places = (np.arange(count) + rng.random(count)) / count * lengths.sum()
+    on = np.minimum(np.searchsorted(np.cumsum(lengths), places), len(lengths) - 1)
+    a = rng.random((count, 1))
+    return (1 - a) * start[on] + a * end[on]
 
 
 def farthest_points(points: Points, count: int) -> np.ndarray:

@@ -13,7 +13,14 @@ from torch import Tensor
 
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
-from graspd_core.optimize.grasp_postures import approach_depth, find_contacts, find_pregrasp, self_overlap, squeeze
+from graspd_core.optimize.grasp_postures import (
+    approach_depth,
+    find_contacts,
+    find_pregrasp,
+    self_overlap,
+    settle,
+    squeeze,
+)
 from graspd_core.optimize.loop import Hooks, Poses
 from graspd_core.optimize.obstacle_distance import gap_on_the_way
 from graspd_core.optimize.plan_config import PlanConfig, method_row
@@ -150,15 +157,15 @@ def staged(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> Staged:
     """Compute contacts, squeeze and pregrasp of every pose. The caller bounds the batch by its memory."""
+    poses = settle(problem, poses, stop)
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
     pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
     opened, clearance = find_pregrasp(problem, poses, config.grasp_stages, stop)
-    adjacent = torch.as_tensor(hand.adjacent, device=problem.hand.lower.device)
-    overlap = self_overlap(problem, poses.joints, adjacent)
-    if any(primitive.kind == "hull" for primitive in hand.primitives):
-        depth = torch.as_tensor(deepest_overlap(hand, poses.joints.double().cpu().numpy()))
-        overlap = torch.maximum(overlap, depth.to(overlap))
+    overlap = torch.maximum(*(self_overlap(problem, at.joints) for at in (poses, opened)))
+    if problem.hand.has_hulls:
+        depths = [deepest_overlap(hand, at.joints.double().cpu().numpy()) for at in (poses, opened)]
+        overlap = torch.maximum(overlap, torch.as_tensor(np.maximum(*depths)).to(overlap))
     return Staged(poses, opened, clearance, contact_set, pressed, overlap)
 
 

@@ -17,11 +17,19 @@ from torch import Tensor
 from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import RETREAT, drawn_back, forward, place_points
 from graspd_core.hands.link_distance import pair_distance, solid_distance
+from graspd_core.hands.solid_overlap import solid_overlaps
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.loop import Distances, Joints, Poses, Rows, Values, adam_moments, pack
 from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors
-from graspd_core.optimize.problem import Problem, hand_forward, obstacle_depth
+from graspd_core.optimize.problem import (
+    HandPlacement,
+    Problem,
+    hand_forward,
+    obstacle_depth,
+    self_collision,
+    solid_collision,
+)
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # Contacts of one link beyond its nearest.
@@ -30,6 +38,12 @@ _SPREAD = 2
 _WAY = (0.0, 0.4, 0.8)
 # What a square of travel costs: of joints per radian², of the base per metre².
 _JOINT_COST, _BASE_COST = 0.1, 2e3
+# Weight of the pregrasp's overlap with itself [1/mm²].
+_SELF_WEIGHT = 10.0
+# How a grasp gives way where it sinks in. Candidates nearer than `clearance` [m] are drawn to stay as near, by `keep`.
+_SETTLING = structs.Pregrasp(
+    0.001, 0.003, 0.0003, joint_cost=1.0, base_cost=1e4, self_collision=1.0, keep=0.03, steps=30
+)
 _CONE_EDGES = 8
 # Weights of an even spread of the load and of normal forces that sum to one, against balance.
 _RIDGE, _SUM = 0.5, 10.0
@@ -126,20 +140,15 @@ def nearest_features(
 
 
 @torch.no_grad()
-def self_overlap(problem: Problem, joints: Joints, adjacent: Bool[Tensor, "links links"]) -> Values:
-    """Return the greatest depth of a contact candidate inside a solid of a link that is not adjacent to its own [m]."""
-    if len(problem.hand.solids.link) == 0:
-        return joints.new_zeros(len(joints))
-    checked = ~adjacent[:, problem.hand.solids.link]
+def self_overlap(problem: Problem, joints: Joints) -> Values:
+    """Return the greatest depth of a solid of the hand in one of a link that is not adjacent [m]."""
     if (compiled := problem.compiled) is not None:
-        joints, checked = joints.contiguous(), checked.to(torch.int32).contiguous()
         deepest = joints.new_empty(len(joints))
-        compiled.call("graspd_self_overlap", len(joints), joints, checked, deepest)
+        compiled.call("graspd_self_overlap", len(joints), joints.contiguous(), deepest)
         return deepest
     links = forward(problem.hand.kinematics, joints)
-    points = place_points(problem.hand.fine.matrix, links)
-    depth = -solid_distance(problem.hand.solids, links, points)
-    return torch.where(checked[problem.hand.fine.links], depth, 0.0).amax((-1, -2)).clamp_min(0.0)
+    row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
+    return joints.new_zeros(len(joints)).scatter_reduce(0, row, depth, "amax")
 
 
 def find_pregrasp(
@@ -149,7 +158,7 @@ def find_pregrasp(
 
     The posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every candidate
     is to be (1 − a) times the clearance away from the object, so that all contacts arrive together. The whole way also
-    keeps clear of obstacles.
+    keeps clear of obstacles, and the posture clear of itself.
 
     Returns:
         The postures, and the least distance on the way over what it should be there, one where all is clear.
@@ -158,14 +167,8 @@ def find_pregrasp(
         return _find_pregrasp(problem, poses, config, stop)
     x = pack(poses).contiguous()
     out, share = x.new_empty(len(x), x.shape[1] - 4), x.new_empty(len(x))
-    settings = structs.Pregrasp(
-        clearance=config.clearance,
-        joint_rate=config.open_joint_rate,
-        base_rate=config.open_base_rate,
-        joint_cost=_JOINT_COST,
-        base_cost=_BASE_COST,
-        steps=config.open_steps,
-    )
+    settings = _pregrasp_settings(config)
+    settings.spheres = problem.hand.has_hulls
     compiled.call("graspd_find_pregrasps", settings, len(x), x, out, share, watch=lambda _: stop())
     return Poses(out[:, :3], poses.quaternion, out[:, 3:]), share
 
@@ -175,7 +178,7 @@ def _find_pregrasp(
 ) -> tuple[Poses, Values]:
     start = torch.cat([poses.translation, poses.joints], -1)
     rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
-    rates, cost = _rates_and_costs(problem, config)
+    rates, cost = _rates_and_costs(problem, _pregrasp_settings(config))
     with torch.no_grad():
         reached = hand_distance(problem, poses.base, poses.joints)
     remaining = torch.tensor([1.0 - a for a in _WAY], dtype=start.dtype, device=start.device)[:, None, None]
@@ -189,40 +192,114 @@ def _find_pregrasp(
         way = way_to(x)
         return hand_distance(problem, SE3(rotation, way[:, :3]), way[:, 3:])
 
-    x, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
-    for count in range(1, config.open_steps + 1):
-        if stop():
-            break
-        x.requires_grad_(True)
+    def loss(x: Rows) -> Values:
         short = ((wanted - distances(x)).clamp_min(0.0) / 0.001).unflatten(0, (len(_WAY), -1))
-        loss = (short * short).mean(-1).sum(0) + (cost * (x - start) ** 2).sum(-1)
-        if problem.obstacles is not None:
-            way = way_to(x)
-            links = forward(problem.hand.kinematics, way[:, 3:])
-            blocked = obstacle_depth(problem.obstacles, SE3(rotation, way[:, :3]), links)
-            loss = loss + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
-        (gradient,) = torch.autograd.grad(loss.sum(), x)
-        gradient = torch.nan_to_num(gradient)
-        mean, square, top, root = adam_moments(mean, square, gradient, count)
-        fade = 1.0 - 0.9 * count / config.open_steps
-        x = x.detach() - fade * rates * top / root
-        x = torch.cat([x[:, :3], x[:, 3:].clamp(problem.hand.lower, problem.hand.upper)], -1)
+        total = (short * short).mean(-1).sum(0) + (cost * (x - start) ** 2).sum(-1)
+        opened = forward(problem.hand.kinematics, x[:, 3:])
+        total = total + _SELF_WEIGHT * solid_collision(problem, opened)
+        if problem.hand.has_hulls:
+            total = total + _SELF_WEIGHT * self_collision(problem, opened)
+        if problem.obstacles is None:
+            return total
+        way = way_to(x)
+        links = forward(problem.hand.kinematics, way[:, 3:])
+        blocked = obstacle_depth(problem.obstacles, SE3(rotation, way[:, :3]), links)
+        return total + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
+
+    x = _descended(problem, start, loss, rates, config.open_steps, stop)
     with torch.no_grad():
         share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
     return Poses(x[:, :3], poses.quaternion, x[:, 3:]), share
 
 
+def settle(problem: Problem, poses: Poses, stop: Callable[[], bool] = lambda: False) -> Poses:
+    """Return poses near by, base shifted and never turned, that sink in less: a finger that does gives way.
+
+    The object's whole surface is held against the hand's solids, and the hand's candidates against the object. Those
+    that touch stay near.
+    """
+    if (compiled := problem.of_surface.compiled) is not None:
+        x = pack(poses).contiguous()
+        out = x.new_empty(len(x), x.shape[1] - 4)
+        compiled.call("graspd_settle", _SETTLING, len(x), x, out, watch=lambda _: stop())
+    else:
+        out = _settle(problem, poses, stop)
+    return Poses(out[:, :3], poses.quaternion, out[:, 3:])
+
+
+def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
+    start = torch.cat([poses.translation, poses.joints], -1)
+    rates, cost = _rates_and_costs(problem, _SETTLING)
+    with torch.no_grad():
+        reached = sample_sdf(problem.object.sdf, hand_forward(problem, problem.hand.fine, poses).points)[0]
+    wanted = torch.where(reached < _SETTLING.clearance, reached.clamp_min(0.0), torch.inf)
+
+    def loss(x: Rows) -> Values:
+        placed = hand_forward(problem, problem.hand.fine, Poses(x[:, :3], poses.quaternion, x[:, 3:]))
+        gap = sample_sdf(problem.object.sdf, placed.points)[0]
+        sunk = ((1e3 * gap.clamp_max(0.0)) ** 2).sum(-1) + _sunk_surface(problem.of_surface, placed, poses, x)
+        total = _SETTLING.self_collision * (sunk + solid_collision(problem, placed.links))
+        total = total + _SETTLING.keep * ((1e3 * (gap - wanted).clamp_min(0.0)) ** 2).sum(-1)
+        if problem.obstacles is not None:
+            blocked = obstacle_depth(problem.obstacles, placed.base, placed.links)
+            total = total + _SETTLING.self_collision * blocked
+        return total + (cost * (x - start) ** 2).sum(-1)
+
+    return _descended(problem, start, loss, rates, _SETTLING.steps, stop)
+
+
+def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:
+    """Return the squared depths of the object's surface in the hand, of each solid the deepest point [mm²]."""
+    solids, features = on_surface.hand.solids, on_surface.object.features
+    if not len(features) or not len(solids.link):
+        return x.new_zeros(len(x))
+    at_rest = Poses(x.detach()[:, :3], poses.quaternion, x.detach()[:, 3:])
+    pick, _, _ = nearest_features(on_surface, at_rest)
+    which = torch.arange(len(solids.link), device=pick.device).expand_as(pick)
+    gap = pair_distance(solids, placed.links, placed.base.apply_inverse(features[pick]), which)
+    return ((1e3 * gap.clamp_max(0.0)) ** 2).sum(-1)
+
+
+def _pregrasp_settings(config: GraspStagesConfig) -> structs.Pregrasp:
+    rates = {"joint_rate": config.open_joint_rate, "base_rate": config.open_base_rate, "steps": config.open_steps}
+    costs = {"joint_cost": _JOINT_COST, "base_cost": _BASE_COST, "self_collision": _SELF_WEIGHT}
+    return structs.Pregrasp(clearance=config.clearance, **rates, **costs)
+
+
 def _rates_and_costs(
-    problem: Problem, config: GraspStagesConfig
+    problem: Problem, settings: structs.Pregrasp
 ) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
     """Return the step sizes of base translation and joints, and what a square of travel costs."""
-    rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), config.open_joint_rate)
+    rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), settings.joint_rate)
     rates[3:] *= problem.hand.joint_scale
-    rates[:3] = config.open_base_rate
-    cost = torch.full_like(rates, _JOINT_COST)
+    rates[:3] = settings.base_rate
+    cost = torch.full_like(rates, settings.joint_cost)
     cost[3:] /= problem.hand.joint_scale**2
-    cost[:3] = _BASE_COST
+    cost[:3] = settings.base_cost
     return rates, cost
+
+
+def _descended(
+    problem: Problem,
+    start: Rows,
+    loss: Callable[[Rows], Values],
+    rates: Float[Tensor, "variables"],
+    steps: int,
+    stop: Callable[[], bool],
+) -> Rows:
+    """Return base translations and joints after so many steps of Adam down a loss, at rates that fade."""
+    x, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
+    for count in range(1, steps + 1):
+        if stop():
+            break
+        x.requires_grad_(True)
+        (gradient,) = torch.autograd.grad(loss(x).sum(), x)
+        gradient = torch.nan_to_num(gradient)
+        mean, square, top, root = adam_moments(mean, square, gradient, count)
+        fade = 1.0 - 0.9 * count / steps
+        x = x.detach() - fade * rates * top / root
+        x = torch.cat([x[:, :3], x[:, 3:].clamp(problem.hand.lower, problem.hand.upper)], -1)
+    return x
 
 
 @torch.no_grad()

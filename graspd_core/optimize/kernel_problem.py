@@ -207,6 +207,9 @@ def _points(
 def _solids(hand: HandTensors, arrays: Arrays) -> structs.Solids:
     solids = hand.solids
     group = hand.group_of_solid.numpy()
+    near, reach = np.zeros((len(group), _padded(len(group)))), (solids.core.norm(dim=-1) + solids.radius).numpy()
+    first, second = hand.solid_pairs.numpy().T
+    near[first, second] = (reach[first] + reach[second]) ** 2
     return structs.Solids(
         count=len(group),
         pose=arrays.floats(torch.cat([solids.rotation, solids.translation[..., None]], -1)),
@@ -215,6 +218,8 @@ def _solids(hand: HandTensors, arrays: Arrays) -> structs.Solids:
         round=arrays.ints(solids.is_round),
         link=arrays.ints(solids.link),
         group=arrays.ints(np.where(group < len(hand.reach), group, -1)),
+        near=arrays.floats(near),
+        stride=near.shape[1],
     )
 
 

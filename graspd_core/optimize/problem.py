@@ -25,8 +25,10 @@ from graspd_core.hands.kinematics import (
 from graspd_core.hands.link_distance import CollisionTensors, make_collision_tensors, pair_distance, solid_bound
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import collision_spheres
+from graspd_core.hands.solid_overlap import solid_overlaps, solid_pairs
+from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
-from graspd_core.mesh.sharp_features import THIN_WALLED, neighbours_together
+from graspd_core.mesh.sharp_features import THIN_WALLED, crease_points, neighbours_together
 from graspd_core.optimize import losses
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.optimize.loop import Distances, Points, Poses, Values
@@ -46,6 +48,8 @@ REACH_WHEN_SHARP = 0.01
 _PALM_RADIUS = 0.05
 # Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
 TASK_POINTS, FEATURE_PAIRS = 96, 96
+# Points of the surface and of its edges by which the depth of a grasp is told.
+_SURFACE, _CREASES = 3000, 1000
 # Free space that the hand keeps to obstacles [m]. Fingertips that hold an object low on a table all but touch it.
 OBSTACLE_MARGIN = 0.001
 
@@ -92,6 +96,7 @@ class HandTensors:
         reach: attraction range of each group of candidates [m].
         solids: collision primitives.
         group_of_solid: the first group of each solid's links, one past the last group if they have no coarse candidate.
+        solid_pairs: pairs of solids whose links are not adjacent.
         spheres: for self-collision.
         lower, upper: joint limits [rad] or [m].
         pivot: the point that a solver turns the hand about, base frame [m].
@@ -105,11 +110,17 @@ class HandTensors:
     reach: Float[Tensor, "groups"]
     solids: CollisionTensors
     group_of_solid: Int[Tensor, "solids"]
+    solid_pairs: Int[Tensor, "pairs 2"]
     spheres: SphereTensors
     lower: Float[Tensor, "joints"]
     upper: Float[Tensor, "joints"]
     pivot: Float[Tensor, "3"]
     joint_scale: Float[Tensor, "joints"]
+
+    @property
+    def has_hulls(self) -> bool:
+        """Whether the hand has hulls, of which only spheres and candidates tell that they overlap."""
+        return len(self.solids.link) < len(self.model.primitives)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +130,7 @@ class ObjectTensors:
     Attributes:
         sdf: signed distance field.
         features: sharp points of the surface, which could sink in between the hand's candidates [m].
+        surface: many points on the surface and its edges, by which the depth of a grasp is told [m].
         coarse_features: how many of the first sharp points the coarse steps look at: some on thin walls, else none.
         center: centre of mass [m].
         length: characteristic length of torques [m].
@@ -127,6 +139,7 @@ class ObjectTensors:
 
     sdf: GridSDF
     features: Float[Tensor, "features 3"]
+    surface: Float[Tensor, "surface 3"]
     coarse_features: int
     center: Float[Tensor, "3"]
     length: float
@@ -171,6 +184,7 @@ def make_hand_tensors(
         reach=tensor(np.full(len(present), _REACH_OF_PATCHES) if patch_size else reach),
         solids=solids,
         group_of_solid=index(place),
+        solid_pairs=index(solid_pairs(hand)),
         spheres=_sphere_tensors(hand, device, dtype),
         lower=tensor(hand.lower),
         upper=tensor(hand.upper),
@@ -197,8 +211,11 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     if scene.confidence is not None:
         confidence = floor + (1 - floor) * scene.confidence.to(device, dtype)
     sdf = scene.sdf.to(device, dtype)
+    samples = surface_samples(scene.object.mesh, _SURFACE, 0)[0], crease_points(scene.object.mesh, _CREASES, 0)
+    surface = np.concatenate([sharp, *samples])
+    surface = surface[neighbours_together(surface)]
     if settings.softness:
-        sharp, thin = sharp[:0], False
+        sharp, thin, surface = sharp[:0], False, sharp[:0]
         sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
     # They were chosen one by one, each the farthest from all before: the first half is spread as well.
     coarse = max(settings.features, len(sharp) // 2) if thin else 0
@@ -208,6 +225,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
         features=torch.as_tensor(
             np.concatenate(features) if thin else sharp[: settings.features], device=device, dtype=dtype
         ),
+        surface=torch.as_tensor(surface, device=device, dtype=dtype),
         coarse_features=coarse,
         center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
         length=scene.object.radius,
@@ -259,6 +277,11 @@ class Problem:
     directions: Float[Tensor, "directions 6"]
     friction: float
     obstacles: ObstacleTensors | None = None
+
+    @cached_property
+    def of_surface(self) -> Problem:
+        """The problem with points all over the surface as its sharp points."""
+        return replace(self, object=replace(self.object, features=self.object.surface, coarse_features=0))
 
     @property
     def compiled(self) -> KernelProblem | None:
@@ -323,6 +346,12 @@ def self_collision(problem: Problem, links: SE3) -> Values:
     """Return the loss of the hand's overlap with itself, at link poses in the base frame."""
     spheres = problem.hand.spheres
     return losses.self_collision(place_points(spheres.matrix, links), spheres.radii, spheres.weight)
+
+
+def solid_collision(problem: Problem, links: SE3) -> Values:
+    """Return the overlap of the hand's solids with each other at link poses [mm²], exact where they are boxes."""
+    row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
+    return depth.new_zeros(len(links.translation)).index_add(0, row, (1e3 * depth) ** 2 / 10.0)
 
 
 def obstacle_depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:

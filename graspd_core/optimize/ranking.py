@@ -25,6 +25,8 @@ from graspd_core.se3 import rotation_from_quaternion
 FARTHEST = 4.0
 # Cost of a hand that presses on nothing: no candidate that the network was fitted to did so.
 _IDLE_COST = 20.0
+# Cost of a hand so deep in itself that the trial refuses it: it is tried after all others [m].
+_SELF_COST, _DEEP = 100.0, 0.0018
 
 
 class Staged(NamedTuple):
@@ -36,7 +38,7 @@ class Staged(NamedTuple):
         clearance: share of the wanted clearance that the way from there keeps.
         contact_set: where the grasp touches.
         pressed: its squeeze.
-        overlap: depth of the hand in itself [m].
+        overlap: depth of the hand in itself at its pregrasp or grasp, whichever is deeper [m].
     """
 
     poses: Poses
@@ -51,10 +53,11 @@ def score(problem: Problem, staged: Staged) -> Values:
     """Return the log-odds of passing the hold trial, less what the trial forgives and a real hand does not.
 
     Costs are a finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself, and pressing on nothing.
+    What the trial would refuse comes last.
     """
     odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
     idle = (staged.pressed.forces == 0.0).all(-1).all(-1)
-    odds = odds - torch.where(idle, _IDLE_COST, 0.0)
+    odds = odds - torch.where(idle, _IDLE_COST, 0.0) - torch.where(staged.overlap > _DEEP, _SELF_COST, 0.0)
     return odds - (_depth(staged) - 2.0).clamp_min(0.0) - 10.0 * (staged.overlap / 0.001 - 1.0).clamp_min(0.0)
 
 

@@ -140,11 +140,10 @@ def close_hand(
     """
     import mujoco
 
+    if reason := posture_fault(world, data, grasp, protocol):
+        return reason
     set_hand_pose(world, data, grasp.pregrasp)
     mujoco.mj_forward(world.model, data)
-    depth = start_penetration(world, data)
-    if depth > protocol.max_start_penetration:
-        return f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm"
     for stage, (start, end) in {
         "closing": (grasp.pregrasp, grasp.grasp),
         "squeezing": (grasp.grasp, grasp.squeeze),
@@ -154,6 +153,22 @@ def close_hand(
             return STOPPED
         if reason:
             return f"{reason} while {stage}"
+    fault = self_fault(world, data, protocol)
+    return f"the squeeze {fault}" if fault else ""
+
+
+def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
+    """Why a grasp is refused before the hand moves, empty if it is not: deep in the object, or links in each other.
+
+    That is geometry: the hand is put there, and MuJoCo's collision detection tells the depths.
+    """
+    deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
+    for name, limit in deepest.items():
+        place_hand(world, data, getattr(grasp, name))
+        if (depth := start_penetration(world, data)) > limit:
+            return f"the {name} penetrates the object by {depth * 1e3:.1f} mm"
+        if fault := self_fault(world, data, protocol):
+            return f"the {name} {fault}"
     return ""
 
 
@@ -163,6 +178,19 @@ def start_penetration(world: World, data: Any) -> float:
     contact = data.contact
     on_object = (bodies[contact.geom1] == world.object_body) != (bodies[contact.geom2] == world.object_body)
     return float(-min(contact.dist[on_object], default=0.0)) if data.ncon else 0.0
+
+
+def self_fault(world: World, data: Any, protocol: Protocol) -> str:
+    """Which links are too deep in each other in the current state; empty if none. Adjacent ones never collide."""
+    first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
+    deep = np.flatnonzero(distance < -protocol.max_self_penetration)
+    own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]
+    if not len(own):
+        return ""
+    worst = own[distance[own].argmin()]
+    bodies = (world.model.geom_bodyid[geoms[worst]] for geoms in (first, second))
+    one, other = sorted(world.model.body(int(body)).name.removeprefix("link:") for body in bodies)
+    return f"puts {one} {-1e3 * distance[worst]:.1f} mm into {other}"
 
 
 def axis_name(direction: np.ndarray) -> str:
@@ -175,6 +203,15 @@ def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
     data.mocap_pos[0] = posture.position
     data.mocap_quat[0] = posture.quaternion_wxyz
     data.ctrl[:] = posture.joint_positions
+
+
+def place_hand(world: World, data: Any, posture: Posture) -> None:
+    """Put the hand where a posture says, and find its contacts there."""
+    import mujoco
+
+    set_hand_pose(world, data, posture)
+    mujoco.mj_kinematics(world.model, data)
+    mujoco.mj_collision(world.model, data)
 
 
 def set_joints(world: World, data: Any, values: np.ndarray) -> None:
@@ -255,6 +292,11 @@ def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
     return ""
 
 
+def out_of_place(protocol: Protocol) -> Protocol:
+    """The trial of a grasp whose object is not what or where it was planned for: how deep it would be is no fault."""
+    return replace(protocol, max_grasp_penetration=math.inf)
+
+
 # Errors of a noisy trial.
 TRIALS = 8
 # A turn and an offset [m] of the hand.
@@ -276,7 +318,7 @@ def noisy_share(
     The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. A start that the
     error pushes too deep into the object counts as not held. None where `stop` ended one of them, or there is none.
     """
-    held = 0
+    held, protocol = 0, out_of_place(protocol)
     for error in errors:
         held += hold_trial(world, displaced(grasp, *error, world.center_of_mass), protocol, stop=stop).passed
         if stop():

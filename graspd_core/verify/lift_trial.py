@@ -26,6 +26,8 @@ from graspd_core.verify.hold_trial import (
     STOPPED,
     breach,
     gave_up,
+    posture_fault,
+    self_fault,
     set_hand_pose,
     set_joints,
     set_targets,
@@ -38,7 +40,7 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 # pyright: reportAttributeAccessIssue=false
 
 
-_COMING, _CLOSING, _LIFTING = "while the hand came", "while closing", "while lifting"
+_COMING, _CLOSING, _SQUEEZING, _LIFTING = "while the hand came", "while closing", "while squeezing", "while lifting"
 # Shares of each way at which the hand's commanded postures are held against the obstacles.
 _SHARES = (0.0, 0.25, 0.5, 0.75)
 
@@ -94,7 +96,8 @@ def _lift(
 ) -> TrialResult:
     with trial_data(world) as data:
         begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
-        reason = reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
+        reason = posture_fault(world, data, grasp, protocol)
+        reason = reason or reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
         if reason:
             return TrialResult("lift", False, 0.0, 0.0, reason)
         set_hand_pose(world, data, begin)
@@ -135,6 +138,8 @@ def _raise(
                 reason = breach(world, data, protocol, worst)
                 if reason or stop():
                     return _said(reason or STOPPED, name)
+        if name == _SQUEEZING and (fault := self_fault(world, data, protocol)):
+            return f"the squeeze {fault}"
     return ""
 
 
@@ -149,7 +154,7 @@ def _stages(
     return (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
         (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
-        ("while squeezing", grasp.grasp, grasp.squeeze, protocol.stage_time),
+        (_SQUEEZING, grasp.grasp, grasp.squeeze, protocol.stage_time),
         (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
     )
 

@@ -20,6 +20,7 @@ from graspd_core.verify.prepared_grasp import (
     MetricsContext,
     PreparedGrasp,
     contact_area,
+    contact_depth,
     contact_links,
     penetration,
     prepare_grasp,
@@ -70,8 +71,13 @@ def _contact_per_volume(grasp: PreparedGrasp) -> float | None:
 
 _ROWS = (
     Metric(
-        "penetration", "mm", 1e3, lambda g: penetration(g.placed),
-        "greatest depth of a sample inside the object",
+        "penetration", "mm", 1e3, lambda g: penetration(g.context, g.placed),
+        "greatest depth of a sample of the hand inside the object, or of a point of the object's surface or "
+        "edges inside the hand",
+    ),
+    Metric(
+        "contact_depth", "mm", 1e3, lambda g: contact_depth(g.context, g.posture),
+        "depth of the deepest contact in MuJoCo, with the object's convex parts; measured where a trial is run",
     ),
     Metric(
         "self_penetration", "mm", 1e3, lambda g: self_penetration(g.context, g.placed),

@@ -26,7 +26,8 @@ from graspd_core.hands.link_distance import (
 )
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import kept_dense_samples
-from graspd_core.mesh.sharp_features import farthest_points
+from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sharp_features import crease_points, farthest_points
 from graspd_core.mesh.surface_queries import (
     DistanceQuery,
     inside,
@@ -38,6 +39,8 @@ from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture
+from graspd_core.verify.hold_trial import place_hand, start_penetration
+from graspd_core.verify.world import World, trial_data
 
 # Samples and a seed that the optimiser's candidates never see.
 _SAMPLES, _SEED = 4000, 20_000
@@ -62,17 +65,25 @@ class HandSurface:
 
 @dataclass(frozen=True, eq=False)
 class MetricsContext:
-    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `metrics.measure`."""
+    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `metrics.measure`.
+
+    Attributes:
+        points: of the object's surface and edges [m].
+        world: of the hold trial; None where there is none, and then no contact depth is measured.
+    """
 
     target: ObjectModel
     hand: HandModel
     surface: HandSurface
     query: DistanceQuery
+    points: Float[np.ndarray, "points 3"]
+    world: World | None = None
 
 
 def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext:
     """Sample the hand and prepare the object's distance, once for all grasps of that object by that hand."""
-    return MetricsContext(target, hand, hand_surface(hand), make_distance_query(target.mesh))
+    points = surface_samples(target.mesh, _SAMPLES, _SEED)[0], crease_points(target.mesh, _SAMPLES // 4, _SEED)
+    return MetricsContext(target, hand, hand_surface(hand), make_distance_query(target.mesh), np.concatenate(points))
 
 
 @lru_cache(maxsize=8)
@@ -144,9 +155,22 @@ _HALVINGS = 4
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
 
 
-def penetration(placed: PlacedHand) -> float:
-    """Greatest depth of a hand sample inside the object [m]."""
-    return float(max(0.0, -placed.distance.min()))
+def penetration(context: MetricsContext, placed: PlacedHand) -> float:
+    """Greatest depth of a hand sample inside the object, or of a point of the object inside a link [m]."""
+    worst = float(max(0.0, -placed.distance.min()))
+    for link in range(context.hand.num_links):
+        local = (context.points - placed.translations[link]) @ placed.rotations[link]
+        worst = max(worst, float(depth_inside(context.hand, link, local).max(initial=0.0)))
+    return worst
+
+
+def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
+    """MuJoCo's deepest contact of hand and object at a posture [m]; None without a world."""
+    if context.world is None:
+        return None
+    with trial_data(context.world) as data:
+        place_hand(context.world, data, posture)
+        return start_penetration(context.world, data)
 
 
 def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
@@ -337,11 +361,13 @@ class PreparedGrasp:
 
     Attributes:
         context: the object and the hand.
+        posture: of the hand.
         placed: the hand's samples in the object frame.
         max_contacts: contacts that the wrench hull is made of at most.
     """
 
     context: MetricsContext
+    posture: Posture
     placed: PlacedHand
     max_contacts: int
 
@@ -370,7 +396,7 @@ class PreparedGrasp:
 
 def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:
     """Put the hand at a posture."""
-    return PreparedGrasp(context, placed_hand(context, posture), max_contacts)
+    return PreparedGrasp(context, posture, placed_hand(context, posture), max_contacts)
 
 
 def surface_normals(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

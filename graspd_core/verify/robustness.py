@@ -25,7 +25,7 @@ from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, build_scene
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
-from graspd_core.verify.hold_trial import STOPPED, PoseError, displaced, hold_trial, pose_errors
+from graspd_core.verify.hold_trial import STOPPED, PoseError, displaced, hold_trial, out_of_place, pose_errors
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext
 from graspd_core.verify.world import Protocol, World, altered, at_friction, build_world
@@ -227,11 +227,12 @@ def _hold_in(
         if stop():
             return None
     world = other.result()
-    return None if world is None else hold_trial(world, grasp, protocol, stop=stop)
+    return None if world is None else hold_trial(world, grasp, out_of_place(protocol), stop=stop)
 
 
 def _hold_displaced(trials: TrialContext, error: PoseError, grasp: Grasp, stop: StopHook) -> TrialResult:
-    return hold_trial(trials.alone, displaced(grasp, *error, trials.alone.center_of_mass), trials.protocol, stop=stop)
+    there = displaced(grasp, *error, trials.alone.center_of_mass)
+    return hold_trial(trials.alone, there, out_of_place(trials.protocol), stop=stop)
 
 
 @lru_cache(maxsize=4)

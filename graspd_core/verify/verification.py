@@ -116,8 +116,8 @@ def make_trial_context(
     if run.over() or (worlds := ahead.worlds.result()) is None:
         return None
     hypotheses = hypotheses_of(scene, ahead.other, worlds, certainty.probability)
-    metrics = partial(_metrics_context, scene, hand) if measure else None
-    return VerificationContext(worlds, metrics, hypotheses, friction)
+    make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
+    return VerificationContext(worlds, make if measure else None, hypotheses, friction)
 
 
 def lighter(
@@ -347,10 +347,11 @@ def verify_grasps(
         worlds = trial_context(scene, hand, verify)
         verified = tuple(replace(grasp, trials=grasp_trials(worlds, grasp)) for grasp in verified)
     if measure:
-        context = _metrics_context(scene, hand)
+        trials = None if verify == "none" else trial_context(scene, hand, verify)
+        context = replace(_metrics_context(scene, hand), world=trials and trials.alone)
         verified = tuple(
-            replace(grasp, metrics=_measured(trial_context(scene, hand, verify), context, False, grasp))
-            if grasp.verdict is Verdict.VERIFIED
+            replace(grasp, metrics=_measured(trials, context, False, grasp))
+            if trials and grasp.verdict is Verdict.VERIFIED
             else replace(grasp, metrics=metrics.measure(context, grasp.grasp))
             for grasp in verified
         )

@@ -206,6 +206,8 @@ class Protocol:
         max_displacement: allowed travel of the object's centre of mass [m].
         max_rotation: allowed turn of the object [rad].
         max_start_penetration: deeper starts are refused [m].
+        max_grasp_penetration: a grasp posture deeper in the object is refused [m].
+        max_self_penetration: a hand deeper in itself is refused, at pregrasp and grasp, and as it was squeezed [m].
         full_length: whether every hold lasts to its end, not only until the answer is known (`early_stop`).
     """
 
@@ -225,6 +227,8 @@ class Protocol:
     max_displacement: float = 0.05
     max_rotation: float = float(np.deg2rad(15.0))
     max_start_penetration: float = 0.01
+    max_grasp_penetration: float = 0.005
+    max_self_penetration: float = 0.002
     full_length: bool = False
 
 

@@ -66,6 +66,7 @@ GRASP = {
 }  # fmt: skip
 METRIC_KEYS = {
     "contact_area_cm2", "contact_area_5mm_cm2", "contact_area_10mm_cm2", "contact_links", "penetration_mm",
+    "contact_depth_mm",
     "self_penetration_mm", "intersection_volume_cm3", "contact_per_volume_per_cm", "epsilon", "volume", "robustness",
     "payload_kg", "least_friction",
 }  # fmt: skip

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from graspd_core.config import GraspStagesConfig
-from graspd_core.optimize.grasp_postures import find_pregrasp, nearest_features, self_overlap
+from graspd_core.optimize.grasp_postures import find_pregrasp, nearest_features, self_overlap, settle
 from graspd_core.optimize.loop import Poses, moved_along, unpack
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
@@ -40,6 +42,36 @@ def test_a_few_steps_are_torchs_and_all_come_as_far(problem_of, rows_of, torch_a
     assert ((end.joints >= problem.hand.lower) & (end.joints <= problem.hand.upper)).all()
 
 
+@pytest.mark.parametrize("scene", ["mug", "crowded"])
+@pytest.mark.parametrize("hand", HANDS)
+def test_settling_is_torchs(problem_of, rows_of, torch_alone, hand, scene):
+    problem = problem_of(hand, scene)
+    poses = grasps_of(problem, rows_of(hand, scene, problem))
+    mine, again = settle(problem, poses), settle(problem, poses)
+    torch_alone()
+    theirs = settle(problem, poses)
+    assert torch.equal(mine.joints, again.joints)
+    # As for pregrasps: signs of what is next to nothing. Some starts lie so deep that their deepest points change.
+    assert ((mine.translation - theirs.translation).abs() < 2e-4).float().mean() > 0.75
+    assert ((mine.joints - theirs.joints).abs() < 4e-3).float().mean() > 0.75
+    assert ((mine.joints >= problem.hand.lower) & (mine.joints <= problem.hand.upper)).all()
+
+
+@pytest.mark.parametrize("hand", ["allegro_right", "leap_right"])
+def test_a_pregrasp_comes_out_of_itself_as_torchs_does(problem_of, rows_of, torch_alone, hand):
+    problem = problem_of(hand, "box")
+    poses = grasps_of(problem, rows_of(hand, "box", problem))
+    share = torch.rand(poses.joints.shape, generator=torch.Generator().manual_seed(2))
+    tangled = replace(poses, joints=problem.hand.lower + share * (problem.hand.upper - problem.hand.lower))
+    mine, _ = find_pregrasp(problem, tangled, GraspStagesConfig())
+    torch_alone()
+    theirs, _ = find_pregrasp(problem, tangled, GraspStagesConfig())
+    before, after, reference = (self_overlap(problem, at.joints) for at in (tangled, mine, theirs))
+    assert (before > 0.004).sum() >= 3
+    assert after[before > 0.004].median() < 0.25 * before[before > 0.004].median()
+    assert (after.median() - reference.median()).abs() < 0.001
+
+
 def test_it_stops_when_asked(problem_of, rows_of):
     problem = problem_of("allegro_right", "crowded")
     poses = grasps_of(problem, rows_of("allegro_right", "crowded", problem))
@@ -60,16 +92,13 @@ def test_a_pose_that_is_not_a_number_stays_alone(problem_of, rows_of):
 
 
 @pytest.mark.parametrize("hand", HANDS)
-def test_overlap_is_torchs(problem_of, hands, torch_alone, hand):
+def test_overlap_is_torchs(problem_of, torch_alone, hand):
     problem = problem_of(hand, "box")
     share = torch.rand(24, len(problem.hand.lower), generator=torch.Generator().manual_seed(0))
     joints = problem.hand.lower + share * (problem.hand.upper - problem.hand.lower)
-    adjacent = torch.as_tensor(hands[hand].adjacent)
-    mine = self_overlap(problem, joints, adjacent)
-    everything = self_overlap(problem, joints, torch.ones_like(adjacent))
+    mine = self_overlap(problem, joints)
     torch_alone()
-    assert mine.tolist() == pytest.approx(self_overlap(problem, joints, adjacent).tolist(), abs=1e-6)
-    assert not everything.any()
+    assert mine.tolist() == pytest.approx(self_overlap(problem, joints).tolist(), abs=1e-6)
     if hand.startswith("allegro"):
         assert mine.max() > 0.002
 

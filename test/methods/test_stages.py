@@ -184,14 +184,12 @@ def test_an_open_hand_is_clear_of_itself_and_crossed_fingers_are_not(problem_of,
         # First and second finger lean towards each other, or away from each other.
         q[joint["joint_0.0"]], q[joint["joint_4.0"]] = 0.47 * sign, -0.47 * sign
         crossed.append(q)
-    overlap = self_overlap(problem, torch.stack([upright, *crossed]), torch.as_tensor(hand.adjacent))
+    overlap = self_overlap(problem, torch.stack([upright, *crossed]))
     assert overlap[0] == 0.0
     # Fingers are 45 mm apart and 27 mm wide; leaning 27° each way they meet within 45 mm of their roots.
     assert overlap[1:].max() > 0.004
     # Leaning apart, the second finger just brushes the third.
-    assert overlap[1:].min() < 0.001
-    everything = torch.ones_like(torch.as_tensor(hand.adjacent))
-    assert not self_overlap(problem, torch.stack(crossed), everything).any()
+    assert overlap[1:].min() < 0.002
 
 
 @pytest.mark.parametrize("seed", range(6))

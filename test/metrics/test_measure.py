@@ -118,7 +118,7 @@ def test_a_block_sunk_into_a_flat_face(depth, block, box, as_object, at):
     context = make_metrics_context(as_object(box), block)
     placed = placed_hand(context, at((0.05 - depth, 0, 0), (0.0,)))
     # The whole end of 30 x 20 mm lies `depth` below the face; Embree counts in float32.
-    assert penetration(placed) == pytest.approx(depth, abs=1e-7)
+    assert penetration(context, placed) == pytest.approx(depth, abs=1e-7)
     # Whole voxels fit this pose, so the count is exact.
     assert intersection_volume(context, placed) == pytest.approx(depth * 0.03 * 0.02, rel=1e-9)
     assert contact_links(placed) == 1
@@ -134,7 +134,7 @@ def test_a_block_sunk_into_a_flat_face(depth, block, box, as_object, at):
 def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, box, as_object, at):
     context = make_metrics_context(as_object(box), block)
     placed = placed_hand(context, at((0.05 + gap, 0, 0), (0.0,)))
-    assert penetration(placed) == 0.0
+    assert penetration(context, placed) == 0.0
     assert intersection_volume(context, placed) == 0.0
     assert contact_links(placed) == touching(placed).any() == (gap < 0.002)
     # The end of 600 mm², and 1 mm of the sides.
@@ -161,7 +161,7 @@ def test_a_slanted_overlap_is_within_the_voxels_error(block, box, as_object, at)
     )
     # A slanted face of 1 mm voxels: about half a voxel over a face of 16 x 20 mm, with signs that mostly cancel.
     assert intersection_volume(context, placed) == pytest.approx(depth**2 * 0.02, rel=0.05)
-    assert penetration(placed) == pytest.approx(depth, abs=0.0005)
+    assert penetration(context, placed) == pytest.approx(depth, abs=0.0005)
 
 
 def test_fingers_that_pass_through_each_other(gripper, box, as_object, at):

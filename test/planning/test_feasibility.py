@@ -120,7 +120,7 @@ def test_what_is_too_low_for_the_fingers_is_told_with_what_became_of_the_trials(
     result = plan_grasps(card_on_table, hand, count=2, preset="fast", measure=False)
     assert result.outcome is Outcome.TOO_FEW
     assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
-    assert result.message.startswith(f"{len(result.grasps)} grasps failed their trials: the object turned while ")
+    assert result.message.startswith(f"{len(result.grasps)} grasps failed their trials: the object ")
     assert "; it is 2 mm high on its support" in result.message
 
 

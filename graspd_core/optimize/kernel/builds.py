@@ -28,8 +28,9 @@ _ARGUMENTS = {
     "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _INT, _AT, _AT, _AT, _INT],
     "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
     "graspd_find_pregrasps": [_AT, _AT, _INT, _AT, _AT, _AT, _INT, POLL],
+    "graspd_settle": [_AT, _AT, _INT, _AT, _AT, _INT, POLL],
     "graspd_nearest_features": [_AT, _INT, _AT, _AT, _AT, _AT, _INT],
-    "graspd_self_overlap": [_AT, _INT, _AT, _AT, _AT, _INT],
+    "graspd_self_overlap": [_AT, _INT, _AT, _AT, _INT],
     "graspd_run_steps": [_AT, _AT, _AT, _INT, _INT, _INT, _INT, POLL],
 }
 
@@ -128,7 +129,7 @@ class Grid(ctypes.Structure):
 
 
 class Solids(ctypes.Structure):
-    _fields_ = [("count", _INT), *_of(_AT, "pose core radius round link group")]
+    _fields_ = [("count", _INT), *_of(_AT, "pose core radius round link group near"), ("stride", _INT)]
 
 
 class Spheres(ctypes.Structure):
@@ -192,7 +193,10 @@ class State(ctypes.Structure):
 
 
 class Pregrasp(ctypes.Structure):
-    _fields_ = [*_of(_FLOAT, "clearance joint_rate base_rate joint_cost base_cost"), ("steps", _INT)]
+    _fields_ = [
+        *_of(_FLOAT, "clearance joint_rate base_rate joint_cost base_cost self_collision keep"),
+        *_of(_INT, "steps spheres"),
+    ]
 
 
 # In the order of `graspd_sizes`.

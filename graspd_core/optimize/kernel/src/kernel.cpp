@@ -77,6 +77,18 @@ int32_t graspd_find_pregrasps(const Problem* p, const Pregrasp* settings, int32_
     });
 }
 
+// Grasps (rows x (3 + joints)) near those in x (rows x variables, places those of the base) that sink in less.
+int32_t graspd_settle(const Problem* p, const Pregrasp* settings, int32_t rows, const float* x, float* out,
+                      int32_t threads, Stop::Poll poll) {
+    return guarded([&] {
+        Stop stop(poll);
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool caller) {
+            settle(*p, *settings, x + row * (7 + p->hand.joints), out + row * (3 + p->hand.joints), s,
+                   [&] { return stop.go(caller); });
+        });
+    });
+}
+
 // Of every row of x (places those of the base) and every solid the nearest sharp point, its distance and the gradient of
 // that (rows x solids x 3).
 int32_t graspd_nearest_features(const Problem* p, int32_t rows, const float* x, int32_t* pick, float* distance,
@@ -89,12 +101,11 @@ int32_t graspd_nearest_features(const Problem* p, int32_t rows, const float* x, 
     });
 }
 
-// Greatest depth of the hand in itself at every row of joints; `checked` is links x solids.
-int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints, const int32_t* checked, float* depth,
-                            int32_t threads) {
+// Greatest depth of the hand's solids in each other at every row of joints.
+int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints, float* depth, int32_t threads) {
     return guarded([&] {
         for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
-            depth[row] = self_overlap(*p, joints + row * p->hand.joints, checked, s);
+            depth[row] = self_overlap(*p, joints + row * p->hand.joints, s);
         });
     });
 }

@@ -44,6 +44,9 @@ struct Solids {
     const float* pose;  // count x 12: T_link_solid
     const float *core, *radius;
     const int32_t *round, *link, *group;  // group: -1 where it has no contact candidate
+    // count x stride: the squared distance at which balls about two solids meet; zero for links that are adjacent.
+    const float* near;
+    int32_t stride;
 };
 
 struct Spheres {
@@ -96,8 +99,8 @@ struct Schedule {
 
 // How a pregrasp is sought (config/grasp_stages_config.py).
 struct Pregrasp {
-    float clearance, joint_rate, base_rate, joint_cost, base_cost;
-    int32_t steps;
+    float clearance, joint_rate, base_rate, joint_cost, base_cost, self_collision, keep;
+    int32_t steps, spheres;  // spheres: whether they are kept out of each other too
 };
 
 // Rows of one matrix each: `variables` is 7 + joints (place of the pivot, quaternion wxyz, joints).

@@ -98,6 +98,8 @@ struct Scratch {
           task(padded(std::min(p.task_points, std::max(p.coarse.count, p.fine.count))), p.directions),
           gap(p.hand.groups), gap_at(p.hand.groups), gap_pair(p.hand.groups),
           solid(12 * p.solids.count),
+          middle{Array<float>(padded(p.solids.count)), Array<float>(padded(p.solids.count)),
+                 Array<float>(padded(p.solids.count))},
           blocks(p.object),
           bound(p.solids.count * blocks.count * LANES), bounded(p.solids.count * blocks.count),
           picked(p.feature_pairs), pair(p.feature_pairs),
@@ -111,6 +113,7 @@ struct Scratch {
     Array<float> gap;          // of each group
     Array<int32_t> gap_at, gap_pair;  // candidate or pair that has it
     Array<float> solid;        // T_object_solid
+    Array<float> middle[3];    // of the solids
     Blocks blocks;
     Array<float> bound;        // of the pairs of some solids and blocks
     Array<int32_t> bounded;    // the first pair of each

@@ -129,6 +129,34 @@ static void nearest_features(const Problem& p, int32_t* pick, float* distance, f
     }
 }
 
+// The sharp point that is deepest in a solid, its depth, and the gradient of its distance; -1 where none is inside.
+static int deepest_feature(const Problem& p, int k, float* depth, float* gradient, Scratch& s) {
+    const Object& object = p.object;
+    const float *x = object.features, *y = x + object.feature_stride, *z = y + object.feature_stride;
+    const Bound bound(p.solids, k, s.solid + 12 * k);
+    int found = -1;
+    *depth = 0;
+    for (int first = 0; first < s.blocks.count; first += LANES) {
+        Floats least = bound(load(s.blocks.x + first), load(s.blocks.y + first), load(s.blocks.z + first)) -
+                       load(s.blocks.reach + first);
+        for (unsigned set = bits(least < -*depth); set; set &= set - 1) {
+            const int at = (first + __builtin_ctz(set)) * LANES;
+            if (at >= object.feature_count) break;
+            for (unsigned in = bits(bound(load(x + at), load(y + at), load(z + at)) < -*depth); in; in &= in - 1) {
+                const int i = at + __builtin_ctz(in);
+                float slope[3];
+                if (i >= object.feature_count) break;
+                const float d = -feature_distance(p, k, i, slope, s);
+                if (!(d > *depth)) continue;
+                found = i;
+                *depth = d;
+                memcpy(gradient, slope, sizeof slope);
+            }
+        }
+    }
+    return found;
+}
+
 // Depth of the nearest pairs; their adjoints begin, and groups learn of pairs that are nearer than their candidates.
 static int sharp_points(const Problem& p, int features, float weight, float* penetration, Scratch& s) {
     const Solids& solids = p.solids;
