@@ -1,8 +1,9 @@
-"""What else may be true of an object that cameras saw: less friction, another place, another shape of a hidden side.
+"""What else may be true of an object that cameras saw: another place, less friction, other shapes of its hidden side.
 
-A grasp that holds on the likeliest scene is tried on these too, cheapest first, until one is failed or it is as sure as
-asked for. How often such grasps hold on the true object was measured (docs/clouds.md). Trials run on several threads,
-and `results_in_order` gives their results in order, the same for any number of threads.
+A grasp that holds on the likeliest scene is tried on these too, until it is as sure as asked for or cannot be. Two of
+the other shapes must hold it: whole things whose hidden side was guessed wrong are told by that from those that every
+rule sees alike. How often such grasps hold on the true object was measured (docs/clouds.md). Trials run on several
+threads, and `results_in_order` gives their results in order, the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
 
-from graspd_core.config.planning_config import HELD, HELD_THOUGH_FAILED
+from graspd_core.config.planning_config import MASS_ASSUMED, MASS_KNOWN, HeldShares
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
@@ -95,6 +96,8 @@ def results_in_order(
 _LESS_FRICTION = 2 / 3
 # Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
+# How many places must hold a grasp whose trials ask for more than most things weigh, and how many other shapes.
+_LEAST_PLACES, LEAST_SHAPES = 2, 2
 # A guessed shape is not worth a finer distance grid: nodes along an axis.
 _RESOLUTION = 24
 # How often the stop hook is asked while waiting for a world [s].
@@ -104,7 +107,7 @@ _SHAPES = "graspd-shapes"
 
 # Of trials under some hypotheses, in their order; None where there was none. And how a grasp goes through them.
 Results = Generator[TrialResult | None]
-HoldUnder = Callable[[Sequence["Hypothesis"], Grasp, StopHook], Results]
+HoldUnder = Callable[["HypothesisStage", Grasp, StopHook], Results]
 
 
 @dataclass(frozen=True)
@@ -121,66 +124,110 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
+class HypothesisStage:
+    """Things of a kind that may be true.
+
+    Attributes:
+        items: in the order in which they are tried.
+        least: how many of them must hold a grasp, all of them if there are fewer.
+        though_failed: how likely a grasp holds on the true object that fails here.
+    """
+
+    items: tuple[Hypothesis, ...]
+    least: int
+    though_failed: float
+
+
+class LaterWorld:
+    """A world that is made in a thread once somebody asks for it, and then kept; None where there is none."""
+
+    def __init__(self, make: Callable[[], World | None]):
+        self._make, self._begun, self._asked = make, None, threading.Lock()
+
+    def begin(self) -> Future[World | None]:
+        """Begin to make it, if nobody has."""
+        with self._asked:
+            self._begun = self._begun or begin_in_thread(_SHAPES, self._make)
+            return self._begun
+
+    def altered(self, mass: float) -> LaterWorld:
+        """Return the world with an object of another mass [kg]."""
+        return LaterWorld(lambda: (world := self.begin().result()) and altered(world, mass=mass))
+
+
+@dataclass(frozen=True)
 class Hypotheses:
     """What else a grasp must hold under.
 
     Attributes:
-        stages: place and friction, which are cheap to try, then another shape.
+        stages: places, which are cheap to try, then other shapes.
         probability: that a grasp which holds under all of them holds on the true object.
         waited_for: set once a trial waits for its world: there is time for other work.
     """
 
-    stages: tuple[tuple[Hypothesis, ...], ...]
+    stages: tuple[HypothesisStage, ...]
     probability: float
     waited_for: threading.Event = field(default_factory=threading.Event)
 
 
-def begin_other_world(
+def begin_other_worlds(
     run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float
-) -> Future[World | None] | None:
-    """Begin the world of another shape of the object, in a thread; None where grasps need not be tried in one.
+) -> tuple[LaterWorld, ...]:
+    """The worlds of other shapes of the object, none where grasps need not be tried in one.
 
-    Its result is None where there is no other shape, or the run was over before.
+    Those that every grasp is tried in are begun, one at a time. A world is None where there is no such shape, or the
+    run was over before.
     """
-    rules = _rules_needed(scene.evidence, probability)
+    making = threading.Lock()
 
-    def make() -> World | None:
-        for rule in rules:
-            if run.known_over():
-                break
-            if (world := _other_world(scene, hand, protocol, rule)) is not None:
-                return world
-        return None
+    def make(rule: str) -> World | None:
+        with making:
+            return None if run.known_over() else _other_world(scene, hand, protocol, rule)
 
-    return begin_in_thread(_SHAPES, make) if rules else None
+    rules = _rules_needed(scene.evidence, probability, held_shares(scene.object))
+    worlds = tuple(LaterWorld(partial(make, rule)) for rule in rules)
+    for world in worlds[:LEAST_SHAPES]:
+        world.begin()
+    return worlds
 
 
 def hypotheses_of(
-    scene: Scene, other: Future[World | None] | None, trials: TrialContext, probability: float
+    scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> Hypotheses | None:
-    """All that a grasp must hold under to be as sure as asked for, `other` from `begin_other_world`; None: nothing."""
-    if scene.evidence is None or probability <= HELD[0]:
+    """All that a grasp must hold under to be as sure as asked for, `others` from `begin_other_worlds`; None: nothing.
+
+    Where the mass is known, it must hold in all places, and with less friction.
+    """
+    shares = held_shares(scene.object)
+    if scene.evidence is None or probability <= shares.likeliest:
         return None
     places = [
         Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
     ]
-    slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
-    world = altered(trials.alone, friction=slippery.friction)
-    less = Hypothesis(
-        f"friction {slippery.friction[0]:.2g}", lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)
-    )
-    if other is None:
-        # Where nothing was hidden no more can be doubted.
-        return Hypotheses(((*places, less),), HELD[1] if scene.evidence.hidden else HELD[-1])
+    least = _LEAST_PLACES
+    if not scene.object.mass_assumed:
+        slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
+        world = altered(trials.alone, friction=slippery.friction)
+        work = lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)  # noqa: E731
+        places.append(Hypothesis(f"friction {slippery.friction[0]:.2g}", work))
+        least = len(places)
+    stages = [HypothesisStage(tuple(places), least, shares.fails_places)]
+    # Where nothing was hidden no more can be doubted.
+    surest = shares.shapes if others or not scene.evidence.hidden else shares.places
     waited_for = threading.Event()
-    shape = Hypothesis("another shape of the hidden side", partial(_hold_in, other, trials.protocol, waited_for))
-    return Hypotheses(((*places, less), (shape,)), HELD[-1], waited_for)
+    if others:
+        shapes = tuple(
+            Hypothesis(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
+            for number, world in enumerate(others, 1)
+        )
+        stages.append(HypothesisStage(shapes, LEAST_SHAPES, shares.fails_shapes))
+    return Hypotheses(tuple(stages), surest, waited_for)
 
 
-def one_by_one(items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
+def one_by_one(stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
     """The trials of a grasp under each, none begun before its result is asked for."""
-    for item in items:
+    for item in stage.items:
         yield item.hold(grasp, stop)
 
 
@@ -190,28 +237,39 @@ def try_hypotheses(
     stop: StopHook,
     hold_under: HoldUnder = one_by_one,
 ) -> tuple[TrialResult, float]:
-    """Hold trials of a grasp under each in turn, until one is failed; and how likely it is to hold in truth.
+    """Hold trials of a grasp under each in turn, until enough hold or too many fail; and how likely it is to hold.
 
     The result tells the greatest travel and turn of the trials that were passed. `hold_under` is given a stage at a
     time.
     """
     travel = turn = 0.0
-    for items, though_failed in zip(hypotheses.stages, HELD_THOUGH_FAILED[: len(hypotheses.stages)], strict=True):
-        with closing(hold_under(items, grasp, stop)) as results:
-            for item, result in zip(items, results, strict=False):
+    for stage in hypotheses.stages:
+        held, reasons = 0, []
+        with closing(hold_under(stage, grasp, stop)) as results:
+            for item, result in zip(stage.items, results, strict=False):
                 if stop() or result is None:
                     continue
-                if not result.passed:
-                    reason = f"fails under {item.name}: {result.reason}"
-                    return TrialResult(HYPOTHESES, False, travel, turn, reason), though_failed
-                travel, turn = max(travel, result.displacement), max(turn, result.rotation)
+                if result.passed:
+                    held += 1
+                    travel, turn = max(travel, result.displacement), max(turn, result.rotation)
+                else:
+                    reasons.append(f"fails under {item.name}: {result.reason}")
+                if held == stage.least or len(reasons) > len(stage.items) - stage.least:
+                    break
         if stop():
-            return TrialResult(HYPOTHESES, False, travel, turn, STOPPED), though_failed
+            return TrialResult(HYPOTHESES, False, travel, turn, STOPPED), stage.though_failed
+        if held < min(stage.least, held + len(reasons)):
+            return TrialResult(HYPOTHESES, False, travel, turn, reasons[0]), stage.though_failed
     return TrialResult(HYPOTHESES, True, travel, turn, ""), hypotheses.probability
 
 
-def _rules_needed(evidence: Evidence | None, probability: float) -> tuple[str, ...]:
-    if evidence is None or probability <= HELD[1]:
+def held_shares(target: ObjectModel) -> HeldShares:
+    """How sure grasps of an object are that hold under hypotheses."""
+    return MASS_ASSUMED if target.mass_assumed else MASS_KNOWN
+
+
+def _rules_needed(evidence: Evidence | None, probability: float, shares: HeldShares) -> tuple[str, ...]:
+    if evidence is None or probability <= shares.places:
         return ()
     from graspd_core.perception.reconstruct.hidden_side import other_rules
 
@@ -219,14 +277,15 @@ def _rules_needed(evidence: Evidence | None, probability: float) -> tuple[str, .
 
 
 def _hold_in(
-    other: Future[World | None], protocol: Protocol, waited_for: threading.Event, grasp: Grasp, stop: StopHook
+    other: LaterWorld, protocol: Protocol, waited_for: threading.Event, grasp: Grasp, stop: StopHook
 ) -> TrialResult | None:
-    if not other.done():
+    begun = other.begin()
+    if not begun.done():
         waited_for.set()
-    while not wait([other], timeout=_POLL).done:
+    while not wait([begun], timeout=_POLL).done:
         if stop():
             return None
-    world = other.result()
+    world = begun.result()
     return None if world is None else hold_trial(world, grasp, out_of_place(protocol), stop=stop)
 
 
@@ -240,17 +299,17 @@ def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
     return {}
 
 
-def begin_other_shape(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
-    """Begin the other shape that grasps of a scene to come will be tried on, if any, in a thread beside.
+def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
+    """Begin the other shapes that all grasps of a scene to come will be tried on, if any, in threads beside.
 
-    For `scene_from_views`: it is made while the distance grid of the likeliest shape is built.
+    For `scene_from_views`: they are made while the distance grid of the likeliest shape is built.
     """
-    for rule in _rules_needed(evidence, probability)[:1]:
+    for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:LEAST_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)
         _begun(evidence)[rule] = begin_in_thread(_SHAPES, work)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
     """The world of another shape of the object's own mass and friction; None where there is no such shape."""
     assert scene.evidence is not None

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
+from graspd_core.config.planning_config import LIGHTER_SHARE
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
@@ -30,10 +31,11 @@ from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_conte
 from graspd_core.verify.robustness import (
     HoldUnder,
     Hypotheses,
-    Hypothesis,
+    HypothesisStage,
+    LaterWorld,
     Results,
     begin_in_thread,
-    begin_other_world,
+    begin_other_worlds,
     hypotheses_of,
     one_by_one,
     results_in_order,
@@ -41,7 +43,7 @@ from graspd_core.verify.robustness import (
 )
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds, grasp_trials
-from graspd_core.verify.world import PROTOCOLS, World, altered, at_friction
+from graspd_core.verify.world import PROTOCOLS, altered, at_friction
 
 # How often stop and deadline are looked at while waiting for the collision parts [s].
 _POLL = 0.02
@@ -77,11 +79,11 @@ class TrialsAhead:
 
     Attributes:
         worlds: of the likeliest scene; None where the run was over before.
-        other: the world of another shape of the object; None where no grasp is tried in one.
+        others: the worlds of other shapes of the object; none where no grasp is tried in one.
     """
 
     worlds: Future[TrialContext | None]
-    other: Future[World | None] | None
+    others: tuple[LaterWorld, ...]
 
 
 def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
@@ -97,7 +99,7 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
 
     worlds = begin_in_thread("graspd-parts", build)
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-    return TrialsAhead(worlds, begin_other_world(run, scene, hand, protocol, certainty.probability))
+    return TrialsAhead(worlds, begin_other_worlds(run, scene, hand, protocol, certainty.probability))
 
 
 def make_trial_context(
@@ -115,7 +117,7 @@ def make_trial_context(
         pass
     if run.over() or (worlds := ahead.worlds.result()) is None:
         return None
-    hypotheses = hypotheses_of(scene, ahead.other, worlds, certainty.probability)
+    hypotheses = hypotheses_of(scene, ahead.others, worlds, certainty.probability)
     make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
     return VerificationContext(worlds, make if measure else None, hypotheses, friction)
 
@@ -123,12 +125,15 @@ def make_trial_context(
 def lighter(
     scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float
 ) -> VerificationContext:
-    """Return the context with an object of less mass [kg]."""
-    trials, shape = context.trials, ahead.other
+    """Return the context with an object of less mass [kg] than was assumed, whose grasps are less sure."""
+    trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
-    other = shape and begin_in_thread("graspd-shapes", lambda: (world := shape.result()) and altered(world, mass=mass))
-    return replace(context, trials=trials, hypotheses=hypotheses_of(scene, other, trials, certainty.probability))
+    known = replace(scene, object=replace(scene.object, mass_assumed=False))
+    hypotheses = hypotheses_of(known, others, trials, certainty.probability)
+    if hypotheses is not None:
+        hypotheses = replace(hypotheses, probability=LIGHTER_SHARE * hypotheses.probability)
+    return replace(context, trials=trials, hypotheses=hypotheses)
 
 
 def greatest_payload(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> float:
@@ -262,8 +267,11 @@ def _best_first(
         hypotheses.waited_for.set()
 
 
-def _at_once(threads: int, items: Sequence[Hypothesis], grasp: Grasp, stop: StopHook) -> Results:
-    return results_in_order(stop, lambda item, ended: item.hold(grasp, ended), items, threads, lambda: len(items))
+def _at_once(threads: int, stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
+    """As many at a time as must hold in any case, the others one by one."""
+    first, others = stage.items[: stage.least], stage.items[stage.least :]
+    yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
+    yield from one_by_one(replace(stage, items=others), grasp, stop)
 
 
 def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook) -> Grasp:

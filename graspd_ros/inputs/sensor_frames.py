@@ -27,7 +27,7 @@ from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import transform_cloud
 from graspd_core.perception.cloud.viewpoint_check import check_viewpoint
 from graspd_core.transforms import SECOND
-from graspd_core.verify.robustness import begin_other_shape
+from graspd_core.verify.robustness import begin_other_shapes
 from graspd_ros.convert import Matrix, array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.parameters import Settings
@@ -245,7 +245,7 @@ def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Ta
     """
     # Beside its distance grid, if grasps will have to hold on it.
     certainty = load_preset(settings.preset).certainty
-    ahead = None if settings.verify == "none" else partial(begin_other_shape, certainty.probability)
+    ahead = None if settings.verify == "none" else partial(begin_other_shapes, certainty.probability)
     return scene_from_views(
         views,
         target=target,

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.config import CertaintyConfig
-from graspd_core.config.planning_config import HELD, HELD_THOUGH_FAILED
+from graspd_core.config.planning_config import LIGHTER_SHARE, MASS_ASSUMED, MASS_KNOWN
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
@@ -35,8 +35,11 @@ from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.robustness import (
     Hypotheses,
     Hypothesis,
-    begin_other_shape,
-    begin_other_world,
+    HypothesisStage,
+    LaterWorld,
+    begin_in_thread,
+    begin_other_shapes,
+    begin_other_worlds,
     hypotheses_of,
     try_hypotheses,
 )
@@ -54,13 +57,14 @@ SURE = CertaintyConfig().probability
 def seen_from(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
     """A cylinder on a table, seen by one camera, in coordinates moved by `shift` [m]."""
     views = views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8))
-    return scene_from_views([PointCloud(view.points + shift, view.viewpoint + np.array(shift)) for view in views])
+    moved = [PointCloud(view.points + shift, view.viewpoint + np.array(shift)) for view in views]
+    return scene_from_views(moved, mass=0.1)
 
 
 @cache
 def seen_all_round() -> Scene:
     """The same cylinder, seen by eight cameras."""
-    return scene_from_views(views_of(tabletop("cylinder"), CAMERA, ring_poses(8, elevation=0.8)))
+    return scene_from_views(views_of(tabletop("cylinder"), CAMERA, ring_poses(8, elevation=0.8)), mass=0.1)
 
 
 def plan(scene: Scene, probability: float, rounds: int = 3) -> GraspResult:
@@ -75,8 +79,12 @@ def planned(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GraspResult:
     return plan(seen_from(shift), SURE)
 
 
-def under(*stages: Sequence[bool | None]) -> Hypotheses:
-    """Hypotheses that a grasp passes, fails, or that cannot be tried."""
+# How likely a grasp holds that fails at each stage, and one that passes all.
+FAILED, PASSED = (0.5, 0.6), 0.9
+
+
+def under(*stages: Sequence[bool | None], least: int | None = None) -> Hypotheses:
+    """Hypotheses that a grasp passes, fails, or that cannot be tried; `least` of a stage must hold it, or all."""
 
     def hypothesis(number: str, held: bool | None) -> Hypothesis:
         result = None
@@ -84,18 +92,19 @@ def under(*stages: Sequence[bool | None]) -> Hypotheses:
             result = TrialResult("hold", held, 0.01 * int(number[-1]), 0.0, "" if held else "the object moved")
         return Hypothesis(f"number {number}", lambda grasp, stop: result)
 
-    made = (tuple(hypothesis(f"{i}.{j}", held) for j, held in enumerate(stage)) for i, stage in enumerate(stages))
-    return Hypotheses(tuple(made), HELD[len(stages)])
+    made = [tuple(hypothesis(f"{i}.{j}", held) for j, held in enumerate(stage)) for i, stage in enumerate(stages)]
+    wanted = [len(items) if least is None else least for items in made]
+    return Hypotheses(tuple(map(HypothesisStage, made, wanted, FAILED)), PASSED)
 
 
 @pytest.mark.parametrize(
     ("passed", "verified", "probability", "travel", "reason"),
     [
-        (((True, True),), True, HELD[1], 0.01, ""),
-        (((True, True, True), (True,)), True, HELD[2], 0.02, ""),
-        (((True, None, True), (None,)), True, HELD[2], 0.02, ""),
-        (((True, False, True), (True,)), False, HELD_THOUGH_FAILED[0], 0.0, "number 0.1: the object moved"),
-        (((True, True, True), (False,)), False, HELD_THOUGH_FAILED[1], 0.02, "number 1.0: the object moved"),
+        (((True, True),), True, PASSED, 0.01, ""),
+        (((True, True, True), (True,)), True, PASSED, 0.02, ""),
+        (((True, None, True), (None,)), True, PASSED, 0.02, ""),
+        (((True, False, True), (True,)), False, FAILED[0], 0.0, "number 0.1: the object moved"),
+        (((True, True, True), (False,)), False, FAILED[1], 0.02, "number 1.0: the object moved"),
     ],
 )
 def test_a_grasp_must_hold_under_all_that_can_be_tried(passed, verified, probability, travel, reason):
@@ -103,6 +112,24 @@ def test_a_grasp_must_hold_under_all_that_can_be_tried(passed, verified, probabi
     assert (result.name, result.passed, likely) == (HYPOTHESES, verified, probability)
     assert result.reason == (f"fails under {reason}" if reason else "")
     assert result.displacement == travel
+
+
+@pytest.mark.parametrize(
+    ("passed", "verified"),
+    [
+        ((True, True, False, False), True),
+        ((False, True, True), True),
+        ((True, False, False), False),
+        ((True, None, None), True),
+        ((False, None, None), False),
+        ((True, False, None, None), False),
+        ((None, None), True),
+    ],
+)
+def test_where_some_must_hold_it_more_may_fail_and_what_there_is_not_counts_nowhere(passed, verified):
+    asked = under(passed, least=2)
+    assert try_hypotheses(asked, GRASP, lambda: False)[0].passed == verified
+    assert try_hypotheses(asked, GRASP, lambda: False, partial(verification._at_once, 2))[0].passed == verified
 
 
 _STAGE = st.lists(st.sampled_from([True, True, True, False, None]), max_size=5)
@@ -134,7 +161,7 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
         return held
 
     monkeypatch.setattr(verification, "grasp_trials", likeliest)
-    asked = Hypotheses(((Hypothesis("a shape", waits),),), HELD[1], waited_for)
+    asked = Hypotheses((HypothesisStage((Hypothesis("a shape", waits),), 1, 0.5),), PASSED, waited_for)
     box = load_scene("shape:box")
     worlds = build_worlds(box, load_hand("allegro_right"), object_parts(box.object), PROTOCOLS["standard"])
     context = verification.VerificationContext(worlds, None, asked)
@@ -157,21 +184,22 @@ def test_a_shape_that_was_begun_with_the_scene_is_not_made_again(monkeypatch):
     begun: list[str] = []
 
     def ahead(likeliest: ObjectModel, evidence: Evidence) -> None:
-        begin_other_shape(SURE, likeliest, evidence)
+        begin_other_shapes(SURE, likeliest, evidence)
         begun.extend(hypotheses._begun(evidence))
 
     scene = scene_from_views(views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8)), ahead=ahead)
     assert begun_before_grid[0]
-    assert begun == [""]
+    assert begun[0] == ""
+    assert len(begun) == 2
     assert any(grasp.verdict is Verdict.VERIFIED for grasp in plan(scene, SURE).grasps)
-    assert made.count("") == 1
+    assert [made.count(rule) for rule in begun] == [1, 1]
 
 
 def test_no_shape_is_begun_where_none_is_needed():
     evidence = seen_all_round().evidence
     assert evidence is not None
-    for doubted, probability in ((evidence, SURE), (replace(evidence, hidden=True), HELD[1])):
-        begin_other_shape(probability, seen_all_round().object, doubted)
+    for doubted, probability in ((evidence, SURE), (replace(evidence, hidden=True), MASS_KNOWN.places)):
+        begin_other_shapes(probability, seen_all_round().object, doubted)
         assert not hypotheses._begun(doubted)
 
 
@@ -181,38 +209,63 @@ def test_nothing_is_tried_after_a_failure_and_what_was_stopped_is_not_verified()
 
     late = Hypothesis("late", never)
     failing = under((True, False), (True,))
-    asked = replace(failing, stages=((*failing.stages[0], late), (late,)))
+    first, second = failing.stages
+    asked = replace(
+        failing, stages=(replace(first, items=(*first.items, late), least=3), replace(second, items=(late,)))
+    )
     assert not try_hypotheses(asked, GRASP, lambda: False)[0].passed
     assert not try_hypotheses(under((True, True, True)), GRASP, lambda: True)[0].passed
 
 
-@pytest.mark.parametrize(("missing", "expected"), [(0, [""]), (1, ["", "mirror"]), (3, ["", "mirror", "extrusion"])])
-def test_the_first_shape_that_there_is_is_taken(missing, expected, monkeypatch):
+def test_two_shapes_are_begun_and_others_once_they_are_asked_for(monkeypatch):
     seen, hand, protocol = seen_from(), load_hand("allegro_right"), PROTOCOLS["standard"]
     world, made = build_world(hand, seen.object, object_parts(seen.object), protocol), []
     monkeypatch.setattr(
         "graspd_core.perception.reconstruct.hidden_side.other_rules", lambda _: ("", "mirror", "extrusion")
     )
     monkeypatch.setattr(
-        hypotheses, "_other_world", lambda *given: made.append(given[-1]) or (None if len(made) <= missing else world)
+        hypotheses, "_other_world", lambda *given: made.append(given[-1]) or (world if given[-1] else None)
     )
-    run = Run(time.perf_counter(), None, None, None, None)
-    begun = begin_other_world(run, seen, hand, protocol, SURE)
-    assert begun is not None
-    assert begun.result() is (None if missing == 3 else world)
-    assert made == expected
+    first, second, third = begin_other_worlds(Run(time.perf_counter(), None, None, None), seen, hand, protocol, SURE)
+    assert first.begin().result() is None
+    assert second.begin().result() is world
+    assert sorted(made) == ["", "mirror"]
+    heavier = third.altered(2.0).begin().result()
+    assert heavier is not None
+    assert heavier.model.body_mass[heavier.object_body] == 2.0
+    assert third.begin().result() is world
+    assert made[2:] == ["extrusion"]
+    assert first.altered(2.0).begin().result() is None
 
 
-@pytest.mark.parametrize(("probability", "stages"), [(0.0, None), (0.91, None), (0.94, 1), (0.95, 2), (0.97, 2)])
-def test_no_more_is_in_doubt_than_the_probability_asks_for(probability, stages):
-    seen, hand, protocol = seen_from(), load_hand("allegro_right"), PROTOCOLS["standard"]
-    worlds = build_worlds(seen, hand, object_parts(seen.object), protocol)
-    other = begin_other_world(Run(time.perf_counter(), None, None, None), seen, hand, protocol, probability)
-    asked = hypotheses_of(seen, other, worlds, probability)
-    assert (None if asked is None else len(asked.stages)) == stages
-    assert (other is None) == (stages != 2)
-    if asked is not None:
-        assert asked.probability >= probability
+@pytest.mark.parametrize("assumed", [True, False])
+def test_no_more_is_in_doubt_than_the_probability_asks_for(assumed):
+    shares, seen = MASS_ASSUMED if assumed else MASS_KNOWN, seen_from()
+    seen, hand = replace(seen, object=replace(seen.object, mass_assumed=assumed)), load_hand("allegro_right")
+    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    for probability, stages in ((0.0, None), (shares.likeliest, None), (shares.places, 1), (shares.shapes, 2)):
+        run = Run(time.perf_counter(), 0.0, None, None)
+        others = begin_other_worlds(run, seen, hand, PROTOCOLS["standard"], probability)
+        asked = hypotheses_of(seen, others, worlds, probability)
+        assert (None if asked is None else len(asked.stages)) == stages
+        assert bool(others) == (stages == 2)
+        if asked is not None:
+            assert asked.probability >= probability
+            # What asks for more than most things weigh leaves room for a place that fails.
+            items, least = asked.stages[0].items, asked.stages[0].least
+            assert (len(items), least) == ((3, 2) if assumed else (4, 4))
+
+
+def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
+    seen, hand = seen_from(), load_hand("allegro_right")
+    seen = replace(seen, object=replace(seen.object, mass_assumed=True))
+    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    ahead = verification.TrialsAhead(begin_in_thread("worlds", lambda: worlds), (LaterWorld(lambda: None),))
+    context = verification.VerificationContext(worlds, None)
+    less = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.05)
+    assert (less.trials.alone.model.body_mass[less.trials.alone.object_body]) == 0.05
+    assert less.hypotheses is not None
+    assert less.hypotheses.probability == LIGHTER_SHARE * MASS_KNOWN.shapes
 
 
 def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
@@ -242,11 +295,13 @@ def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape_and_a_
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     monkeypatch.delattr("graspd_core.verify.robustness._other_world")
-    verified = [grasp for grasp in plan(seen_all_round(), HELD[-1]).grasps if grasp.verdict is Verdict.VERIFIED]
+    verified = [
+        grasp for grasp in plan(seen_all_round(), MASS_KNOWN.shapes).grasps if grasp.verdict is Verdict.VERIFIED
+    ]
     assert verified
     for grasp in verified:
         assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
-        assert grasp.probability == HELD[-1]
+        assert grasp.probability == MASS_KNOWN.shapes
 
 
 def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
@@ -280,7 +335,7 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
     monkeypatch.setattr(
         "graspd_core.verify.robustness.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
     )
-    result = plan(seen(), HELD[-1], rounds=1)
+    result = plan(seen(), MASS_KNOWN.shapes, rounds=1)
     assert result.grasps
     assert not any(grasp.usable for grasp in result.grasps)
     assert result.grasps[0].verdict is Verdict.UNVERIFIED
