@@ -8,6 +8,7 @@ from graspd_bench.measurement import run_cell
 from graspd_bench.stress import stress_cases
 from graspd_bench.studies import (
     arm_reach,
+    cameras,
     early_ends,
     frames,
     human_hand,
@@ -73,6 +74,17 @@ STUDIES: dict[str, Study] = {
         _PLANS,
         seen_objects.seen_seconds,
         came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
+    ),
+    "cameras": Study(
+        "views by four kinds of cameras of things that nothing was fitted to, tried on the truth at their own mass",
+        cameras.camera_cases,
+        cameras.run_view,
+        cameras.camera_sections,
+        ("studies/cameras.py", "studies/seen_objects.py", "rendering/*.py"),
+        _PLANS,
+        lambda case: 10.0,
+        came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
+        usual=False,
     ),
     "piles": Study(
         "piles of things on a table, seen by a camera, grasped and lifted out one after another on the truth",

@@ -89,10 +89,10 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 25_150,
     "graspd_ros": 4_700,
-    "graspd_bench": 8_100,
+    "graspd_bench": 8_350,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
-    "test": 28_700,
+    "test": 28_760,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

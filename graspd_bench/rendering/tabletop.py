@@ -7,7 +7,7 @@ grasp that was planned on them can be tried on `truth` as it is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -79,7 +79,12 @@ def tabletop(
     for other, x, y in obstacles:
         resting, T_world_other = _at_rest(other, 0.0)
         others.append(moved(resting, _translation(x, y, 0.0) @ T_world_other))
-    return TabletopScene(moved(mesh, pose), pose, tuple(others), _table(), Plane(np.array([0.0, 0.0, 1.0]), 0.0))
+    return replace(on_table(moved(mesh, pose), others), T_world_object=pose)
+
+
+def on_table(target: TriangleMesh, others: Sequence[TriangleMesh] = ()) -> TabletopScene:
+    """Things that lie where they are, on the table."""
+    return TabletopScene(target, np.eye(4), tuple(others), _table(), Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
 def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:

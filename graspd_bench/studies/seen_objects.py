@@ -17,7 +17,7 @@ import numpy as np
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, ring_poses, tabletop, views_of
-from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cases
+from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, object_cases
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
@@ -93,7 +93,11 @@ def run_seen(case: Seen) -> Record:
     try:
         middle = Target(point=0.5 * (stage.truth.vertices.min(0) + stage.truth.vertices.max(0)))
         target = middle if case.sight == CROWDED else None
-        scene = scene_from_views(clouds, target=target) if case.views else _true_scene(stage, case.object)
+        scene = (
+            scene_from_views(clouds, target=target, mass=PROTOCOL_MASS)
+            if case.views
+            else _true_scene(stage, case.object)
+        )
     except GraspdError as error:
         return {"refused": str(error), "scene_s": time.perf_counter() - began, "verified": 0, "held": 0}
     scene_s = time.perf_counter() - began
@@ -129,7 +133,9 @@ def _load_libraries() -> None:
 
 def _true_scene(stage: TabletopScene, source: str) -> Scene:
     obstacles = tuple(Obstacle(mesh, build_sdf(mesh, resolution=32, padding=0.02)) for mesh in stage.obstacles)
-    return replace(build_scene(stage.truth, source=source), support=stage.support, obstacles=obstacles)
+    return replace(
+        build_scene(stage.truth, source=source, mass=PROTOCOL_MASS), support=stage.support, obstacles=obstacles
+    )
 
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
@@ -202,7 +208,7 @@ def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
             markdown_table(_HEADINGS, body),
             told,
             markdown_table(["object", *(NAMES[views] for views in shown)], objects),
-            *_calibration([pair for r in records for pair in r.get("told", ())]),
+            *calibration([pair for r in records for pair in r.get("told", ())]),
         ]
     }
 
@@ -236,7 +242,7 @@ def _marks(own: Sequence[Record]) -> str:
     return f"{sum(r['held'] for r in own)}/{sum(r['verified'] for r in own)} {marks}"
 
 
-def _calibration(told: Sequence[tuple[float, bool]]) -> list[str]:
+def calibration(told: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
     """How often grasps of each stated probability held on the truth, and the mean square of what that was off."""
     if not told:
         return []
@@ -245,6 +251,7 @@ def _calibration(told: Sequence[tuple[float, bool]]) -> list[str]:
     body = [[f"{level:.0%}", f"{np.mean(holds):.0%} of {len(holds)}"] for level, holds in held.items()]
     brier = float(np.mean([(probability - hold) ** 2 for probability, hold in told]))
     return [
-        f"Stated probability against what held on the truth, less sure grasps among them; Brier score {brier:.3f}:",
+        f"Stated probability{where and f', {where}'} against what held on the truth, less sure grasps among them; "
+        f"Brier score {brier:.3f}:",
         markdown_table(["stated", "held"], body),
     ]

@@ -31,6 +31,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = {
     "main": ("bench", "README.md"),
     "rgbd": ("rgbd", "docs/clouds.md"),
+    "cameras": ("cameras", "docs/clouds.md"),
     "piles": ("piles", "docs/clouds.md"),
     "robust": ("robust", "docs/stress.md"),
     "steered": ("steered", "docs/usage.md"),
