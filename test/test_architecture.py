@@ -89,10 +89,10 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 24_900,
     "graspd_ros": 4_700,
-    "graspd_bench": 7_800,
+    "graspd_bench": 8_070,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
-    "test": 28_300,
+    "test": 28_430,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
