@@ -44,6 +44,9 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--trials", default="", metavar="A,B", help="of raw grasps (docs/bench.md lists them)")
     parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps of others, beside ours")
     parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of imported npy files")
+    parser.add_argument("--python", default="", metavar="PATH", help="that runs a checkout: dexgraspbench FOLDER")
+    parser.add_argument("--armature", action="store_true", help="of dexgraspbench: its Allegro with our armature, too")
+    parser.add_argument("--grasps", default="", metavar="FILE", help="of dexgraspbench: ours from this file")
     parser.add_argument("--quick", action="store_true", help="few objects and grasps: minutes")
     parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="for finished cases")
     parser.add_argument("--processes", type=int, default=1, help="cases at a time, each on one thread (default 1)")
@@ -65,6 +68,11 @@ def run(options: argparse.Namespace) -> int:
 
     if options.processes < 1:
         raise ConfigError(f"processes: {options.processes}; at least 1")
+    words = list(options.studies)
+    # One study is followed by a folder.
+    after = words.index("dexgraspbench") + 1 if "dexgraspbench" in words else len(words)
+    checkout = "".join(words[after : after + 1])
+    del words[after : after + 1]
     request = Request(
         presets=tuple(options.presets),
         objects=tuple(options.objects),
@@ -76,8 +84,12 @@ def run(options: argparse.Namespace) -> int:
         quick=options.quick,
         imported=options.imported,
         joint_order=tuple(name for name in options.joint_order.split(",") if name),
+        checkout=checkout,
+        python=options.python,
+        armature=options.armature,
+        grasps=options.grasps,
     )
-    studies = studies_of([*options.studies, *options.suite] or ["imported" if options.imported else "main"])
+    studies = studies_of([*words, *options.suite] or ["imported" if options.imported else "main"])
     old_code = options.any_code or options.no_run
     plan = make_plan(studies, request, options.out, any_code=old_code, failed=options.no_run)
     old = read_results(options.compare) if options.compare else None

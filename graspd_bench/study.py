@@ -78,6 +78,10 @@ class Request:
         quick: a small run that takes minutes.
         imported: file or folder of somebody else's grasps.
         joint_order: of the joints in its npy files, by name.
+        checkout: folder of DexGraspBench.
+        python: program that runs it.
+        armature: try its hand with our armature, too.
+        grasps: file of our grasps that are taken instead of planned.
     """
 
     presets: tuple[str, ...] = ()
@@ -90,6 +94,10 @@ class Request:
     quick: bool = False
     imported: str = ""
     joint_order: tuple[str, ...] = ()
+    checkout: str = ""
+    python: str = ""
+    armature: bool = False
+    grasps: str = ""
 
     def __post_init__(self) -> None:
         if self.count is not None and not 1 <= self.count <= 1024:

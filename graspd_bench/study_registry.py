@@ -9,6 +9,7 @@ from graspd_bench.stress import stress_cases
 from graspd_bench.studies import (
     arm_reach,
     cameras,
+    dexgraspbench,
     early_ends,
     frames,
     human_hand,
@@ -184,6 +185,17 @@ STUDIES: dict[str, Study] = {
         _IMPORTED,
         (*_PLANS, "trials", "imported", "joint_order"),
         lambda case: 10.0 + 18.0 * case.count,
+        usual=False,
+    ),
+    "dexgraspbench": Study(
+        "our grasps through DexGraspBench's own code (dexgraspbench FOLDER --python PATH)",
+        dexgraspbench.bench_cases,
+        dexgraspbench.run_bench,
+        dexgraspbench.bench_sections,
+        ("studies/dexgraspbench.py", "../graspd_dataset/*_grasps.py"),
+        (*_PLANS, "checkout", "python", "armature", "grasps"),
+        lambda case: 10.0 + 4.0 * case.count * (1 + case.armature),
+        came=dexgraspbench.bench_came,
         usual=False,
     ),
     "mano": Study(

@@ -124,11 +124,16 @@ def refuse_hand(name: str) -> None:
         raise ConfigError(f"to dexgraspbench: hand {name!r}; valid: {', '.join(PALMS)}")
 
 
-def write_dexgraspbench(rows: Sequence[dict[str, Any]], mesh: TriangleMesh, out: Path) -> None:
-    """Write the grasps of one hand on one object, and the object: mesh, convex parts, mass and centre of mass."""
+def write_dexgraspbench(
+    rows: Sequence[dict[str, Any]], mesh: TriangleMesh, out: Path, *, objects: str = "objects"
+) -> None:
+    """Write the grasps of one hand on one object, and the object: mesh, convex parts, mass and centre of mass.
+
+    That bench takes paths from the folder of its own code: there belong the `objects`, or they are named in full.
+    """
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):
-        grasp = {"obj_path": f"objects/{name}", "obj_scale": 1.0, "obj_pose": np.array([0, 0, 0, 1, 0, 0, 0.0])}
+        grasp = {"obj_path": f"{objects}/{name}", "obj_scale": 1.0, "obj_pose": np.array([0, 0, 0, 1, 0, 0, 0.0])}
         grasp |= {f"{stage}_qpos": qpos(row, stage) for stage in STAGES}
         buffer = BytesIO()
         np.save(buffer, np.array(grasp, dtype=object), allow_pickle=True)

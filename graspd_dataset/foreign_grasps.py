@@ -168,10 +168,10 @@ def read_dexgraspbench(
     """
     order = order_of(hand, order)
     values = npy_dictionary(path, content)
-    named = _plain(values, "obj_path", path)
+    named = plain_entry(values, "obj_path", path)
     mesh = mesh or find_beside(f"{named}/mesh/simplified.obj", path, f"{path}: obj_path")
-    scale = float(numbers_of(_plain(values, "obj_scale", path), (), f"{path}: obj_scale"))
-    target = _pose(_plain(values, "obj_pose", path), 0, f"{path}: obj_pose")
+    scale = float(numbers_of(plain_entry(values, "obj_scale", path), (), f"{path}: obj_scale"))
+    target = _pose(plain_entry(values, "obj_pose", path), 0, f"{path}: obj_pose")
     pregrasp, grasp, squeeze = (_posture(values, stage, target, hand, order, path) for stage in STAGES)
     moved = float(np.linalg.norm(squeeze.position - grasp.position))
     return [ImportedGrasp(f"{path}", mesh, scale, grasp, pregrasp, squeeze, squeeze_moved=moved)]
@@ -199,7 +199,7 @@ def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
     return items[0]
 
 
-def _plain(values: dict[Any, Any], key: str, path: Path) -> Any:
+def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
     """Text, a number, or an array of numbers under a key."""
     value = entry(values, key, f"{path}")
     if not isinstance(value, Inert):
@@ -235,7 +235,7 @@ def _posture(
     from scipy.spatial.transform import Rotation
 
     where = f"{path}: {stage}_qpos"
-    position, quaternion, joints = _pose(_plain(values, f"{stage}_qpos", path), len(order), where)
+    position, quaternion, joints = _pose(plain_entry(values, f"{stage}_qpos", path), len(order), where)
     into = Rotation.from_quat(np.roll(target[1], -1)).inv()
     palm = Rotation.from_quat(np.roll(PALMS.get(hand.name, (1.0, 0.0, 0.0, 0.0)), -1))
     base = into * Rotation.from_quat(np.roll(quaternion, -1)) * palm

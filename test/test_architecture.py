@@ -89,14 +89,14 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 25_150,
     "graspd_ros": 4_700,
-    "graspd_bench": 8_350,
+    "graspd_bench": 8_670,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
-    "test": 28_760,
+    "test": 28_980,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 20_050, "graspd_ros.node": 23_850}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 20_100, "graspd_ros.node": 23_900}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

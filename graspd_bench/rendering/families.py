@@ -65,10 +65,12 @@ def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:
     points = np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
     marching: Any = igl.marching_cubes
     vertices, faces = marching(field(points), points, *(len(axis) for axis in axes), 0.0)[:2]
+    # igl counts in an integer type that is not numpy's own of 64 bits.
+    faces = faces.astype(np.int32).astype(np.int64)
     a, b, c = vertices[faces].transpose(1, 0, 2)
     # Outwards where the field grows.
     outwards = np.einsum("ij,ij->", a, np.cross(b, c)) > 0
-    return TriangleMesh(np.ascontiguousarray(vertices), np.ascontiguousarray(faces if outwards else faces[:, ::-1]))
+    return TriangleMesh(np.array(vertices), faces if outwards else faces[:, ::-1])
 
 
 def _cone(*stations: tuple[float, float, float, float]) -> Field:

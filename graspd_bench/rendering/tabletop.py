@@ -114,6 +114,9 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
     hull = trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull
     poses, shares = trimesh.poses.compute_stable_poses(hull, center_mass=centre, sigma=0.0, n_samples=1, threshold=0.01)
     poses, shares = np.asarray(poses), np.asarray(shares)
+    if not len(poses):
+        # A ball rests on any of its many facets.
+        return lowest_pose(mesh)
     standing = np.flatnonzero(poses[:, 2, 2] > _UPRIGHT)
     upright = len(standing) > 0 and rng.random() < 0.5
     pose = np.eye(4)

@@ -1,0 +1,282 @@
+"""Our grasps through DexGraspBench's own evaluation, beside what our hold trial says of them.
+
+    graspd bench dexgraspbench FOLDER --python ENVIRONMENT/bin/python
+
+FOLDER is a checkout of the user's with its submodule, the environment one with its requirements. Its code runs in a
+child process and is never imported. Our grasps and objects are written to a temporary folder, in its format; so is a
+copy of its Allegro where that is changed. What it writes is read by a reader that runs nothing (`inert_pickle`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.study import ObjectCase, Record, Request, Sections, all_shapes, find_objects
+from graspd_core.errors import ConfigError, FormatError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.io.grasps_json import grasps_of, load_document
+from graspd_core.mesh.topology import moved_mesh
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.scene import Scene
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Grasp, Verdict
+from graspd_core.verify.world import Protocol
+from graspd_dataset.export_grasps import refuse_hand, write_dexgraspbench
+from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, numbers_of, plain_entry
+from graspd_dataset.run_records import markdown_table, thing_name
+
+NAME = "dexgraspbench"
+# Its object's mass [kg], and how far [m] and by how much [degrees] an object may move there.
+MASS, _TRAVEL, _TURN = 0.1, 0.05, 15.0
+# Files of a checkout that a result depends on; the first two are what is run.
+_MAIN, _ALLEGRO = "src/main.py", "assets/hand/allegro/right_hand.xml"
+_HASHED = ("src/**/*.py", "config/**/*.yaml", _ALLEGRO)
+# Seconds until it is called hung: its start, and one of its grasps.
+_START, _GRASP = 120.0, 60.0
+AS_IS, ARMATURE = "as it is", f"armature {Protocol().armature:g}"
+DIFFERENCES = f"""\
+Known differences of its evaluation from our hold trial:
+
+- Its Allegro's joints have no armature, ours {Protocol().armature:g} kg·m². Its links weigh 800 kg/m³.
+- Stiffness and softness of a contact are the mean of hand's and object's. Ours are the hand's.
+- A weld holds its hand's base, and gives.
+- No joint has an effort limit.
+- Targets move in ten jumps a stage, each held for 40 ms. Ours move with every step.
+- A pregrasp is refused that overlaps by more than 1 cm, the hand with itself too. Ours looks at hand and object.
+- The hand closes anew for each of the six pulls. Ours closes once.
+- Limits ({_TRAVEL * 100:g} cm, {_TURN:g}°) are looked at every 0.2 s of a pull, not while the hand closes.
+
+The object weighs {MASS:g} kg and has friction 0.6 in both. It is written about its centre of mass, of which ours says
+how far it moved."""
+
+
+@dataclass(frozen=True)
+class BenchCase(ObjectCase):
+    """The grasps of one object.
+
+    Attributes:
+        checkout: folder of DexGraspBench.
+        python: program that runs it.
+        armature: whether its Allegro is tried with our armature, too.
+        grasps: file of grasps that are taken; empty where they are planned.
+        content: hash of the checkout's code and of that file.
+    """
+
+    checkout: str
+    python: str
+    armature: bool
+    grasps: str
+    content: str
+
+    @property
+    def label(self) -> str:
+        return f"{thing_name(self.object)} {self.preset} {thing_name(self.hand)} seed {self.seed} {self.armature:d}"
+
+    def asked(self) -> Record:
+        """Where files lie does not count, what they hold does."""
+        return {name: value for name, value in super().asked().items() if name not in ("checkout", "python", "grasps")}
+
+
+def bench_cases(request: Request) -> tuple[BenchCase, ...]:
+    """One an object and seed. Raises GraspdError: no checkout, it does not start, or the request names what is not."""
+    if not request.checkout:
+        raise ConfigError(f"{NAME}: give the folder of a checkout: graspd bench {NAME} FOLDER --python PATH")
+    checkout, hand = Path(request.checkout).absolute(), request.hand or "allegro_right"
+    for name in (_MAIN, _ALLEGRO):
+        if not (checkout / name).is_file():
+            raise ConfigError(f"{request.checkout}: no checkout of DexGraspBench: {name} is missing")
+    refuse_hand(load_hand(hand, candidates=1).name)
+    python = shutil.which(request.python) if request.python else None
+    if python is None:
+        told = f"{request.python!r} is no program" if request.python else "not given"
+        raise ConfigError(f"python: {told}; --python PATH is that of an environment with DexGraspBench's requirements")
+    python = os.path.abspath(python)
+    objects = request.objects or all_shapes()[: 1 if request.quick else None]
+    if request.grasps:
+        document = load_document(request.grasps)
+        objects = request.objects or (str(document["object"]["source"]),)
+        refuse_hand(document["hand"]["name"])
+        if len(objects) > 1:
+            raise ConfigError(f"grasps: {request.grasps} is of one object, not of {len(objects)}")
+    _run([python, str(checkout / _MAIN), "--help"], Path(), _START)
+    files = sorted(path for glob in _HASHED for path in checkout.glob(glob) if path.is_file())
+    files += [Path(request.grasps)] if request.grasps else []
+    content = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    count = request.count or (2 if request.quick else 8)
+    where = {"checkout": str(checkout), "python": python, "armature": request.armature}
+    return tuple(
+        BenchCase(thing, request.preset(), hand, seed, count, grasps=request.grasps, content=content, **where)
+        for seed in request.seeds or (0,)
+        for thing in find_objects(objects)
+    )
+
+
+def run_bench(case: BenchCase) -> Record:
+    """All grasps that were tried here, verified or failed, and what becomes of them there."""
+    config = case.config
+    hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
+    if case.grasps:
+        document = load_document(case.grasps)
+        scene = load_scene(case.object, mass=MASS, scale=float(document["object"].get("scale", 1.0)))
+        grasps = grasps_of(document)
+    else:
+        scene = load_scene(case.object, mass=MASS, resolution=config.resolution)
+        grasps = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).grasps
+    ours = [{"verified": grasp.verdict is Verdict.VERIFIED, "reason": grasp.reason} for grasp in grasps]
+    with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
+        written = Path(folder) / "written"
+        paths = write_grasps(scene, hand, grasps, written)
+        theirs: dict[str, list[Record]] = {}
+        for variant in (AS_IS, ARMATURE)[: 1 + case.armature] if grasps else ():
+            xml = Path(case.checkout, _ALLEGRO)
+            if variant == ARMATURE:
+                xml = write_armature(xml, Path(folder) / "right_hand.xml", Protocol().armature)
+            theirs[variant] = evaluate(case, written, xml, paths)
+    return {"ours": ours, "theirs": theirs, "held": sum(own["verified"] for own in ours)}
+
+
+def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Path) -> list[Path]:
+    """Write grasps and object in its format, about the object's centre of mass; the files, relative to `out`."""
+    center, rows = scene.object.center_of_mass, []
+    for grasp in grasps:
+        row: dict[str, Any] = {"hand_name": hand.name, "object_sha256": scene.object.sha256, "mass": scene.object.mass}
+        for stage in STAGES:
+            posture = getattr(grasp, stage)
+            row[f"{stage}_position"] = posture.position - center
+            row[f"{stage}_quaternion_wxyz"] = posture.quaternion_wxyz
+            row[f"{stage}_joint_positions"] = posture.joint_positions
+        rows.append(row)
+    if rows:
+        # It takes a part's file from its own folder unless the path is whole.
+        write_dexgraspbench(rows, moved_mesh(scene.object.mesh, -center), out, objects=str(out.absolute() / "objects"))
+    return [Path(hand.name, scene.object.sha256, f"{number}.npy") for number in range(len(rows))]
+
+
+def write_armature(xml: Path, to: Path, armature: float) -> Path:
+    """Write a hand whose joints all have an armature [kg·m²]; its meshes stay where they are. Returns its path."""
+    tree = ElementTree.parse(xml)
+    for compiler in tree.iter("compiler"):
+        compiler.set("meshdir", str((xml.parent / compiler.get("meshdir", ".")).resolve()))
+    for body in tree.iter("worldbody"):
+        for joint in body.iter("joint"):
+            joint.set("armature", f"{armature:g}")
+    tree.write(to)
+    return to
+
+
+def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -> list[Record]:
+    """Run its evaluation on the grasps; of each whether it held, how far [m] and by how much [degrees] it moved.
+
+    Raises:
+        ConfigError: it ended with an error, or gave no result for a grasp.
+    """
+    results = Path(tempfile.mkdtemp(dir=written.parent))
+    options = {"task": "eval", "hand": "allegro", "setting": "fc", "exp_name": "graspd", "n_worker": "1"}
+    options |= {"task.max_num": "-1", "task.analytic_fc_metrics": "null", "task.obj_mass": f"{MASS:g}"}
+    places = {"save_root": results, "grasp_dir": written, "eval_dir": results / "evaluation", "hand.xml_path": xml}
+    options |= {name: "'" + str(path).replace("'", "\\'") + "'" for name, path in places.items()}
+    command = [case.python, str(Path(case.checkout, _MAIN)), *(f"{name}={value}" for name, value in options.items())]
+    told = _run(command, results, _START + _GRASP * len(paths))
+    found = []
+    for path in paths:
+        file = results / "evaluation" / path
+        if not file.is_file():
+            raise ConfigError(f"DexGraspBench gave no result for a grasp: {told}")
+        try:
+            values = npy_dictionary(file, file.read_bytes())
+            held, travel, turn = (
+                float(numbers_of(plain_entry(values, key, file), (), f"{file}: {key}"))
+                for key in ("succ_flag", "delta_pos", "delta_angle")
+            )
+        except FormatError as error:
+            raise ConfigError(f"DexGraspBench gave a result that cannot be read: {error}") from None
+        found.append({"held": bool(held), "travel": travel, "turn": turn})
+    return found
+
+
+def _run(command: Sequence[str], folder: Path, patience: float) -> str:
+    """Run its code; the last line that it wrote. Raises ConfigError: it ended with an error, or did not end."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    try:
+        done = subprocess.run(
+            command,
+            cwd=folder,
+            env={**kept, "PYTHONDONTWRITEBYTECODE": "1"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=patience,
+        )
+    except OSError as error:
+        raise ConfigError(f"python: {command[0]}: {error.strerror or error}") from None
+    except subprocess.TimeoutExpired:
+        raise ConfigError(f"DexGraspBench did not end within {patience:.0f} s") from None
+    lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+    last = lines[-1][:300] if lines else "it wrote nothing"
+    if done.returncode:
+        raise ConfigError(f"DexGraspBench ended with an error: {last} (exit status {done.returncode}, {command[0]})")
+    return last
+
+
+def why_failed(there: Record) -> str:
+    """Why a grasp did not hold there, in a few words."""
+    # So it says that a pregrasp was refused.
+    if there["travel"] >= 100 and there["turn"] >= 100:
+        return "refused: the pregrasp overlaps the object, or the hand itself, by more than 1 cm"
+    if not np.isfinite([there["travel"], there["turn"]]).all():
+        return "the simulation diverged"
+    if there["travel"] >= _TRAVEL:
+        return f"the object moved more than {_TRAVEL * 100:g} cm"
+    return f"the object turned more than {_TURN:g}°"
+
+
+def bench_came(record: Record) -> str:
+    """How many of the verified grasps hold there."""
+    pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
+    return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
+
+
+def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:
+    """Of every grasp whether it is verified here, and what became of it there."""
+    return [
+        (own["verified"], there)
+        for record in records
+        if variant in record["theirs"]
+        for own, there in zip(record["ours"], record["theirs"][variant], strict=True)
+    ]
+
+
+def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """One table, a row for every object and Allegro and for all objects together; the reasons, the differences."""
+    headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
+    headings += ["by neither", "of the verified"]
+    groups = [(thing_name(record["object"]), [record]) for record in records]
+    groups += [("**all**", list(records))] if len(records) > 1 else []
+    variants = [name for name in (AS_IS, ARMATURE) if any(name in record["theirs"] for record in records)]
+    body, reasons = [], []
+    for name, some in groups:
+        for variant in variants:
+            cells = Counter((verified, there["held"]) for verified, there in _pairs(some, variant))
+            both, alone = cells[True, True], cells[True, False]
+            share = f"{both / (both + alone):.0%}" if both + alone else "–"
+            numbers = [cells.total(), both + alone, both, alone, cells[False, True], cells[False, False]]
+            body.append([name, variant, *map(str, numbers), share])
+    for variant in variants:
+        lost = [there for verified, there in _pairs(records, variant) if verified and not there["held"]]
+        told = "; ".join(f"{count}: {why}" for why, count in Counter(map(why_failed, lost)).most_common())
+        reasons.append(f"Held by ours only, {variant}: {told or 'none'}.")
+    return {NAME: [markdown_table(headings, body), "\n".join(reasons), DIFFERENCES]}
