@@ -18,10 +18,10 @@ ALL = "all"
 LESS_SURE = "less sure"
 FILTERS = (ALL, "verified", LESS_SURE, "unverified", "failed")
 # Metrics of which less is better; of all others more is.
-_LESS = ("penetration", "self_penetration", "intersection_volume")
+_LESS = ("penetration", "contact_depth", "self_penetration", "intersection_volume", "least_friction")
 ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
 # Columns of the table, and how many rows are shown about the chosen one.
-_COLUMNS, _AROUND = ("epsilon", "penetration", "contact_area"), 2
+_COLUMNS, _AROUND = ("payload", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _OTHER_FIGURES = {
     "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",

@@ -112,7 +112,10 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
 
     centre = mass_properties(mesh)[1]
     hull = trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull
-    poses, shares = trimesh.poses.compute_stable_poses(hull, center_mass=centre, sigma=0.0, n_samples=1, threshold=0.01)
+    # It takes the root of what rounding leaves below zero, of facets that are next to none.
+    with np.errstate(invalid="ignore"):
+        given = {"center_mass": centre, "sigma": 0.0, "n_samples": 1, "threshold": 0.01}
+        poses, shares = trimesh.poses.compute_stable_poses(hull, **given)
     poses, shares = np.asarray(poses), np.asarray(shares)
     if not len(poses):
         # A ball rests on any of its many facets.

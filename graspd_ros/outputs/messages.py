@@ -453,9 +453,9 @@ def _axes(T_frame_base: Matrix) -> Iterator[Marker]:
 
 def _text(grasp: Grasp, rank: int, T_frame_base: Matrix) -> Marker:
     lines = [f"#{rank} {grasp.verdict}"]
-    epsilon = (grasp.metrics or {}).get("epsilon")
-    if epsilon is not None:
-        lines.append(f"ε {epsilon:.3f}")
+    payload = (grasp.metrics or {}).get("payload")
+    if payload is not None:
+        lines.append(f"holds {payload:.2g} kg")
     if grasp.reason:
         lines.append(grasp.reason)
     above = _matrix(np.eye(3), T_frame_base[:3, 3] + [0.0, 0.0, _TEXT_ABOVE])

@@ -280,7 +280,7 @@ def grasp(verdict: Verdict = Verdict.VERIFIED, seed: int = 0) -> Grasp:
     joints = HAND.lower + random.random(HAND.num_joints) * (HAND.upper - HAND.lower)
     posture = Posture(random.normal(size=3), np.roll(Rotation.random(rng=random).as_quat(), 1), joints)
     contact = Contact("link_3.0", (0.1, 0.2, 0.3), (0.0, 0.0, 1.0))
-    metrics = GraspMetrics({"epsilon": 0.1234})
+    metrics = GraspMetrics({"epsilon": 0.1234, "payload": 1.234})
     reason = "the object turned 40°" if verdict is Verdict.FAILED else ""
     trials = () if verdict is Verdict.UNVERIFIED else (TrialResult("hold", not reason, 0.0, 0.7, reason),)
     return Grasp(posture, posture, posture, (contact,), 1.0, metrics, trials)
@@ -377,7 +377,7 @@ def test_colour_and_text_tell_the_verdict(verdict: Verdict):
     assert colours == {COLOURS[verdict]}
     (text,) = of(found, "text")
     assert text.text.startswith(f"#0 {verdict}")
-    assert "0.123" in text.text
+    assert "holds 1.2 kg" in text.text
     assert ("turned 40°" in text.text) == (verdict is Verdict.FAILED)
     assert text.scale.z > 0
 
