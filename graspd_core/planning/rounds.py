@@ -19,7 +19,7 @@ from graspd_core.optimize.loop import Hooks, Poses
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.perception.scene import Scene
-from graspd_core.types import Grasp, Snapshot, Stage
+from graspd_core.types import Grasp, Snapshot, Stage, Verdict
 from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.verification import (
@@ -170,7 +170,10 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
-        if attempt and not state.good and ahead is not None and scene.object.mass_assumed and state.mass is None:
+        # A second round seeks stronger grasps, unless not even the likeliest shape was held in the first.
+        doubted = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
+        too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed
+        if too_heavy and ahead is not None and state.mass is None:
             state = _tried_lighter(run, scene, ahead, state, config.certainty, count)
             if state.good >= count or run.over():
                 break
