@@ -141,7 +141,7 @@ _YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
 
 
 def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan at the friction of the case, for 0.1 kg; try at every mass."""
+    """Plan at the friction of the case, for 0.1 kg, and try at every mass."""
     config = settings(case.preset)
     scene = load_scene(
         f"shape:{case.thing}", mass=PROTOCOL_MASS, friction=float(case.across), resolution=config.resolution

@@ -98,7 +98,7 @@ def _box(centre: tuple[float, float, float], half: tuple[float, float, float], r
 
 
 def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
-    """A body of (height, radius), rounded at its ends; `flat` shrinks its depth, y."""
+    """A body of (height, radius), rounded at its ends. `flat` shrinks its depth, y."""
     heights, radii = np.array(profile).T
 
     def field(points: Points) -> Distance:

@@ -80,7 +80,7 @@ class CameraView(Case):
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
-    """Every thing from some places, cameras and crowds taking turns; scans are those of --objects."""
+    """Every thing from some places, cameras and crowds taking turns. Scans are those of --objects."""
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -141,7 +141,7 @@ def _share_seen(scene: TabletopScene, lens: PinholeCamera, pose: np.ndarray) -> 
 
 
 def run_view(case: CameraView) -> Record:
-    """Plan on the view, and try what is verified on the truth; a refusal is a result with its message."""
+    """Plan on the view, and try what is verified on the truth. A refusal is a result with its message."""
     stage, cloud, mass, target = view_of(case)
     hand = load_hand(case.hand)
     surface = ReconstructionConfig(poisson="open3d" if case.way == OPEN3D else "grid")

@@ -150,7 +150,7 @@ def run_bench(case: BenchCase) -> Record:
 
 
 def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Path) -> list[Path]:
-    """Write grasps and object in its format, about the object's centre of mass; the files, relative to `out`."""
+    """Write grasps and object in its format, about the object's centre of mass. Return the files, relative to `out`."""
     center, rows = scene.object.center_of_mass, []
     for grasp in grasps:
         row: dict[str, Any] = {"hand_name": hand.name, "object_sha256": scene.object.sha256, "mass": scene.object.mass}
@@ -167,7 +167,7 @@ def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Pa
 
 
 def write_armature(xml: Path, to: Path, armature: float) -> Path:
-    """Write a hand whose joints all have an armature [kg·m²]; its meshes stay where they are. Returns its path."""
+    """Write a hand whose joints all have an armature [kg·m²]. Its meshes stay where they are. Return its path."""
     tree = ElementTree.parse(xml)
     for compiler in tree.iter("compiler"):
         compiler.set("meshdir", str((xml.parent / compiler.get("meshdir", ".")).resolve()))
@@ -179,7 +179,7 @@ def write_armature(xml: Path, to: Path, armature: float) -> Path:
 
 
 def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -> list[Record]:
-    """Run its evaluation on the grasps; of each whether it held, how far [m] and by how much [degrees] it moved.
+    """Run its evaluation on the grasps. Return of each whether it held, how far [m] and by how much [degrees] it moved.
 
     Raises:
         ConfigError: it ended with an error, or gave no result for a grasp.
@@ -209,7 +209,7 @@ def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -
 
 
 def _run(command: Sequence[str], folder: Path, patience: float) -> str:
-    """Run its code; the last line that it wrote. Raises ConfigError: it ended with an error, or did not end."""
+    """Run its code and return the last line that it wrote. Raises ConfigError: it ended with an error, or never."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     try:
         done = subprocess.run(
@@ -262,7 +262,7 @@ def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]
 
 
 def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """One table, a row for every object and Allegro and for all objects together; the reasons, the differences."""
+    """One table, a row for every object and Allegro and for all objects together, the reasons and the differences."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
     groups = [(thing_name(record["object"]), [record]) for record in records]

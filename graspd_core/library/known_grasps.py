@@ -284,7 +284,7 @@ def add_planned(
     verify: str,
     name: str = "",
 ) -> int:
-    """Put the verified grasps of a run into the library, with the trial of the object alone; how many it has then.
+    """Put the verified grasps of a run into the library, with the trial of the object alone. Return how many it has.
 
     Raises FormatError: the library cannot be written.
     """

@@ -59,7 +59,7 @@ def _is_thin(query: DistanceQuery, points: Points, normals: Points, probe: float
 
 
 def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray, "points 3"]:
-    """Points evenly along the edges where faces meet at more than 20°, or end [m]; `count`, none on a smooth mesh."""
+    """Points evenly along the edges where faces meet at more than 20°, or end [m]. Return `count`, or none."""
     scaled, faces = scaled_normals(mesh.vertices, mesh.faces), mesh.faces
     normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
     sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]))

@@ -181,7 +181,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Which links are too deep in each other in the current state; empty if none. Adjacent ones never collide."""
+    """Which links are too deep in each other in the current state, empty if none. Adjacent ones never collide."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]

@@ -165,7 +165,7 @@ def penetration(context: MetricsContext, placed: PlacedHand) -> float:
 
 
 def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
-    """MuJoCo's deepest contact of hand and object at a posture [m]; None without a world."""
+    """MuJoCo's deepest contact of hand and object at a posture [m], or None without a world."""
     if context.world is None:
         return None
     with trial_data(context.world) as data:

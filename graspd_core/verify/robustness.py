@@ -139,7 +139,7 @@ class HypothesisStage:
 
 
 class LaterWorld:
-    """A world that is made in a thread once somebody asks for it, and then kept; None where there is none."""
+    """A world that is made in a thread once somebody asks for it, and then kept. It is None where there is none."""
 
     def __init__(self, make: Callable[[], World | None]):
         self._make, self._begun, self._asked = make, None, threading.Lock()
@@ -194,7 +194,7 @@ def begin_other_worlds(
 def hypotheses_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> Hypotheses | None:
-    """All that a grasp must hold under to be as sure as asked for, `others` from `begin_other_worlds`; None: nothing.
+    """All that a grasp must hold under to be as sure as asked for, `others` from `begin_other_worlds`. None: nothing.
 
     Where the mass is known, it must hold in all places, and with less friction.
     """
@@ -237,7 +237,7 @@ def try_hypotheses(
     stop: StopHook,
     hold_under: HoldUnder = one_by_one,
 ) -> tuple[TrialResult, float]:
-    """Hold trials of a grasp under each in turn, until enough hold or too many fail; and how likely it is to hold.
+    """Hold trials of a grasp under each in turn, until enough hold or too many fail, and how likely it is to hold.
 
     The result tells the greatest travel and turn of the trials that were passed. `hold_under` is given a stage at a
     time.

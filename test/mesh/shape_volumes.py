@@ -1,4 +1,4 @@
-"""Closed-form volumes of the authored shapes [m³]; overlaps count once."""
+"""Closed-form volumes of the authored shapes [m³]. Overlaps count once."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ FAILED, PASSED = (0.5, 0.6), 0.9
 
 
 def under(*stages: Sequence[bool | None], least: int | None = None) -> Hypotheses:
-    """Hypotheses that a grasp passes, fails, or that cannot be tried; `least` of a stage must hold it, or all."""
+    """Hypotheses that a grasp passes, fails, or that cannot be tried. `least` of a stage must hold it, or all."""
 
     def hypothesis(number: str, held: bool | None) -> Hypothesis:
         result = None

@@ -1,4 +1,4 @@
-"""Irregular things are closed, of a hand's size and heavy as such things are; cameras err as their makers say."""
+"""Irregular things are closed, of a hand's size and heavy as such things are. Cameras err as their makers say."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a trial refuses before the hand moves: links in each other, a grasp deep in the object; by name."""
+"""What a trial refuses before the hand moves: links in each other, and a grasp deep in the object, by name."""
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
