@@ -206,7 +206,7 @@ def _message(path: Path) -> Any:
 
     from graspd_core.errors import FormatError
     from graspd_core.io.bags import CLOUD, IMAGE, INFO, TRANSFORMS, jazzy_types
-    from graspd_core.io.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
+    from graspd_core.io.messages import ORIGIN, add_transforms, cloud_from_depth_message, no_lookup, stamp_of
     from graspd_core.perception.cloud.camera import PinholeCamera
     from graspd_core.transforms import TransformBuffer
 
@@ -217,7 +217,7 @@ def _message(path: Path) -> Any:
     except Exception as error:  # the library's own affair: BagError names it
         raise FormatError("not a message") from error
     if kind == CLOUD:
-        return cloud_from_message(message)
+        return ORIGIN.cloud(message, no_lookup)
     if kind == TRANSFORMS:
         return add_transforms(TransformBuffer(), message, static=False)
     stamp_of(message)

@@ -16,6 +16,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
+from graspd_core.io.messages import CameraPlace
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.types import GraspResult, Outcome, Timing
@@ -131,6 +132,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--topic", default=None, help="of clouds or depth images, where a bag has several")
     parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="of the depth images' camera")
     parser.add_argument("--frame", default=None, help="put clouds into this frame by the bag's /tf and /tf_static")
+    parser.add_argument("--sensor-frame", default="", metavar="FRAME", help="of the clouds' camera, in the bag's /tf")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="take one cloud of N")
     parser.add_argument("--limit", type=int, default=None, metavar="N", help="end after N clouds")
 
@@ -143,6 +145,10 @@ def add_object_options(parser: argparse.ArgumentParser) -> None:
         help="a point on the object, in metres; else what is nearest the axis of view",
     )  # fmt: skip
     which.add_argument("--alone", action="store_true", help="the clouds show the object and nothing else")
+    parser.add_argument(
+        "--view-point", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
+        help="where the camera of a cloud stood, in metres in the cloud's frame; else at the origin",
+    )  # fmt: skip
     parser.add_argument(
         "--scene", type=Path, default=None, metavar="FILE.yaml",
         help="settings of segmentation, reconstruction and obstacles (docs/clouds.md)",
@@ -175,18 +181,20 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
     Raises:
         BagError: nothing can be read, or the frame wanted is not in the bag.
     """
-    transforms = None
+    transforms, place = None, CameraPlace(options.view_point, options.sensor_frame)
     frames = read_frames(
         path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit
     )
     for frame in frames:
-        if transforms is None and options.frame and options.frame.removeprefix("/") != frame.frame.removeprefix("/"):
-            transforms = read_transforms(path)
-            if options.frame.removeprefix("/") not in transforms.frames():
+        for name in (options.frame, options.sensor_frame):
+            if not name or name.removeprefix("/") == frame.frame.removeprefix("/"):
+                continue
+            transforms = transforms or read_transforms(path)
+            if name.removeprefix("/") not in transforms.frames():
                 known = ", ".join(transforms.frames())
-                raise BagError(f"{path}: no frame {options.frame!r}; its transforms know: {known}")
+                raise BagError(f"{path}: no frame {name!r}; its transforms know: {known}")
         try:
-            yield frame, frame.view(transforms, options.frame)
+            yield frame, frame.view(transforms, options.frame, place)
         except (CloudError, TransformError) as error:
             yield frame, str(error)
 
@@ -222,7 +230,7 @@ def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...
     from graspd_core.perception.cloud import cloud_files
 
     if not is_bag(path):
-        return cloud_files.load_views(path)
+        return cloud_files.load_views(path, None if options.view_point is None else np.array(options.view_point))
     chosen = argparse.Namespace(**{**vars(options), "limit": options.limit or 1})
     return merged_views(path, chosen)
 

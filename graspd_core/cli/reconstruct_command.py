@@ -32,18 +32,13 @@ def run(options: argparse.Namespace) -> int:
     """Returns the exit status."""
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
-    from graspd_core.perception.reconstruct.reconstruct import reconstruct
-    from graspd_core.perception.segment.segment import segment
+    from graspd_core.perception.scene_from_views import reconstruct_object
 
     check_bag_options(options)
     check_writable(options.out)
     settings = scene_config_of(options)
     views = load_views(options.cloud, options)
-    support, warnings = None, ()
-    if not options.alone:
-        seen = segment(views, target=target_of(options), settings=settings.segmentation)
-        views, support, warnings = seen.views, seen.support, seen.warnings
-    whole = reconstruct(views, support=support, settings=settings.reconstruction)
+    whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
     mesh = whole.mesh
     save_mesh(mesh, options.out)
     for warning in (*warnings, *whole.warnings):

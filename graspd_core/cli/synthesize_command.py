@@ -74,6 +74,7 @@ def run(options: argparse.Namespace) -> int:
                 scale=_UNITS[options.units] if options.units else options.scale,
                 target=target_of(options),
                 alone=options.alone,
+                view_point=options.view_point,
                 settings=scene_config_of(options),
             )
             hand = load_hand(options.hand)

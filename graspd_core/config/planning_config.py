@@ -121,6 +121,8 @@ MASS_ASSUMED = HeldShares(0.92, 0.94, 0.98, 0.87, 0.83)
 MASS_KNOWN = HeldShares(0.70, 0.89, 0.95, 0.60, 0.59)
 # The share of the latter that holds where the hand could not hold what was assumed: some things are heavier than tried.
 LIGHTER_SHARE = 0.9
+# The share that holds of grasps on a scene that something speaks against, as a cloud whose camera stood elsewhere.
+DOUBTED_SHARE = 0.6
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from graspd_core.errors import BagError, TransformError
-from graspd_core.io.messages import add_transforms, cloud_from_depth_message, cloud_from_message, stamp_of
+from graspd_core.errors import BagError
+from graspd_core.io.messages import (
+    ORIGIN,
+    CameraPlace,
+    add_transforms,
+    cloud_from_depth_message,
+    no_lookup,
+    stamp_of,
+)
 from graspd_core.perception.cloud.camera import (
     ENCODINGS,
 )
@@ -58,25 +65,26 @@ class BagFrame:
     message: Any
     info: Any = None
 
-    def view(self, transforms: TransformBuffer | None = None, target: str | None = None) -> PointCloud:
-        """What the camera saw, in its own frame or in `target`.
+    def view(
+        self, transforms: TransformBuffer | None = None, target: str | None = None, place: CameraPlace = ORIGIN
+    ) -> PointCloud:
+        """What the camera saw, in its own frame or in `target`; a cloud's camera stood at `place`.
 
         Raises:
             CloudError: the message is broken or shows nothing.
             TransformError: where the frame stood in `target` is not known for that time.
         """
+        # A driver that does not stamp its messages leaves zero: then the newest transform has to do.
+        lookup = no_lookup if transforms is None else lambda to, of: transforms.lookup(to, of, self.stamp or None)
         if self.info is None:
-            cloud = cloud_from_message(self.message)
+            cloud = place.cloud(self.message, lookup)
         else:
             # REP 118 and image_pipeline: rectified images say so in the last part of their name.
             rectified = re.search(r"(^|_)rect(_|$)", self.topic.rsplit("/", 1)[-1]) is not None
             cloud = cloud_from_depth_message(self.message, self.info, rectified=rectified)
         if target is None or target.removeprefix("/") == self.frame.removeprefix("/"):
             return cloud
-        if transforms is None:
-            raise TransformError(f"transform {self.frame} -> {target}: no transforms are given")
-        # A driver that does not stamp its messages leaves zero: then the newest transform has to do.
-        return transform_cloud(cloud, transforms.lookup(target, self.frame, self.stamp or None))
+        return transform_cloud(cloud, lookup(target, self.frame))
 
 
 def is_bag(path: str | Path) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from graspd_core.perception.cloud.point_cloud import (
     organised_points,
     points_from_layout,
 )
+from graspd_core.perception.cloud.viewpoint_check import seen_from
 from graspd_core.transforms import SECOND, TransformBuffer
 
 
@@ -56,11 +59,40 @@ def _layout(message: Any) -> CloudLayout:
     )
 
 
-def cloud_from_message(message: Any) -> PointCloud:
-    """A sensor_msgs/PointCloud2 as seen from the origin of its frame. Raises CloudError as `points_from_message`."""
-    # REP 103: the frames of cameras whose z axis is the optical axis are called so.
-    optical = message.header.frame_id.endswith("optical_frame")
-    return PointCloud(points_from_message(message), np.zeros(3), np.array([0.0, 0.0, 1.0]) if optical else None)
+@dataclass(frozen=True)
+class CameraPlace:
+    """Where a cloud's camera stood; nothing given: at the origin of the cloud's frame.
+
+    `view_point`, in the cloud's frame [m], goes before `sensor_frame`, at whose origin it stood. It looked along z if
+    the name of its frame ends in optical_frame (REP 103).
+    """
+
+    view_point: tuple[float, float, float] | None = None
+    sensor_frame: str = ""
+
+    def cloud(self, message: Any, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]) -> PointCloud:
+        """Return a sensor_msgs/PointCloud2 as its camera saw it; `lookup` gives `T_target_source` of two frames.
+
+        Raises:
+            CloudError: as `points_from_message`, or the pixels show that the camera stood elsewhere.
+            TransformError: nothing tells where the camera's frame stood.
+        """
+        T, frame = np.eye(4), message.header.frame_id
+        if self.view_point is not None:
+            T[:3, 3], optical = self.view_point, False
+        else:
+            optical = (self.sensor_frame or frame).endswith("optical_frame")
+            if self.sensor_frame.removeprefix("/") not in ("", frame.removeprefix("/")):
+                T = lookup(frame, self.sensor_frame)
+        return seen_from(pixels_from_message(message), T[:3, 3], T[:3, 2] if optical else None)
+
+
+ORIGIN = CameraPlace()
+
+
+def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
+    """Look a frame up where no transforms are known. Raises TransformError."""
+    raise TransformError(f"transform {source} -> {target}: no transforms are given")
 
 
 def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from graspd_core.config import SceneConfig
@@ -30,6 +32,7 @@ def load_scene(
     device: torch.device | str = "cpu",
     target: Target | None = None,
     alone: bool = False,
+    view_point: Sequence[float] | None = None,
     settings: SceneConfig | None = None,
 ) -> Scene:
     """Build the scene of one object.
@@ -42,6 +45,7 @@ def load_scene(
         resolution: the distance grid has at most the cube of it in nodes; `plan_grasps` goes by its preset.
         target: which of the things in a cloud is meant.
         alone: a cloud shows the object and nothing else.
+        view_point: where a cloud's camera stood [m]; None: where its file says, else at the origin.
         settings: how a cloud becomes a scene.
 
     Raises:
@@ -56,13 +60,17 @@ def load_scene(
         # A mesh needs none of what makes an object of a cloud.
         from graspd_core.perception.scene_from_views import scene_from_views
 
+        place = None if view_point is None else np.asarray(view_point, dtype=float) / scale
         views = [
-            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
+            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale)
+            for view in load_views(source, place)
         ]
         scene = scene_from_views(
             views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
         )
         return replace(scene, object=replace(scene.object, scale=scale))
+    if view_point is not None:
+        raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
     mesh, warnings = _read_mesh(source, scale)
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 

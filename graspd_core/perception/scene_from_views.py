@@ -6,18 +6,26 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from graspd_core.config import SceneConfig
-from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.errors import CloudError
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points
+from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere
 from graspd_core.perception.obstacles import make_obstacles
-from graspd_core.perception.reconstruct.merge_views import Evidence
+from graspd_core.perception.reconstruct.merge_views import Evidence, is_unposed
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
 from graspd_core.perception.scene import ObjectModel, Obstacle, Scene, build_scene, refuse_numbers
 from graspd_core.perception.segment.segment import Segmentation, segment
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane, TriangleMesh
+
+# From here on numbers of 32 bits are coarser than a camera [m].
+_FAR = 100.0
+# Depth cameras see nothing nearer [m]. Where more than this share of a scene is too far, it is not one on a table.
+_NEAREST, _CUT_OFF = 0.1, 0.3
 
 
 def scene_from_views(
@@ -54,7 +62,7 @@ def scene_from_views(
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
     settings = settings or SceneConfig()
     # The child, where there is one, is free for other work while the distance grid is built here.
-    whole, support, obstacles, warnings = run_isolated(_reconstructed, views, target, alone, settings)
+    whole, support, obstacles, warnings = run_isolated(reconstruct_object, views, target, alone, settings)
     scene = build_scene(
         whole.mesh,
         source=source,
@@ -72,16 +80,65 @@ def scene_from_views(
     return replace(scene, evidence=whole.evidence)
 
 
-def _reconstructed(
+def reconstruct_object(
     views: Sequence[PointCloud], target: Target | None, alone: bool, settings: SceneConfig
 ) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
-    """The surface of the object, what it stands on, what stands about it, and how surely it was cut out."""
+    """Return the surface of the object, what it stands on, what stands about it, and how surely it was cut out.
+
+    Raises:
+        CloudError: as `segment` and `reconstruct`, or a camera cannot have stood where it is said to.
+    """
+    # The same cloud in numbers of 32 and of 64 bits is the same scene.
+    views = [replace(view, points=_single(view.points)) for view in views]
     if alone:
         seen = Segmentation(tuple(views), None, (), ())
     else:
+        check_scene(views)
         seen = segment(views, target=target, settings=settings.segmentation)
+    doubts = _doubts(seen, views, settings.segmentation.max_range)
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
-    return whole, seen.support, _obstacles(seen, whole.mesh, settings), seen.warnings
+    whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts))
+    told = tuple(f"cloud: {doubt}; no grasp counts as verified" for doubt in doubts)
+    return whole, seen.support, _obstacles(seen, whole.mesh, settings), seen.warnings + told
+
+
+def _single(points: Points) -> Points:
+    """Points rounded to 32 bits [m], unless they are too far from the origin for those."""
+    near = np.abs(points[np.isfinite(points)]).max(initial=0.0) < _FAR
+    return points.astype(np.float32).astype(float) if near else points
+
+
+def _doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
+    """Why what is seen may not be what was there: nothing that is planned on it counts as verified."""
+    return (*_unit_doubts(seen, views, farthest), *_camera_doubts(seen, views))
+
+
+def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
+    away = np.concatenate([np.linalg.norm(view.points[::50] - view.viewpoint, axis=1) for view in views])
+    beyond = float((away[np.isfinite(away)] > farthest).mean()) if np.isfinite(away).any() else 0.0
+    thing = float(np.median(np.linalg.norm(seen.views[0].points - seen.views[0].viewpoint, axis=1)))
+    asked = "are its numbers metres? (the camera's depth unit; --units or --scale for a file)"
+    if thing < _NEAREST and seen.views[0].posed:
+        return (f"the object is {1e3 * thing:.0f} mm from its camera, nearer than depth cameras see: {asked}",)
+    if seen.support is None and (seen.cut or beyond > _CUT_OFF):
+        told = f"no support is seen, and {100 * beyond:.0f} % of the points are beyond {farthest:g} m"
+        return (f"{told if beyond > _CUT_OFF else 'no support is seen, and the object is cut off'}: {asked}",)
+    return ()
+
+
+def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str, ...]:
+    by_eye = {tuple(view.viewpoint.astype(float)): view for view in views}
+    up = None if seen.support is None else np.asarray(seen.support.normal, dtype=float)
+    try:
+        told = [check_thing(thing, by_eye[tuple(thing.viewpoint.astype(float))], up) for thing in seen.views]
+    except CloudError:
+        first = seen.views[0]
+        if len(seen.views) == 1 and fits_nowhere(first) and is_unposed(first, first.forward is not None):
+            # It shows an object from all round, so that no camera counts.
+            return ()
+        raise
+    # Views of several sides explain each other.
+    return tuple(told) if len(told) == 1 and told[0] else ()
 
 
 def _obstacles(seen: Segmentation, mesh: TriangleMesh, settings: SceneConfig) -> tuple[Obstacle, ...]:

@@ -167,7 +167,9 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     if scene.evidence is None or not held:
         return result
     told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None
-    if scene.evidence.hidden:
+    if scene.evidence.doubts:
+        told += f": {scene.evidence.doubts[0]}"
+    elif scene.evidence.hidden:
         from graspd_core.perception.reconstruct.hidden_side import next_view
 
         told += ", since a part of the object was guessed"

@@ -18,7 +18,7 @@ from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
 
-from graspd_core.config.planning_config import MASS_ASSUMED, MASS_KNOWN, HeldShares
+from graspd_core.config.planning_config import DOUBTED_SHARE, MASS_ASSUMED, MASS_KNOWN, HeldShares
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
@@ -163,11 +163,13 @@ class Hypotheses:
         stages: places, which are cheap to try, then other shapes.
         probability: that a grasp which holds under all of them holds on the true object.
         waited_for: set once a trial waits for its world: there is time for other work.
+        doubts: what speaks against the scene itself. No grasp is tried under anything else then, and none passes.
     """
 
     stages: tuple[HypothesisStage, ...]
     probability: float
     waited_for: threading.Event = field(default_factory=threading.Event)
+    doubts: tuple[str, ...] = ()
 
 
 def begin_other_worlds(
@@ -199,6 +201,8 @@ def hypotheses_of(
     Where the mass is known, it must hold in all places, and with less friction.
     """
     shares = held_shares(scene.object)
+    if scene.evidence is not None and scene.evidence.doubts:
+        return Hypotheses((), DOUBTED_SHARE, doubts=scene.evidence.doubts)
     if scene.evidence is None or probability <= shares.likeliest:
         return None
     places = [
@@ -243,6 +247,8 @@ def try_hypotheses(
     time.
     """
     travel = turn = 0.0
+    if hypotheses.doubts:
+        return TrialResult(HYPOTHESES, False, travel, turn, hypotheses.doubts[0]), hypotheses.probability
     for stage in hypotheses.stages:
         held, reasons = 0, []
         with closing(hold_under(stage, grasp, stop)) as results:
@@ -269,7 +275,7 @@ def held_shares(target: ObjectModel) -> HeldShares:
 
 
 def _rules_needed(evidence: Evidence | None, probability: float, shares: HeldShares) -> tuple[str, ...]:
-    if evidence is None or probability <= shares.places:
+    if evidence is None or evidence.doubts or probability <= shares.places:
         return ()
     from graspd_core.perception.reconstruct.hidden_side import other_rules
 

@@ -203,7 +203,9 @@ def run_trials(
     verified: list[Grasp] = []
     others: list[Grasp] = []
     metrics: list[Future[GraspMetrics]] = []
-    threads = torch.get_num_threads()
+    threads, doubted = torch.get_num_threads(), 0
+    # Where the scene itself is doubted, none is verified: so many that hold on it are as good an answer.
+    hopeless = context.hypotheses is not None and bool(context.hypotheses.doubts)
     first = None
     seen = None if run.watch is None else candidates_seen(candidates)
     # The first answer comes sooner where the best candidate is tried under several hypotheses at a time.
@@ -222,7 +224,8 @@ def run_trials(
             if seen is not None:
                 seen = replace(seen, verdicts=(*seen.verdicts[:index], tried.verdict, *seen.verdicts[index + 1 :]))
                 run.show(seen)
-            enough = len(verified) + passed == count
+            doubted += tried.verdict is Verdict.UNVERIFIED
+            enough = len(verified) + passed + (doubted if hopeless else 0) == count
             if enough:
                 # What is tried ahead takes no more time from measuring.
                 trials.close()

@@ -26,6 +26,8 @@ from std_msgs.msg import Header
 
 from graspd_core import Box, NearPoints, Scene, Sphere, Steering, Target, load_scene, preset_names
 from graspd_core.errors import MeshError
+from graspd_core.io.messages import CameraPlace
+from graspd_core.perception.cloud.viewpoint_check import check_scene
 from graspd_core.planning.steering import zero_of_roll
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.convert import Matrix, moved_points, nanoseconds, near, pose_matrix, wxyz_of_matrix
@@ -80,7 +82,9 @@ class RequestBuilder:
     def add_view(self, settings: Settings) -> None:
         """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
         frame = latest_frame(self.newest, nanoseconds(self._now()), settings)
-        cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup, alone=not settings.segment)
+        cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup)
+        if settings.segment:
+            check_scene([cloud])
         self.views = self.views.add(frame, cloud, settings, self.lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
@@ -339,7 +343,7 @@ def known_mesh(path: Path, settings: Settings) -> KnownObject | None:
 def frame_loader(
     frame: SensorFrame,
     settings: Settings,
-    place: seen.CameraPlace,
+    place: CameraPlace,
     lookup: Lookup,
     point: Float[np.ndarray, "3"] | None = None,
     mask: Image | None = None,
@@ -350,13 +354,13 @@ def frame_loader(
     """
 
     def load() -> Scene:
-        cloud = seen.seen_by_camera(frame, place, lookup, alone=not settings.segment)
+        cloud = seen.seen_by_camera(frame, place, lookup)
         if mask is None:
             target = None if point is None else Target(point=point)
             return seen.scene_of_views((seen.trimmed(cloud, settings),), settings, target)
-        cloud, shown = seen.masked_cloud(frame, cloud, mask)
-        inside = seen.within(cloud.points, settings)
-        return seen.scene_of_views((replace(cloud, points=cloud.points[inside]),), settings, Target(mask=shown[inside]))
+        points, shown = seen.masked_points(frame, mask)
+        inside = seen.within(points, settings)
+        return seen.scene_of_views((replace(cloud, points=points[inside]),), settings, Target(mask=shown[inside]))
 
     return load
 
@@ -444,8 +448,8 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
 
 
 def _shown(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
-    cloud, shown = seen.masked_cloud(frame, frame.read(), mask, "region_mask")
-    return cloud.points[shown & np.isfinite(cloud.points).all(1)]
+    points, shown = seen.masked_points(frame, mask, "region_mask")
+    return points[shown & np.isfinite(points).all(1)]
 
 
 def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:

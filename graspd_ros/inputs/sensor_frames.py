@@ -22,10 +22,16 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from graspd_core import PinholeCamera, PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
 from graspd_core.config import load_scene_config
 from graspd_core.errors import CloudError
-from graspd_core.io.messages import camera_from_message, depth_from_message, pixels_from_message, points_from_message
+from graspd_core.io.messages import (
+    ORIGIN,
+    CameraPlace,
+    camera_from_message,
+    depth_from_message,
+    no_lookup,
+    pixels_from_message,
+)
 from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import transform_cloud
-from graspd_core.perception.cloud.viewpoint_check import check_viewpoint
 from graspd_core.transforms import SECOND
 from graspd_core.verify.robustness import begin_other_shapes
 from graspd_ros.convert import Matrix, array_of, nanoseconds
@@ -51,7 +57,8 @@ class SensorFrame:
         frame: the frame it was seen in.
         stamp: when it was seen, by the sensor's word; zero where it has none.
         arrived: when it came, by the node's clock [ns].
-        read: its points, in its frame, seen from its origin; takes some milliseconds, may raise a CloudError.
+        read: its points, in its frame, and where its camera stood, given the place that is said of a cloud's, and how
+            to look frames up. It takes some milliseconds and may raise a CloudError or TransformError.
         pixels: all of its points in their pixels, NaN where nothing was seen; may raise a CloudError.
     """
 
@@ -59,7 +66,7 @@ class SensorFrame:
     frame: str
     stamp: Time
     arrived: int
-    read: Callable[[], PointCloud]
+    read: Callable[..., PointCloud]
     pixels: Callable[[], Pixels] | None = None
 
     def check_age(self, now: int, limit: float) -> None:
@@ -79,14 +86,15 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
         told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
         raise RequestError(ErrorCode.BAD_CLOUD, told)
     header = message.header
-    read = lambda: PointCloud(points_from_message(message), np.zeros(3))  # noqa: E731
+    read = lambda place=ORIGIN, lookup=no_lookup: place.cloud(message, lookup)  # noqa: E731
     return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, lambda: pixels_from_message(message))
 
 
 def depth_sensor_frame(image: Image, info: CameraInfo, arrived: int) -> SensorFrame:
     """Return a depth image with its calibration as a frame; it is read only when it is used."""
 
-    def read() -> PointCloud:
+    def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
+        # A depth image knows by itself.
         return cloud_from_depth(*depth_and_camera(image, info))
 
     def pixels() -> Pixels:
@@ -146,18 +154,6 @@ class ImagePairs:
         return pair
 
 
-@dataclass(frozen=True)
-class CameraPlace:
-    """Where a cloud's camera stood; nothing given: at the origin of the cloud's frame, if the cloud agrees.
-
-    `view_point`, in the cloud's frame [m], goes before `sensor_frame`, at whose origin it stood; it looked along z if
-    that name ends in optical_frame (REP 103).
-    """
-
-    view_point: tuple[float, float, float] | None = None
-    sensor_frame: str = ""
-
-
 def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraPlace:
     """What the request says, or else the parameters."""
     if message is not None and message.use_view_point:
@@ -169,33 +165,20 @@ def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraP
     return CameraPlace((x, y, z) if any(settings.view_point) else None, settings.sensor_frame)
 
 
-def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup, *, alone: bool) -> PointCloud:
-    """Return what a frame shows, from where its camera stood. A depth image knows that by itself.
-
-    `alone` says whether the cloud shows one object and nothing else.
+def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> PointCloud:
+    """Return what a frame shows, from where its camera stood.
 
     Raises:
-        CloudError: the cloud cannot be read, or nobody said where its camera stood and it was not at the origin.
+        CloudError: the cloud cannot be read, or its pixels show that its camera stood elsewhere.
         TransformError: /tf does not know the camera's frame.
     """
-    cloud = frame.read()
-    if frame.kind != CLOUD:
-        return cloud
-    if place.view_point is not None:
-        return replace(cloud, viewpoint=np.array(place.view_point))
-    if place.sensor_frame:
-        same = place.sensor_frame == frame.frame
-        T = np.eye(4) if same else lookup(frame.frame, place.sensor_frame, frame.stamp)
-        forward = T[:3, 2] if place.sensor_frame.endswith("optical_frame") else None
-        return replace(cloud, viewpoint=T[:3, 3], forward=forward)
-    check_viewpoint(cloud.points, cloud.viewpoint, grid=None if frame.pixels is None else frame.pixels(), alone=alone)
-    return cloud
+    return frame.read(place, lambda target, source: lookup(target, source, frame.stamp))
 
 
-def masked_cloud(
-    frame: SensorFrame, cloud: PointCloud, mask: Image, name: str = "target_mask"
-) -> tuple[PointCloud, Bool[np.ndarray, "points"]]:
-    """Return the cloud with a point a pixel, NaN where none was seen, and which of them the mask of this name shows.
+def masked_points(
+    frame: SensorFrame, mask: Image, name: str = "target_mask"
+) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
+    """Return a point a pixel, NaN where none was seen, and which of them the mask of this name shows.
 
     Raises RequestError: the mask is no mono8 image of the cloud's size; CloudError: the cloud cannot be read.
     """
@@ -210,7 +193,7 @@ def masked_cloud(
         told = f"{name}: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
         raise bad_request(told)
     shown = np.ndarray((height, width), np.uint8, memoryview(mask.data), 0, (mask.step, 1)) > 0
-    return replace(cloud, points=np.where(np.isfinite(pixels), pixels, np.nan).reshape(-1, 3)), shown.reshape(-1)
+    return np.where(np.isfinite(pixels), pixels, np.nan).reshape(-1, 3), shown.reshape(-1)
 
 
 @dataclass(frozen=True)
@@ -232,7 +215,7 @@ class Views:
         cloud = trimmed(cloud, settings)
         if len(cloud.points) > MOST_VIEW_POINTS:
             every = -(-len(cloud.points) // MOST_VIEW_POINTS)
-            cloud = PointCloud(cloud.points[::every], cloud.viewpoint, cloud.forward)
+            cloud = replace(cloud, points=cloud.points[::every])
         if frame != sensor_frame.frame:
             cloud = transform_cloud(cloud, lookup(frame, sensor_frame.frame, sensor_frame.stamp))
         return Views(frame, sensor_frame.stamp, (*self.clouds, cloud))
@@ -264,7 +247,7 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
         workspace = f"roi_min={settings.roi_min} to roi_max={settings.roi_max}"
         told = f"none of {len(cloud.points)} points lies in the workspace, {workspace}"
         raise RequestError(ErrorCode.BAD_CLOUD, told)
-    inside = PointCloud(points, cloud.viewpoint, cloud.forward)
+    inside = replace(cloud, points=points)
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 

@@ -17,6 +17,7 @@ import pytest
 from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
 
 from graspd_bench.rendering.render import look_at, render_depth
+from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
 from graspd_core.cli import main
 from graspd_core.cli import options as clouds
 from graspd_core.cli.options import summary
@@ -341,6 +342,37 @@ def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys, quick):
     assert "graspd: 1 of 3 clouds left out, the first cloud 1: depth image: none of its" in said
     assert main(["replay", str(bags["hopeless"]), "--fuse", *quick]) == EXIT_BAD_INPUT
     assert "cloud 0: the cloud has no finite point" in the_line(capsys)
+
+
+def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, capsys, quick):
+    """The same cloud in the frame of a robot's base, as a file and as a recording."""
+    pose = ring_poses(1, elevation=0.7, azimuth=0.4)[0]
+    (view,) = views_of(tabletop("cylinder"), PinholeCamera(160, 120, 154.0, 154.0, 79.5, 59.5), [pose])
+    points, file = view.points[np.random.default_rng(0).permutation(len(view.points))], tmp_path / "base.npy"
+    np.save(file, points)
+    place, turned = [str(x) for x in pose[:3, 3]], [str(-x) for x in pose[:3, 3]]
+    to = [*quick, "--target", "0", "0", "0.05", "--out", str(tmp_path / "out.json")]
+    assert main(["synthesize", str(file), "--view-point", *place, *to]) == EXIT_OK
+    assert np.linalg.norm(load_document(tmp_path / "out.json")["object"]["center_of_mass"][:2]) < 0.01
+    capsys.readouterr()
+    for wrong in ([], ["--view-point", *turned]):
+        for command in (["synthesize", str(file)], ["reconstruct", str(file)]):
+            rest = to if command[0] == "synthesize" else ["--out", str(tmp_path / "x.ply")]
+            assert main([*command, *wrong, *rest]) == EXIT_BAD_INPUT
+            assert "its camera did not stand at" in the_line(capsys)
+    assert main(["synthesize", "shape:mug", "--view-point", "0", "0", "1", *quick]) == EXIT_BAD_INPUT
+    assert "view_point: shape:mug is a mesh" in the_line(capsys)
+    stamped = [
+        Record("/tf", START, transforms_message([("base", OPTICAL, pose)], START)),
+        Record("/points", START, cloud_message(points, "base", START)),
+    ]
+    write_bag(tmp_path / "bag", stamped)
+    said, to = ["--sensor-frame", OPTICAL, "--frame", "base"], ["--limit", "1", *to]
+    assert main(["replay", str(tmp_path / "bag"), *said, *to]) == EXIT_OK
+    assert main(["replay", str(tmp_path / "bag"), *to]) == EXIT_BAD_INPUT
+    assert "refused: cloud: its camera did not stand at the origin of its frame" in capsys.readouterr().out
+    assert main(["replay", str(tmp_path / "bag"), "--sensor-frame", "elbow", *to]) == EXIT_BAD_INPUT
+    assert "no frame 'elbow'; its transforms know: " in the_line(capsys)
 
 
 def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):

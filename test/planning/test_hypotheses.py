@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core.config import CertaintyConfig
-from graspd_core.config.planning_config import LIGHTER_SHARE, MASS_ASSUMED, MASS_KNOWN
+from graspd_core.config.planning_config import DOUBTED_SHARE, LIGHTER_SHARE, MASS_ASSUMED, MASS_KNOWN
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
@@ -291,6 +291,22 @@ def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape_and_a_
     assert all(trial.name != HYPOTHESES for grasp in result.grasps for trial in grasp.trials)
     result = plan(load_scene("shape:cylinder"), SURE)
     assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.grasps)
+
+
+def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
+    """A depth unit four times too large: no support is seen, and most of the scene is out of range."""
+    monkeypatch.delattr("graspd_core.verify.robustness._other_world")
+    seen = seen_from()
+    assert seen.evidence is not None
+    assert not seen.evidence.doubts
+    doubted = replace(seen, evidence=replace(seen.evidence, doubts=("are its numbers metres?",)))
+    for probability in (0.0, SURE):
+        result = plan(doubted, probability)
+        held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.UNVERIFIED]
+        assert len(held) == 3
+        assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+        assert all((grasp.probability, grasp.reason) == (DOUBTED_SHARE, "are its numbers metres?") for grasp in held)
+        assert "none is sure enough: are its numbers metres?" in result.message
 
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import nullcontext
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,8 +15,11 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, reaches_image_border
-from graspd_core.perception.cloud.viewpoint_check import check_viewpoint
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, reaches_image_border
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere, seen_from
+from graspd_core.perception.scene_from_views import scene_from_views
+from graspd_core.perception.segment.target_selection import Target
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 
@@ -33,35 +40,80 @@ def seen(shape: str, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return grid, flat[np.unique(np.floor(flat / 0.004), axis=0, return_index=True)[1]], T[:3, 3]
 
 
+def is_refused(thing: PointCloud, cloud: PointCloud) -> bool:
+    try:
+        check_scene([cloud])
+        check_thing(thing, cloud)
+    except CloudError as error:
+        return re.search("hidden from there|far side of the table|seen from behind", str(error)) is not None
+    return False
+
+
 @pytest.mark.parametrize(("shape", "elevation"), [("mug", 0.35), ("mug", 0.8), ("mug", 1.2), ("box", 0.8)])
 def test_the_true_place_is_taken_and_the_places_of_robots_are_refused(shape, elevation):
     grid, points, place = seen(shape, elevation)
-    check_viewpoint(points, place, grid=grid)
-    check_viewpoint(points, place)
+    assert seen_from(grid, place).posed
+    cloud = PointCloud(points, place)
+    check_scene([cloud])
+    thing = points[(np.abs(points[:, :2]) < 0.08).all(1) & (points[:, 2] > 0.008)]
+    assert check_thing(PointCloud(thing, place), cloud, np.array([0.0, 0.0, 1.0])) == ""
     for base in BASES.values():
         with pytest.raises(CloudError, match="its pixels show it at") as refused:
-            check_viewpoint(points, np.array(base), grid=grid)
+            seen_from(grid, np.array(base))
         told = str(refused.value).split("show it at (")[1].split(")")[0]
         # The fit is to a pixel or so; the frame of the figure is the cloud's.
         np.testing.assert_allclose([float(x) for x in told.split(",")], place, atol=0.005)
-        with pytest.raises(CloudError, match=r"hidden from there by others|far side of the table"):
-            check_viewpoint(points, np.array(base))
+        assert is_refused(PointCloud(thing, np.array(base)), replace(cloud, viewpoint=np.array(base)))
 
 
 def test_an_object_alone_from_all_round_needs_no_camera():
     ball = surface_samples(make_shape("sphere"), 3000, seed=0)[0] + [0.0, 0.0, 0.5]
-    check_viewpoint(ball, np.zeros(3), alone=True)
+    cloud = PointCloud(ball, np.zeros(3))
+    assert fits_nowhere(cloud)
+    evidence = scene_from_views([cloud], alone=True).evidence
+    assert evidence is not None
+    assert evidence.doubts == ()
     with pytest.raises(CloudError, match=r"did not stand at the origin of its frame: .*sensor_frame or view_point"):
-        check_viewpoint(ball, np.zeros(3))
+        check_thing(cloud, cloud)
+
+
+@pytest.mark.parametrize(("factor", "doubt"), [(4.0, "are its numbers metres"), (0.1, "nearer than depth"), (10.0, "")])
+def test_a_scene_in_another_unit_is_refused_or_doubted(factor, doubt):
+    """Depth of 0.25 mm a unit that is read as millimetres, and its like."""
+    scene = tabletop("mug", yaw=0.4, obstacles=[("box", 0.15, 0.05)])
+    T = ring_poses(1, elevation=0.6, azimuth=0.3)[0]
+    depth = depth_views(scene, CAMERA, [T], DEFAULT, seed=3)[0][0]
+    with nullcontext() if doubt else pytest.raises(CloudError, match="are their numbers metres"):
+        seen = scene_from_views([cloud_from_depth(factor * depth, CAMERA)])
+        assert seen.evidence is not None
+        assert doubt in " ".join(seen.evidence.doubts)
+        assert any(doubt in told and "no grasp counts as verified" in told for told in seen.object.warnings)
+
+
+def test_a_cloud_that_many_places_fit_is_doubted_unless_its_pixels_tell():
+    """A flat thing alone looks the same from anywhere above."""
+    rng = np.random.default_rng(0)
+    plate = np.c_[rng.uniform(-0.06, 0.06, (4000, 2)), rng.normal(0.0, 0.0005, 4000)]
+    cloud = PointCloud(plate, np.array([0.1, 0.0, 0.5]))
+    assert "of all places for the camera fit the cloud as well as (0.1, 0, 0.5)" in check_thing(cloud, cloud)
+    assert check_thing(cloud, replace(cloud, posed=True)) == ""
+
+
+def test_numbers_of_32_and_of_64_bits_are_the_same_scene():
+    points, place = seen("mug", 0.8)[1:]
+    few = points.astype(np.float32).astype(float)
+    assert (few != points).any()
+    asked = {"target": Target(np.array([0.0, 0.0, 0.05])), "mass": 0.1}
+    one, other = (scene_from_views([PointCloud(some, place)], **asked) for some in (points, few))
+    assert one.object.sha256 == other.object.sha256
 
 
 def test_clouds_too_small_or_too_flat_to_tell_are_taken():
     rng = np.random.default_rng(0)
-    check_viewpoint(np.ones((3, 3)), np.zeros(3), grid=np.ones((1, 3, 3)))
-    check_viewpoint(np.ones((100, 3)), np.zeros(3), grid=np.ones((10, 10, 3)))
+    assert not seen_from(np.ones((1, 3, 3)), np.zeros(3)).posed
+    seen_from(np.ones((10, 10, 3)), np.zeros(3))
     flat = np.c_[rng.uniform(-0.3, 0.3, (5000, 2)), np.full(5000, 0.6)]
-    check_viewpoint(flat, np.zeros(3))
-    check_viewpoint(np.zeros((500, 3)), np.zeros(3))
+    check_scene([PointCloud(flat, np.zeros(3)), PointCloud(np.zeros((500, 3)), np.zeros(3))])
 
 
 EYE = np.array([0.0, 0.0, 1.0])

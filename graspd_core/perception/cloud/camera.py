@@ -268,7 +268,7 @@ def cloud_from_depth(
     if camera.distortion:
         # Pixels beyond the range of the lens model have no ray.
         points = points[np.isfinite(points[:, 0])]
-    cloud = PointCloud(points, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    cloud = PointCloud(points, np.zeros(3), np.array([0.0, 0.0, 1.0]), posed=True)
     return cloud if T_frame_camera is None else transform_cloud(cloud, T_frame_camera)
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
+from graspd_core.perception.cloud.viewpoint_check import seen_from
 
 # The most that a byte of LZF, the method of compressed pcd, can stand for: 264 bytes by three.
 _DENSEST = 88
@@ -182,8 +183,8 @@ def is_cloud_file(path: str | Path) -> bool:
     return ending in CLOUD_ENDINGS
 
 
-def load_views(path: str | Path) -> tuple[PointCloud, ...]:
-    """Read what one or several cameras saw, in one frame.
+def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[PointCloud, ...]:
+    """Read what one or several cameras saw, in one frame. `viewpoint` says where the camera of points stood.
 
     * ply, xyz; npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from where its `VIEWPOINT` stands; which way that looked, the format leaves open.
@@ -204,25 +205,31 @@ def load_views(path: str | Path) -> tuple[PointCloud, ...]:
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
     if ending not in ("npy", "npz"):
-        return (PointCloud(_read_points(path, ending), _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)),)
+        if viewpoint is None:
+            viewpoint = _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)
+        points = _read_points(path, ending)
+        height = _pcd_height(path) if ending == "pcd" else 1
+        return (seen_from(points.reshape(height if len(points) % height == 0 else 1, -1, 3), viewpoint),)
     arrays = _read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
+            if viewpoint is not None:
+                raise CloudError("holds depth, which tells where its camera stood; view_point is for points")
             return _depth_views(arrays)
-        return (_points_view(arrays),)
+        return (_points_view(arrays, viewpoint),)
     except CloudError as error:
         raise CloudError(f"{path}: {error}") from None
 
 
-def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
+def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> PointCloud:
     if "points" not in arrays:
         raise CloudError(f"holds no array called 'points', 'depth' or 'depths'; it has: {', '.join(arrays) or 'none'}")
     points = _numbers(arrays, "points")
     viewpoint = _numbers(arrays, "viewpoint") if "viewpoint" in arrays else np.zeros(3)
+    viewpoint = viewpoint if said is None else said
     forward = _numbers(arrays, "forward") if "forward" in arrays else None
-    if points.ndim == 3 and points.shape[2] == 3:
-        points = points.reshape(-1, 3)
-    if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):
+    pixels = points if points.ndim == 3 else points[None]
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or viewpoint.shape != (3,):
         raise CloudError(f"shape {points.shape}, viewpoint {viewpoint.shape}; points × 3 and 3 are needed")
     if not np.isfinite(viewpoint).all():
         raise CloudError("'viewpoint' is NaN or infinite")
@@ -232,7 +239,7 @@ def _points_view(arrays: Mapping[str, np.ndarray]) -> PointCloud:
             raise CloudError("'forward' is no direction; 3 finite numbers are needed, not all zero")
         forward = forward / largest
         forward = forward / np.linalg.norm(forward)
-    return PointCloud(points, viewpoint, forward)
+    return seen_from(pixels, viewpoint, forward)
 
 
 def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
@@ -318,16 +325,25 @@ def _ply_has_faces(path: Path) -> bool:
 
 def _pcd_viewpoint(path: Path) -> Vector:
     """Where the sensor stood, by the header; the origin where it does not say."""
-    with path.open("rb") as file:
-        header = file.read(4096).split(b"\nDATA")[0]
-    line = next((line.split()[1:4] for line in header.splitlines() if line.startswith(b"VIEWPOINT")), [b"0"] * 3)
+    words = _pcd_header(path, b"VIEWPOINT")[:3] or [b"0"] * 3
     try:
-        place = np.array([float(word) for word in line])
+        place = np.array([float(word) for word in words])
     except ValueError:
         place = np.zeros(0)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise CloudError(f"{path}: its VIEWPOINT is not 3 finite numbers and a quaternion")
     return place
+
+
+def _pcd_height(path: Path) -> int:
+    words = _pcd_header(path, b"HEIGHT")
+    return int(words[0]) if words and words[0].isdigit() and int(words[0]) > 0 else 1
+
+
+def _pcd_header(path: Path, name: bytes) -> list[bytes]:
+    with path.open("rb") as file:
+        lines = [line.split() for line in file.read(4096).split(b"\nDATA")[0].splitlines()]
+    return next((words[1:] for words in lines if words[:1] == [name]), [])
 
 
 def _read_points(path: Path, ending: str) -> Points:

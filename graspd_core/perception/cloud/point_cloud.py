@@ -32,11 +32,13 @@ class PointCloud:
         points: positions [m]; may hold NaN until cleaned.
         viewpoint: where the camera stood, in the same frame [m].
         forward: unit direction of its optical axis, in the same frame; None where it is not known.
+        posed: whether the points tell that they were seen from there, as those of a depth image do.
     """
 
     points: Float[np.ndarray, "points 3"]
     viewpoint: Vector
     forward: Vector | None = None
+    posed: bool = False
 
     def thinned(self, size: float) -> PointCloud:
         """The first point in every voxel of side `size` [m]."""
@@ -49,7 +51,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
     points = cloud.points @ rotation.T
     points += position
     forward = None if cloud.forward is None else rotation @ cloud.forward
-    return PointCloud(points, rotation @ cloud.viewpoint + position, forward)
+    return replace(cloud, points=points, viewpoint=rotation @ cloud.viewpoint + position, forward=forward)
 
 
 def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
@@ -194,7 +196,12 @@ def points_from_layout(layout: CloudLayout) -> Points:
     Raises:
         CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
     """
-    points = organised_points(layout).reshape(-1, 3)
+    return finite_points(organised_points(layout))
+
+
+def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Points:
+    """The finite points of an organised cloud, in row order. Raises CloudError: there is none."""
+    points = pixels.reshape(-1, 3)
     # Column by column: three times as fast as `isfinite(points).all(1)`.
     finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
     kept = points[finite] if not finite.all() else points

@@ -135,6 +135,8 @@ def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
     for name, per_metre in UNITS_PER_METRE:
         if farthest < away and MIN_CAMERA_DISTANCE_M <= away / per_metre <= farthest:
             return f"; half of them are beyond {away:.0f} m: if they are in {name}, divide them by {per_metre}"
+    if away > farthest:
+        return f"; half of them are beyond {away:.1f} m: are their numbers metres? (--units or --scale for a file)"
     return ""
 
 

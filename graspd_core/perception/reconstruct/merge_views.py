@@ -209,6 +209,7 @@ class Evidence:
         chosen: the rule that the reconstruction took; empty where none applied.
         settings: of the reconstruction.
         hidden: whether a good part of the surface was.
+        doubts: why the views may not show what was there, so that no grasp counts as verified.
     """
 
     seen: Surfels
@@ -219,3 +220,4 @@ class Evidence:
     chosen: str
     settings: ReconstructionConfig
     hidden: bool
+    doubts: tuple[str, ...] = ()

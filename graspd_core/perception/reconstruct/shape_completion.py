@@ -24,6 +24,8 @@ RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
 FAULT_WEIGHT = 5.0
 # Symmetries of which the cameras contradict more than this share are chance.
 MAX_SYMMETRY_FAULTS = 0.02
+# A centre of symmetry must be worth so many times what mirrors are.
+TIE = 1.1
 # Two rules' guesses keep this far from each other [m].
 RULE_DISTANCE_M = 0.008
 
@@ -98,7 +100,8 @@ def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str,
         value[MIRROR] = mirrors[0].worth
     if centre.wrong < MAX_SYMMETRY_FAULTS:
         value[POINT_SYMMETRY] = centre.worth
-    best = max(value, key=lambda name: value[name])
+    # A tie is not for the last digit to break: the other rule is among the shapes that grasps are tried on.
+    best = POINT_SYMMETRY if value[POINT_SYMMETRY] > TIE * value[MIRROR] else MIRROR
     if value[best] < least:
         return "", nothing()
     return best, image(centre, seen) if best == POINT_SYMMETRY else _mirrored(mirrors, seen)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -38,13 +38,15 @@ class Segmentation:
         views: the object's points as each camera saw them, at full density; views that do not show it are left out.
         support: what it stands on; None where none was seen.
         obstacles: the points of each other thing near it, thinned [m].
-        warnings: what was doubtful.
+        warnings: what the user should know.
+        cut: whether the object reaches the border of the picture or of the workspace.
     """
 
     views: tuple[PointCloud, ...]
     support: Plane | None
     obstacles: tuple[Float[np.ndarray, "_ 3"], ...]
     warnings: tuple[str, ...]
+    cut: bool = False
 
 
 def segment(
@@ -77,7 +79,8 @@ def segment(
     obstacles = _obstacles(parted, chosen)
     doubts = _doubts(parted, chosen, bool(obstacles))
     support = None if ground.support is None else ground.support.plane
-    return Segmentation(found, support, obstacles, doubts if marked else (*doubts, *_touching(parted, chosen)))
+    cut = any("reaches the border" in doubt for doubt in doubts)
+    return Segmentation(found, support, obstacles, doubts if marked else (*doubts, *_touching(parted, chosen)), cut)
 
 
 def find_things(
@@ -158,7 +161,7 @@ def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, groun
     for k, view in enumerate(views):
         part = scene.of_view(k)
         if wanted[part].any():
-            found.append(PointCloud(scene.points[part][wanted[part]], view.viewpoint, view.forward))
+            found.append(replace(view, points=scene.points[part][wanted[part]]))
     return tuple(found)
 
 

@@ -54,7 +54,7 @@ def intake(lookup=lambda target, source, stamp: np.eye(4)) -> RequestBuilder:
 
 
 def sensor_frame(points: np.ndarray, frame: str = "camera", stamp: Time = NOW) -> SensorFrame:
-    return SensorFrame("cloud", frame, stamp, 1000 * 10**9, lambda: PointCloud(points, np.zeros(3)))
+    return SensorFrame("cloud", frame, stamp, 1000 * 10**9, lambda *_: PointCloud(points, np.zeros(3)))
 
 
 @pytest.mark.parametrize(("given", "told", "timeless"), [(Time(), NOW, True), (Time(sec=7), Time(sec=7), False)])

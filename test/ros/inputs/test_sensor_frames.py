@@ -236,7 +236,7 @@ def test_a_cloud_that_came_unasked_is_seen_from_where_the_parameters_say(scene):
         taker.from_sensor_frame("r", Settings(cloud_max_age=0.0), frame).load()
     settings = Settings(cloud_max_age=0.0, sensor_frame=OPTICAL)
     assert taker.from_sensor_frame("r", settings, frame).load().support is not None
-    seen = seen_by_camera(frame, place_of(settings), lambda *_: T, alone=False)
+    seen = seen_by_camera(frame, place_of(settings), lambda *_: T)
     assert seen.forward is not None
     np.testing.assert_array_equal(np.r_[seen.viewpoint, seen.forward], np.r_[T[:3, 3], T[:3, 2]])
     taker.newest = frame
