@@ -25,6 +25,8 @@ from graspd_core.mesh.mesh_files import simplify
 from graspd_core.types import TriangleMesh
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
+# Lengths that differ by less are the same [m].
+_SAME = 1e-6
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
 # Triangles of all meshes that a viewer draws of a hand together, and of each.
 _MOST_TRIANGLES, _FEWEST_TRIANGLES = 4000, 60
@@ -41,7 +43,30 @@ def _colliding(link: ET.Element) -> list[ET.Element]:
 def _shapes(
     path: Path, elements: Sequence[ET.Element], read_mesh: Callable[..., TriangleMesh]
 ) -> tuple[Primitive, ...]:
-    return tuple(_read_shape(path, element, read_mesh) for element in elements)
+    return _with_capsules([_read_shape(path, element, read_mesh) for element in elements])
+
+
+def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
+    """Return the shapes of a link with each cylinder and the two balls at its ends as one capsule, the same solid.
+
+    This is how a URDF writes a capsule, since urdfdom knows none.
+    """
+    found, taken = list(shapes), set[int]()
+    for i, shape in enumerate(shapes):
+        if shape.kind != "cylinder":
+            continue
+        half = shape.size[1] * shape.rotation[:, 2]
+        ends = [(shape.translation + sign * half, shape.size[0]) for sign in (-1.0, 1.0)]
+        balls = [next((j for j, b in enumerate(shapes) if j not in taken and _is_ball(b, *end)), -1) for end in ends]
+        if min(balls) >= 0:
+            found[i] = replace(shape, kind="capsule")
+            taken.update(balls)
+    return tuple(shape for i, shape in enumerate(found) if i not in taken)
+
+
+def _is_ball(shape: Primitive, center: Float[np.ndarray, "3"], radius: float) -> bool:
+    same = shape.kind == "sphere" and abs(shape.size[0] - radius) < _SAME
+    return same and float(np.abs(shape.translation - center).max()) < _SAME
 
 
 def _read_shape(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:

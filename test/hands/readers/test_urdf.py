@@ -31,6 +31,27 @@ def _read(tmp_path: Path, text: str | bytes) -> HandModel:
     return read_hand_file(path)
 
 
+@pytest.mark.parametrize(
+    ("radius", "shift", "kinds"),
+    [
+        (0.01, 0.0, ["capsule"]),
+        (0.009, 0.0, ["cylinder", "sphere", "sphere"]),
+        (0.01, 0.002, ["cylinder"] + ["sphere"] * 2),
+    ],
+)
+def test_a_cylinder_with_its_balls_is_a_capsule(tmp_path: Path, radius: float, shift: float, kinds: list[str]) -> None:
+    """Turned a quarter about y its axis lies along x; balls of another size or at another place are their own."""
+    ball = '<collision><origin xyz="{} 0 0"/><geometry><sphere radius="{}"/></geometry></collision>'
+    rod = '<cylinder radius="0.01" length="0.04"/>'
+    rod = f'<collision><origin rpy="0 1.570796327 0"/><geometry>{rod}</geometry></collision>'
+    text = ball.format(0.02 + shift, radius) + rod + ball.format(-0.02, radius)
+    finger = [p for p in _read(tmp_path, HAND.replace(BOX, text, 1)).primitives if p.link == 0]
+    assert sorted(p.kind for p in finger) == kinds
+    if kinds == ["capsule"]:
+        assert finger[0].size == (0.01, 0.02)
+        assert np.allclose(finger[0].rotation[:, 2], [1, 0, 0])
+
+
 def _changed(*pairs: tuple[str, str]) -> str:
     text = HAND
     for old, new in pairs:
