@@ -89,14 +89,14 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 25_300,
     "graspd_ros": 4_700,
-    "graspd_bench": 8_670,
-    "graspd_dataset": 2_900,
+    "graspd_bench": 8_700,
+    "graspd_dataset": 3_000,
     "graspd_viewer": 2_200,
     "test": 29_400,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 20_100, "graspd_ros.node": 23_900}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 20_600, "graspd_ros.node": 24_400}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

@@ -66,7 +66,7 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
 
     hand, config, request, stop = rest
     scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)
-    for warning in scene.object.warnings:
+    for warning in (*scene.object.warnings, *hand.named_warnings):
         print(f"graspd: {warning}", file=sys.stderr)
     entry = entry_of(scene.object, hand, options.verify)
     _refuse_name(library, entry)

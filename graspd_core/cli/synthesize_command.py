@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
         result = not_loaded(options, config, options.began)
         print(summary(result, options.count, 0))
         return exit_status(result)
-    for warning in scene.object.warnings:
+    for warning in (*scene.object.warnings, *hand.named_warnings):
         print(f"graspd: {warning}", file=sys.stderr)
     page_of_run = nullcontext(Watched())
     if options.view:

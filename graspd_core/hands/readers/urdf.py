@@ -18,7 +18,7 @@ from jaxtyping import Float
 from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind, Primitive, PrimitiveKind
 from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, read_couplings, refuse_crowds
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull, whole_mesh
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull, missing_packages, whole_mesh
 from graspd_core.hands.readers.xml_io import read_numbers, read_origin, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import simplify
@@ -115,6 +115,8 @@ _KINDS: dict[str, JointKind] = {
     "prismatic": "prismatic",
     "fixed": "fixed",
 }
+# What to do with a xacro file.
+EXPAND = "expand it to a URDF first: xacro FILE > hand.urdf"
 # Joint types that only place a whole robot in the world.
 _FREE = ("floating", "planar")
 _MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
@@ -158,6 +160,9 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
         bodies.append(LinkSpec(name, *_inertial(path, link), _shapes(path, elements, hull)))
     if shown:
         dropped.append(f"no <collision>, so the <visual> is taken: {', '.join(shown)}")
+    dropped += missing_packages(
+        path, (mesh for link in links for shape in _colliding(link) for mesh in shape.iter("mesh"))
+    )
     name = str(root.get("name") or path.stem)
     return assemble(path, name, bodies, specs, read_couplings(path, joints), tuple(dropped))
 
@@ -224,14 +229,14 @@ def below_link(path: Path, root: ET.Element, link: str) -> None:
 def _refuse_xacro(path: Path, root: ET.Element) -> None:
     for top in root:
         if top.tag.startswith("xacro:"):
-            raise wrong(path, top, f"is a xacro file (<{top.tag}>); expand it to a URDF first")
+            raise wrong(path, top, f"is a xacro file (<{top.tag}>); {EXPAND}")
         if top.tag not in ("link", "joint"):
             continue
         for element in top.iter():
             unexpanded = [text for text in element.attrib.values() if "${" in text or "$(" in text]
             if unexpanded or element.tag.startswith("xacro:"):
                 what = unexpanded[0] if unexpanded else f"<{element.tag}>"
-                raise wrong(path, element, f"xacro left over in <{element.tag}>: {what}; expand it to a URDF first")
+                raise wrong(path, element, f"xacro left over in <{element.tag}>: {what}; {EXPAND}")
 
 
 def _below_world(
