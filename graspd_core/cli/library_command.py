@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 after Ctrl-C."""
+    """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources

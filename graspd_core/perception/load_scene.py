@@ -9,10 +9,12 @@ from pathlib import Path
 import torch
 
 from graspd_core.config import SceneConfig
-from graspd_core.errors import MeshError
+from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.perception.cloud.depth_files import is_depth_image, load_depth_view
+from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import Scene, build_scene, refuse_numbers
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.types import TriangleMesh
@@ -31,6 +33,7 @@ def load_scene(
     target: Target | None = None,
     alone: bool = False,
     settings: SceneConfig | None = None,
+    camera: str | Path | None = None,
 ) -> Scene:
     """Build the scene of one object.
 
@@ -43,6 +46,8 @@ def load_scene(
         target: which of the things in a cloud is meant.
         alone: a cloud shows the object and nothing else.
         settings: how a cloud becomes a scene.
+        camera: file of the camera that took a depth image, which `source` is then (docs/clouds.md); there `scale` is
+            metres per unit of depth, and 1 leaves it to the camera's file.
 
     Raises:
         MeshError: the mesh cannot be read or used, or a number is out of range.
@@ -52,19 +57,26 @@ def load_scene(
     given = "mesh" if isinstance(source, TriangleMesh) else str(source)
     numbers = {"mass": mass, "friction": friction, "resolution": resolution}
     refuse_numbers(given, scale=scale, **numbers)
-    if not isinstance(source, TriangleMesh) and is_cloud_file(source):
+    if not isinstance(source, TriangleMesh) and (camera is not None or is_depth_image(source) or is_cloud_file(source)):
         # A mesh needs none of what makes an object of a cloud.
         from graspd_core.perception.scene_from_views import scene_from_views
 
-        views = [
-            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
-        ]
+        views = scaled_views(source, camera, scale)
         scene = scene_from_views(
             views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
         )
         return replace(scene, object=replace(scene.object, scale=scale))
     mesh, warnings = _read_mesh(source, scale)
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
+
+
+def scaled_views(source: str | Path, camera: str | Path | None, scale: float = 1.0) -> list[PointCloud]:
+    """What a cloud file or a depth image shows [m], as `load_scene` takes it. Raises CloudError: see there."""
+    if camera is not None:
+        return [load_depth_view(source, camera, None if scale == 1.0 else scale)]
+    if is_depth_image(source):
+        raise CloudError(f"{source}: an image, of depth perhaps: name the camera that took it, --camera camera.json")
+    return [replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)]
 
 
 def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[TriangleMesh, tuple[str, ...]]:
