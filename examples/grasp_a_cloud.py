@@ -1,14 +1,13 @@
-"""A depth image in, grasps out: python examples/grasp_a_cloud.py [view.npz].
+"""A depth image in, grasps out: python examples/grasp_a_cloud.py [depth.png camera.json].
 
-The file holds `depth` (height x width, [m]), the camera's matrix `K` (3 x 3) and `T_world_camera` (4 x 4, z forward).
-Without one, a cylinder on a table is rendered. The object is cut out and made whole; the table stays in the way.
+The camera's file has `width`, `height`, `K` and perhaps `T_world_camera` (docs/clouds.md): the target is in that world.
+Without files, a cylinder on a table is rendered. The object is cut out and made whole; the table stays in the way.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -16,37 +15,29 @@ from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core import (
     GraspdError,
     PinholeCamera,
+    PointCloud,
     SceneConfig,
     Target,
     Verdict,
     cloud_from_depth,
+    load_depth_view,
     load_hand,
     plan_grasps,
     scene_from_views,
 )
 
 
-def rendered_view() -> tuple[np.ndarray, PinholeCamera, np.ndarray]:
-    """What a camera sees of a cylinder on a table: depth [m], the camera, where it stood."""
+def rendered_view() -> PointCloud:
+    """What a camera sees of a cylinder on a table: its points, and where it stood."""
     camera = PinholeCamera(320, 240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
     (pose,) = ring_poses(1, elevation=0.6)
     ((depth, _),) = depth_views(tabletop("cylinder"), camera, [pose])
-    return depth, camera, pose
-
-
-def view_of(path: Path) -> tuple[np.ndarray, PinholeCamera, np.ndarray]:
-    """The same from a file."""
-    with np.load(path) as arrays:
-        depth, matrix, pose = arrays["depth"], arrays["K"], arrays["T_world_camera"]
-    height, width = depth.shape
-    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return depth, PinholeCamera(width, height, fx, fy, cx, cy), pose
+    return cloud_from_depth(depth, camera, pose)
 
 
 def main(arguments: Sequence[str]) -> int:
     """0 when there is a verified grasp, 1 when not, 2 when the view shows no object."""
-    depth, camera, T_world_camera = view_of(Path(arguments[0])) if arguments else rendered_view()
-    view = cloud_from_depth(depth, camera, T_world_camera)
+    view = load_depth_view(arguments[0], arguments[1]) if arguments else rendered_view()
     try:
         # Several views of one scene go into the list; Target also takes a box or a mask.
         scene = scene_from_views([view], target=Target(point=np.array([0.0, 0.0, 0.05])), settings=SceneConfig())

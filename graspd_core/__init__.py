@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from graspd_core.perception.cloud.camera import PinholeCamera as PinholeCamera
     from graspd_core.perception.cloud.camera import cloud_from_depth as cloud_from_depth
     from graspd_core.perception.cloud.camera import depth_in_metres as depth_in_metres
+    from graspd_core.perception.cloud.depth_files import load_depth_view as load_depth_view
     from graspd_core.perception.cloud.point_cloud import PointCloud as PointCloud
     from graspd_core.perception.load_scene import load_scene as load_scene
     from graspd_core.perception.obstacles import with_neighbours as with_neighbours
@@ -84,6 +85,7 @@ _MODULES = {
     "perception.segment.target_selection": "Target",
     "perception.cloud.point_cloud": "PointCloud",
     "perception.cloud.camera": "PinholeCamera cloud_from_depth depth_in_metres",
+    "perception.cloud.depth_files": "load_depth_view",
     "mesh.mesh_files": "load_mesh save_mesh",
     "mesh.shapes": "make_shape",
     "hands.library": "hand_names load_hand",

@@ -206,8 +206,8 @@ class Grasp:
 
     @property
     def usable(self) -> bool:
-        """Whether it is as sure as was asked for: verified, or found where no trial was asked for."""
-        return self.verdict is Verdict.VERIFIED or not self.trials
+        """Whether it is as sure as was asked for: verified, or with a contact where no trial was asked for."""
+        return self.verdict is Verdict.VERIFIED or bool(not self.trials and self.contacts)
 
     @property
     def reason(self) -> str:

@@ -9,28 +9,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import finished, staged
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, build_problem
 from graspd_core.perception.scene import Scene
+from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Posture
 from graspd_dataset.finger_closing import CLOSE_STEPS, make_closing
 from graspd_dataset.foreign_grasps import ImportedGrasp
 
 # A joint may be so far beyond its limit [rad] or [m]: limits are rounded differently in other descriptions.
 _BEYOND = 1e-3
+# A hand so deep in the object, or so far off, does not grasp it [m]. The share of grasps that makes a frame doubtful,
+# and the fewest grasps that can.
+_DEEP, _OFF, _NEARLY_ALL, _FEWEST = 0.005, 0.005, 0.8, 5
 # Grasps at once; each takes a megabyte on the way.
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class CompletedGrasps:
-    """Grasps of one object, in the order of their files, unverified; and how many were refused, by reason."""
+    """Grasps of one object, in the order of their files, unverified.
+
+    Attributes:
+        refused: how many were refused, by reason.
+        frame_doubt: that the poses are hardly those of the hand's base link, a sentence. Empty if they may be.
+    """
 
     grasps: tuple[Grasp, ...]
     refused: Mapping[str, int]
+    frame_doubt: str = ""
 
 
 def complete_grasps(
@@ -60,7 +72,28 @@ def complete_grasps(
                 faults.append("no squeeze to be found: fewer than two links touch the object")
             else:
                 grasps.append(_merged(theirs, ours))
-    return CompletedGrasps(tuple(grasps), dict(Counter(filter(None, faults))))
+    doubt = frame_doubt(scene, hand, [grasp.grasp for grasp in kept if grasp.closed])
+    return CompletedGrasps(tuple(grasps), dict(Counter(filter(None, faults))), doubt)
+
+
+def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:
+    """Say that nearly all postures are deep in the object or do not touch it, as those of another frame are."""
+    if len(postures) < _FEWEST:
+        return ""
+    points = [
+        in_base(link_poses(hand, posture.joint_positions), hand.candidate_points, hand.candidate_link)
+        @ rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz).double()).numpy().T
+        + posture.position
+        for posture in postures
+    ]
+    nearest = np.array([float(sample_sdf(scene.sdf, torch.as_tensor(p).to(scene.sdf.field))[0].min()) for p in points])
+    deep, off = int((nearest < -_DEEP).sum()), int((nearest > _OFF).sum())
+    if max(deep, off) < _NEARLY_ALL * len(postures):
+        return ""
+    what = f"{deep} of {len(postures)} grasps are more than {_DEEP * 1000:g} mm deep in the object"
+    if off > deep:
+        what = f"{off} of {len(postures)} grasps are more than {_OFF * 1000:g} mm off the object"
+    return f"{what}: their poses are hardly those of the base link {hand.base_link!r} of {hand.name}; check the frame"
 
 
 def beyond_limits(grasp: ImportedGrasp, hand: HandModel) -> str:

@@ -64,7 +64,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 1 where blocks failed or a data set has faults, 130 after Ctrl-C."""
+    """Returns the exit status: 0, 1 where blocks failed or a data set has faults, 130 if interrupted."""
     from graspd_dataset.dataset_store import DatasetStore
 
     action, places = options.words[0], options.words[1:]
@@ -79,7 +79,7 @@ def _make(options: argparse.Namespace) -> int:
     from graspd_dataset.blocks import blocks_of
     from graspd_dataset.dataset_store import DatasetStore
     from graspd_dataset.guarded_calls import Limits
-    from graspd_dataset.run_dataset import begin_run, missing_blocks
+    from graspd_dataset.run_dataset import begin_run, missing_blocks, with_unrecorded, write_run
 
     if not options.out:
         raise ConfigError("--out is missing: a directory or s3://bucket/path")
@@ -98,7 +98,10 @@ def _make(options: argparse.Namespace) -> int:
         return EXIT_OK
     record = begin_run(store, request, len(blocks), any_code=options.any_code)
     with Interrupt() as interrupt:
-        lines = _run_missing(options, store, limits, missing, record, interrupt) if missing else Lines(0)
+        lines, record = (
+            _run_missing(options, store, limits, missing, record, interrupt) if missing else (Lines(0), record)
+        )
+    write_run(store, with_unrecorded(store, record))
     _finish(store)
     if interrupt.came():
         print(f"graspd: interrupted; the same command goes on, {store.shown} keeps what is done", file=sys.stderr)
@@ -113,7 +116,7 @@ def _run_missing(
     missing: list[Block],
     record: RunRecord,
     interrupt: Interrupt,
-) -> Lines:
+) -> tuple[Lines, RunRecord]:
     """Run what is missing; the record is written from time to time, so that a run that is killed has one."""
     from graspd_dataset.ray_engine import RayEngine, ray_running
     from graspd_dataset.run_dataset import run_blocks, write_run
@@ -126,8 +129,7 @@ def _run_missing(
             if time.monotonic() > written + _RECORDS:
                 write_run(store, lines.added_to(record, time.monotonic() - began))
                 written = time.monotonic()
-    write_run(store, lines.added_to(record, time.monotonic() - began))
-    return lines
+    return lines, lines.added_to(record, time.monotonic() - began)
 
 
 def _finish(store: DatasetStore) -> None:
@@ -164,6 +166,7 @@ class Lines:
         self._blocks, self._done, self._rows, self._verified = blocks, 0, 0, 0
         self._cpu = self._peak = self._told = 0.0
         self._failures: Counter[str] = Counter()
+        self._files: dict[str, str] = {}
         self._began = time.monotonic()
         self._bar: Any = None
 
@@ -175,18 +178,21 @@ class Lines:
         return self
 
     def __call__(self, what: Any, report: Report) -> None:
+        from graspd_dataset.blocks import DatasetObject
+
+        self._files.update(report.files)
         if report.failed:
             self.wrong += 1
             name = getattr(what, "source", None) or f"{what.object.source} {what.hand} seed {what.seed}"
             print(f"graspd: {report.failed}: {name}: {report.error}", file=sys.stderr, flush=True)
-        else:
+        elif not isinstance(what, DatasetObject):
             self._done += 1
             self._rows, self._verified = self._rows + report.rows, self._verified + report.verified
             self._cpu, self._peak = self._cpu + report.cpu, max(self._peak, report.peak_mb)
             self._failures.update(report.failures)
         if self._bar is not None:
             self._bar.set_postfix_str(self._text())
-            self._bar.update(not report.failed)
+            self._bar.update(self._done - self._bar.n)
         elif time.monotonic() > self._told + _LINES:
             self._told = time.monotonic()
             print(f"graspd: {self._done}/{self._blocks} blocks, {self._text()}", file=sys.stderr, flush=True)
@@ -200,7 +206,7 @@ class Lines:
     def added_to(self, record: RunRecord, wall: float) -> RunRecord:
         """The record with what this session did."""
         more = {"done": record.done + self._done, "cpu": record.cpu + self._cpu, "wall": record.wall + wall}
-        return replace(record, **more, peak_mb=max(record.peak_mb, self._peak))
+        return replace(record, **more, peak_mb=max(record.peak_mb, self._peak), files=record.files | self._files)
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
@@ -218,10 +224,15 @@ def _stats(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
 
 
 def _validate(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
-    from graspd_dataset.inspect_dataset import faults_of_dataset
+    from graspd_dataset.inspect_dataset import faults_of_dataset, recorded_hashes
 
     faults = list(faults_of_dataset(stores[0]))
-    print("\n".join(faults) or f"{stores[0].shown}: {len(stores[0].list('grasps'))} blocks, no fault")
+    if not faults:
+        paths, known = stores[0].list("grasps"), recorded_hashes(stores[0])
+        without = sum(path not in known for path in paths)
+        told = f"; {without} without a hash on record" if without else ""
+        print(f"{stores[0].shown}: {len(paths)} blocks, no fault{told}")
+    print("\n".join(faults), end="\n" if faults else "")
     return EXIT_FAULTS if faults else EXIT_OK
 
 

@@ -6,11 +6,13 @@
     runs/KEY.json                                  what a command asked for and what it took
     README.md                                      the data card
 
-A file appears whole or not at all. The same rows give the same bytes, and a byte that changed is found when it is read.
+A file appears whole or not at all. The same rows give the same bytes. The record of a run holds the hash of every file
+that it wrote, so that a byte that changed anywhere is found.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -47,7 +49,10 @@ def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = Non
     import pyarrow.parquet as pq
 
     try:
-        table = pq.ParquetFile(BytesIO(content), page_checksum_verification=True).read(columns)
+        # Without a thread of Arrow's, nor a file of Python's for it to read: one that still runs when the process ends
+        # aborts it.
+        file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True, pre_buffer=False)
+        table = file.read(columns, use_threads=False)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         raise FormatError(f"{where}: not a whole Parquet file: {' '.join(str(error).split())[:200]}") from None
     try:
@@ -173,6 +178,22 @@ def block_path(hand: str, object_sha256: str, key: str) -> str:
 def key_of(path: str) -> str:
     """The key that a file is called by."""
     return PurePosixPath(path).stem
+
+
+def file_hash(content: bytes) -> str:
+    """SHA-256 of a file, as records of runs hold it."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
+    """The record of a run or a failure. Raises FormatError: it holds no JSON object."""
+    try:
+        record = json.loads(store.read(path))
+    except ValueError:
+        record = None
+    if not isinstance(record, dict) or not isinstance(record.get("files", {}), dict):
+        raise FormatError(f"{store.shown}/{path}: no record of a run or a failure: its content was changed")
+    return record
 
 
 def keys_below(store: DatasetStore, folder: str) -> set[str]:

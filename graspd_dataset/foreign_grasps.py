@@ -31,7 +31,7 @@ from jaxtyping import Float
 from graspd_core.config.mapping import parse_yaml
 from graspd_core.errors import ConfigError, FormatError, shown
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
+from graspd_core.hands.model import AT_ORIGIN, HandModel, all_joint_names, all_joint_positions
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, load_inert, read_bounded
 from graspd_core.types import Posture
 
@@ -143,7 +143,7 @@ def find_beside(named: Any, file: Path, where: str) -> str:
 
 
 # The palm, our base link, in the frame of the qpos, wxyz, of hands whose model there is another than ours. Their joints
-# are in the order of ours; of other hands the frame is that of the base link.
+# are in the order of ours. Of other hands the frame is that of the hand's own file, in which the base link stands.
 PALMS = {"allegro_right": (0.0, 1.0, 0.0, 1.0)}
 STAGES = ("pregrasp", "grasp", "squeeze")
 _WHAT = "file of DexGraspBench"
@@ -237,10 +237,13 @@ def _posture(
     where = f"{path}: {stage}_qpos"
     position, quaternion, joints = _pose(plain_entry(values, f"{stage}_qpos", path), len(order), where)
     into = Rotation.from_quat(np.roll(target[1], -1)).inv()
-    palm = Rotation.from_quat(np.roll(PALMS.get(hand.name, (1.0, 0.0, 0.0, 0.0)), -1))
-    base = into * Rotation.from_quat(np.roll(quaternion, -1)) * palm
+    frame = Rotation.from_quat(np.roll(quaternion, -1))
+    place, turn = hand.base_place
+    if (place, turn) == AT_ORIGIN:
+        turn = PALMS.get(hand.name, turn)
+    base = into * frame * Rotation.from_quat(np.roll(turn, -1))
     named = joints_by_name(dict(zip(order, joints, strict=True)), hand, where)
-    return Posture(into.apply(position - target[0]), np.roll(base.as_quat(), 1), named)
+    return Posture(into.apply(position + frame.apply(place) - target[0]), np.roll(base.as_quat(), 1), named)
 
 
 # Entries of a rotation matrix may be so far from orthonormal.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from graspd_core.runtime.worker_process import WorkerProcess
-from graspd_dataset.dataset_store import DatasetStore, block_path
+from graspd_dataset.dataset_store import DatasetStore, block_path, file_hash
 
 T = TypeVar("T")
 
@@ -43,6 +43,7 @@ class Report:
         size: of the file [bytes].
         cpu: seconds.
         peak_mb: peak of the child's memory.
+        files: hashes of the files that were written, by path.
     """
 
     key: str
@@ -54,6 +55,7 @@ class Report:
     size: int = 0
     cpu: float = 0.0
     peak_mb: float = 0.0
+    files: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,9 @@ def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits:
         ready = call_guarded(limits, ready_of, job.pickled, content)
     except Exception as error:
         return failed_report(store, job, error), b""
-    store.write(f"objects/{ready.sha256}.parquet", ready.file)
-    return Report(job.key), ready.shared
+    path = f"objects/{ready.sha256}.parquet"
+    store.write(path, ready.file)
+    return Report(job.key, files={path: file_hash(ready.file)}), ready.shared
 
 
 def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
@@ -126,7 +129,8 @@ def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits:
         made = call_guarded(limits, block_of, job.pickled, hand, shared)
     except Exception as error:
         return failed_report(store, job, error)
-    store.write(block_path(job.hand, made.object_sha256, job.key), made.file)
+    path = block_path(job.hand, made.object_sha256, job.key)
+    store.write(path, made.file)
     return Report(
         job.key,
         rows=made.rows,
@@ -135,6 +139,7 @@ def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits:
         size=len(made.file),
         cpu=made.cpu,
         peak_mb=made.peak_mb,
+        files={path: file_hash(made.file)},
     )
 
 

@@ -86,15 +86,15 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
         grasps = tuple(sorted(tried, key=lambda grasp: grasp.verdict is not Verdict.VERIFIED))
     good = sum(grasp.usable for grasp in grasps)
     moved = [grasp.squeeze_moved for grasp in imported if grasp.squeeze_moved > _MOVED]
-    warnings = ()
+    warnings = [*hand.named_warnings, *filter(None, [completed.frame_doubt])]
     if moved:
         told = f"the base of {len(moved)} squeezes was moved, by up to {max(moved) * 1000:.1f} mm"
-        warnings = (f"{told}; it stays at the grasp's",)
+        warnings.append(f"{told}; it stays at the grasp's")
     return result_of(
         grasps,
         len(imported),
         method="imported",
         message=f"{len(grasps)} of {len(imported)} imported grasps are kept, {good} are usable",
-        warnings=warnings,
+        warnings=tuple(warnings),
         refused=completed.refused,
     )

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from graspd_core.errors import FormatError
 from graspd_dataset.block_rows import kind_of_reason
 from graspd_dataset.blocks import content_key
-from graspd_dataset.dataset_store import DatasetStore, block_path, key_of, read_parquet
+from graspd_dataset.dataset_store import DatasetStore, block_path, file_hash, key_of, read_parquet, read_record
 from graspd_dataset.record_schema import arrow_schema
 from graspd_dataset.run_records import markdown_table
 
@@ -84,7 +83,7 @@ def stats_of(store: DatasetStore) -> DatasetStats:
             lost = next((trial for trial in trials if not trial["passed"]), None)
             if lost is not None:
                 stats.reasons[kind_of_reason(lost["name"], lost["reason"])] += 1
-    records = [json.loads(store.read(path)) for path in store.list("failed")]
+    records = [read_record(store, path) for path in store.list("failed")]
     stats.failed = [record for record in records if record["key"] not in there]
     return stats
 
@@ -126,13 +125,22 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
     paths, meshes = store.list("grasps"), {key_of(path) for path in store.list("objects")}
     if not paths:
         raise FormatError(f"{store.shown}: no data set: nothing in grasps/")
+    known: dict[str, set[str]] = {}
+    try:
+        known = recorded_hashes(store)
+    except FormatError as error:
+        yield str(error)
+    there = {key_of(path) for path in paths} | meshes
+    yield from (f"{path}: is missing, but a run has written it" for path in known if key_of(path) not in there)
     seen: dict[bytes, str] = {}
     for path in paths:
+        content = store.read(path)
         try:
-            table, told = read_parquet(store.read(path), path)
+            table, told = read_parquet(content, path)
         except FormatError as error:
             yield str(error)
             continue
+        yield from _changed(path, content, known)
         yield from (f"{path}: {fault}" for fault in _file_faults(path, table, told, meshes))
         for digest in row_digests(table):
             if digest in seen:
@@ -140,10 +148,27 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
                 break
             seen[digest] = path
     for path in store.list("objects"):
+        content = store.read(path)
         try:
-            read_parquet(store.read(path), path)
+            read_parquet(content, path)
         except FormatError as error:
             yield str(error)
+            continue
+        yield from _changed(path, content, known)
+
+
+def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
+    """The hashes of every file that the records of runs hold, by path. Raises FormatError: a record is spoilt."""
+    known: dict[str, set[str]] = {}
+    for record in (read_record(store, path) for path in store.list("runs")):
+        for path, digest in record.get("files", {}).items():
+            known.setdefault(path, set()).add(digest)
+    return known
+
+
+def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterator[str]:
+    if path in known and file_hash(content) not in known[path]:
+        yield f"{path}: not the bytes that a run has written: its SHA-256 is not the recorded one"
 
 
 def row_digests(table: Any) -> list[bytes]:

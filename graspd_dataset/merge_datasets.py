@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import heapq
+import json
 from collections.abc import Sequence
 from typing import Any
 
 from graspd_core.errors import ConfigError, FormatError
-from graspd_dataset.dataset_store import DatasetStore, keys_below, parquet_bytes, read_parquet
+from graspd_dataset.dataset_store import DatasetStore, keys_below, parquet_bytes, read_parquet, read_record
 from graspd_dataset.inspect_dataset import tables_of
 from graspd_dataset.record_schema import arrow_schema
 
@@ -41,6 +42,10 @@ def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]
             for path in source.list(folder):
                 if path.rpartition("/")[2].partition(".")[0] not in present:
                     out.write(path, source.read(path))
+                elif folder == "runs":
+                    record = read_record(source, path)
+                    files = read_record(out, path).get("files", {}) | record.get("files", {})
+                    out.write(path, (json.dumps({**record, "files": files}, indent=1) + "\n").encode())
     return copied, common
 
 

@@ -11,15 +11,15 @@ import platform
 import shlex
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import date
 from typing import Any
 
 from graspd_core.errors import ConfigError
 from graspd_dataset.blocks import Block, DatasetObject, DatasetRequest, by_object, content_key
-from graspd_dataset.dataset_store import FORMAT, SCHEMA_VERSION, DatasetStore, keys_below
+from graspd_dataset.dataset_store import FORMAT, SCHEMA_VERSION, DatasetStore, file_hash, keys_below, read_record
 from graspd_dataset.guarded_calls import Report
-from graspd_dataset.inspect_dataset import DatasetStats, reason_lines, stats_table
+from graspd_dataset.inspect_dataset import DatasetStats, reason_lines, recorded_hashes, stats_table
 from graspd_dataset.ray_engine import RayEngine
 from graspd_dataset.run_records import code_version, commit
 
@@ -38,6 +38,7 @@ class RunRecord:
         cpu: seconds in the processes of blocks.
         wall: seconds.
         peak_mb: greatest peak of a process of blocks.
+        files: hashes of the files written, by path.
     """
 
     command: str
@@ -50,6 +51,7 @@ class RunRecord:
     cpu: float = 0.0
     wall: float = 0.0
     peak_mb: float = 0.0
+    files: dict[str, str] = field(default_factory=dict)
 
     @property
     def path(self) -> str:
@@ -95,8 +97,15 @@ def write_run(store: DatasetStore, record: RunRecord) -> None:
 def run_records(store: DatasetStore) -> list[RunRecord]:
     """Those of a data set."""
     names = {item.name for item in fields(RunRecord)}
-    told = [json.loads(store.read(path)) for path in store.list("runs")]
+    told = [read_record(store, path) for path in store.list("runs")]
     return [RunRecord(**{key: value for key, value in record.items() if key in names}) for record in told]
+
+
+def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:
+    """The record with the hashes of files that no record holds: of a session that was killed, or of earlier code."""
+    known = recorded_hashes(store).keys() | record.files.keys()
+    paths = [path for folder in ("grasps", "objects") for path in store.list(folder) if path not in known]
+    return replace(record, files=record.files | {path: file_hash(store.read(path)) for path in paths})
 
 
 def data_card(store: DatasetStore, stats: DatasetStats) -> str:
@@ -172,7 +181,7 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Run blocks and yield each with its report as it ends; objects that fail too, their blocks are dropped then.
+    """Run blocks and yield each with its report as it ends; objects too, of which those that fail drop their blocks.
 
     Raises:
         StorageError: a file could not be written; what was written before stays.
@@ -197,7 +206,6 @@ def run_blocks(
                 continue
             thing, own, shared = preparing.pop(handle)
             report = engine.report(handle, thing.key)
-            if report.failed:
-                yield thing, report
-            else:
+            yield thing, report
+            if not report.failed:
                 ready.extend((block, shared) for block in own)

@@ -14,8 +14,8 @@ from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel, all_joint_names
 from graspd_core.io.grasps_json import grasps_of, load_document
 from graspd_core.optimize.plan_config import PlanConfig, plan_config
-from graspd_core.perception.cloud.cloud_files import is_cloud_file, load_views
-from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
+from graspd_core.perception.cloud.cloud_files import is_cloud_file
+from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene, scaled_views
 from graspd_core.perception.scene import Scene, moved_grasp
 from graspd_core.planning.plan_grasps import planning_scene
 from graspd_core.types import Grasp, TriangleMesh
@@ -85,11 +85,13 @@ def make_session(
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, config, seen - far, notes, far)
 
 
-def seen_points(source: str | TriangleMesh, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
-    """The points of a cloud file [m]; none for anything else."""
-    if isinstance(source, TriangleMesh) or source.startswith(SHAPE_PREFIX) or not is_cloud_file(source):
+def seen_points(
+    source: str | TriangleMesh, scale: float = 1.0, camera: str | Path | None = None
+) -> Float[np.ndarray, "points 3"]:
+    """The points of a cloud file, or of a depth image by its camera's file [m]; none for anything else."""
+    if isinstance(source, TriangleMesh) or (camera is None and not is_cloud_file(source)):
         return np.zeros((0, 3))
-    points = np.concatenate([view.points for view in load_views(source)]) * scale
+    points = np.concatenate([view.points for view in scaled_views(source, camera, scale)])
     return points[np.isfinite(points).all(1)]
 
 

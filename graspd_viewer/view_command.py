@@ -70,7 +70,7 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
     from graspd_viewer.session import make_session, seen_points
     from graspd_viewer.viewer import Viewer
 
-    seen, notes = seen_points(options.object, scene.object.scale), scene.object.warnings
+    seen, notes = seen_points(options.object, scene.object.scale, options.camera), scene.object.warnings
     name = Path(options.object).name
 
     def show(result: GraspResult) -> None:

@@ -8,7 +8,6 @@ Each folder holds */depth_mm.png, camera.json (K, width, height) and object_clou
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from graspd_bench.study import Case, Record, Request, Sections
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.topology import is_closed
-from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth, depth_in_metres
+from graspd_core.perception.cloud.depth_files import load_depth_view
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target, segment
@@ -92,13 +91,8 @@ def run_frame(case: Frame) -> Record:
 
 def read_frame(folder: Path) -> tuple[PointCloud, np.ndarray]:
     """The cloud of a depth image in its camera's frame, and the reference cloud of its object [m]."""
-    from PIL import Image
-
-    info = json.loads((folder / "camera.json").read_text())
-    k = info["K"]
-    camera = PinholeCamera(info["width"], info["height"], k[0][0], k[1][1], k[0][2], k[1][2])
-    depth = depth_in_metres(np.asarray(Image.open(folder / "depth_mm.png")).astype(np.uint16), "16UC1")
-    return cloud_from_depth(depth, camera), np.loadtxt(folder / "object_cloud.xyz")
+    view = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
+    return view, np.loadtxt(folder / "object_cloud.xyz")
 
 
 def overlap(found: np.ndarray, reference: np.ndarray) -> float:

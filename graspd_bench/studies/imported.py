@@ -116,7 +116,7 @@ def run_imported(case: ImportedCase) -> Record:
     }
     figures = {name: tried(scene, hand, some, case.trials) for name, some in grasps.items()}
     held = sum(bool(r.get("standard", {}).get("passed")) for r in figures["imported"])
-    return {"held": held, "refused": completed.refused, "grasps": figures}
+    return {"held": held, "refused": completed.refused, "frame_doubt": completed.frame_doubt, "grasps": figures}
 
 
 def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:
@@ -146,14 +146,19 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
     groups = [(_name(record["object"]), [record]) for record in records]
     if len(records) > 1:
         groups.append(("**all**", list(records)))
-    body = [_row(name, some, source, trials) for name, some in groups for source in SOURCES]
+    body = [_row(name, some, source, trials, len(headings)) for name, some in groups for source in SOURCES]
     whys: dict[str, int] = {}
     for record in records:
         for why, count in record["refused"].items():
             whys[why] = whys.get(why, 0) + count
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
     told = "Shares are of all grasps of an object, also of those that were refused or not found; others are medians."
-    return {"imported": [markdown_table(headings, body), f"{told} {refused}".strip()]}
+    doubts = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]
+    return {"imported": [markdown_table(headings, body), " ".join(filter(None, (told, refused, *doubts)))]}
+
+
+def _doubted(record: Record) -> bool:
+    return bool(record.get("frame_doubt"))
 
 
 def _name(source: str) -> str:
@@ -161,7 +166,7 @@ def _name(source: str) -> str:
     return (path.parents[1].name if path.stem == "simplified" else thing_name(source))[:16]
 
 
-def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str]) -> list[str]:
+def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str], width: int) -> list[str]:
     asked = sum(record["count"] for record in records)
     grasps = [grasp for record in records for grasp in record["grasps"][source]]
 
@@ -169,6 +174,9 @@ def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str
         there = [value for value in values if value is not None]
         return f"{np.median(there):.{digits}f}" if there else "–"
 
+    if source == "imported" and any(map(_doubted, records)):
+        # What holds of poses that are read in another frame says nothing of the grasps.
+        return [name, "imported, frame in doubt", f"{len(grasps)} of {asked}", *["–"] * (width - 3)]
     cells = [name, SOURCES[source], f"{len(grasps)} of {asked}"]
     for trial in trials:
         if trial in _PASSED:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,20 +10,32 @@ import numpy as np
 import torch
 
 from graspd_core.arms.arm import Arm, tip_hand
+from graspd_core.arms.arm_collision import hits_of_support
 from graspd_core.arms.arm_paths import LIFT, ArmTask, arm_paths, make_task, tip_poses
 from graspd_core.arms.inverse_kinematics import start_table, within_reach
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import drawn_back
 from graspd_core.hands.model import HandModel
-from graspd_core.optimize.restrictions import Allowed, BoundRestriction, JointRows, Places, Refusal, Turns
+from graspd_core.optimize.initial_poses import draw_starts
+from graspd_core.optimize.restrictions import (
+    Allowed,
+    BoundRestriction,
+    BoundRestrictions,
+    JointRows,
+    Places,
+    Refusal,
+    Turns,
+)
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
-from graspd_core.types import Grasp
+from graspd_core.types import Grasp, Posture
 
 # A base farther away than this is in another unit [m].
 _FARTHEST = 100.0
 # Fingers reach past the base link by no more than this [m].
 _HAND_LENGTH = 0.4
+# Hands around the object that are asked about where none could be begun from.
+_PROBES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +74,22 @@ class BoundReach(BoundRestriction):
     task: ArmTask
 
     @property
+    def asked(self) -> str:
+        """See `BoundRestriction`."""
+        return f"the reach of {self.task.arm.name}"
+
+    @property
     def impossible(self) -> str:
-        """That the base is so far away that no posture comes near the object, or nothing where one may."""
-        task = self.task
+        """Say that every posture is in the support, or that the base is too far away. Empty if one may come there."""
+        task, support = self.task, self.task.scene.support
+        if support is not None and not task.usable.any():
+            table = start_table(task.arm)
+            hits = hits_of_support(task.arm, task.scene, task.base, (table.start, table.end))
+            above = support.offset - float(support.normal @ task.base.translation.numpy())
+            return (
+                f"every posture of {task.arm.name} has its {hits.what[int((hits.depth > 0).sum(0).argmax())]}, whose "
+                f"surface is {above:.2f} m above the arm's base; raise the base, or check where it stands"
+            )
         longest = float(start_table(task.arm).features[:, :3].norm(dim=-1).max())
         longest += float(tip_hand(task.arm, task.hand).translation.norm())
         target = task.scene.object
@@ -74,6 +100,17 @@ class BoundReach(BoundRestriction):
             f"the object is {away:.2f} m from the base of {task.arm.name}, which brings {task.hand.name} "
             f"{longest:.2f} m far"
         )
+
+    def why_none(self, others: BoundRestrictions) -> str:
+        """Count the reasons why the arm takes no hand to the object, of some drawn around it."""
+        task = self.task
+        starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
+        rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)
+        postures = [Posture(*row) for row in rows]
+        ways = arm_paths(task, [Grasp(posture, posture, posture) for posture in postures])
+        reasons = Counter(way for way in ways if isinstance(way, str)).most_common()
+        told = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        return f"of {len(ways)} hands around the object: {told}" if told else ""
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Which initial poses are no farther away than the arm reaches, nor nearer; retreated and lifted ones too."""

@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 after Ctrl-C."""
+    """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources
@@ -66,7 +66,7 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
 
     hand, config, request, stop = rest
     scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)
-    for warning in scene.object.warnings:
+    for warning in (*scene.object.warnings, *hand.named_warnings):
         print(f"graspd: {warning}", file=sys.stderr)
     entry = entry_of(scene.object, hand, options.verify)
     _refuse_name(library, entry)

@@ -155,6 +155,14 @@ def add_object_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_camera_option(parser: argparse.ArgumentParser) -> None:
+    """The camera of a depth image."""
+    parser.add_argument(
+        "--camera", type=Path, default=None, metavar="camera.json",
+        help="that took the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)",
+    )  # fmt: skip
+
+
 def target_of(options: argparse.Namespace):
     """The `Target` that the options name, if any."""
     from graspd_core.perception.segment.target_selection import Target

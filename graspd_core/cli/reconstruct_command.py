@@ -9,6 +9,7 @@ from typing import Any
 
 from graspd_core.cli.options import (
     add_bag_options,
+    add_camera_option,
     add_object_options,
     check_bag_options,
     load_views,
@@ -22,7 +23,8 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
     parser = commands.add_parser("reconstruct", help="turn a point cloud into a closed mesh")
     parser.set_defaults(run=run)
-    parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="a cloud file; of a bag, its first cloud")
+    parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="cloud, depth image; of a bag its first cloud")
+    add_camera_option(parser)
     add_object_options(parser)
     add_bag_options(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="mesh.ply")
@@ -32,12 +34,15 @@ def run(options: argparse.Namespace) -> int:
     """Returns the exit status."""
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
+    from graspd_core.perception.cloud.depth_files import is_depth_image
+    from graspd_core.perception.load_scene import scaled_views
     from graspd_core.perception.scene_from_views import reconstruct_object
 
     check_bag_options(options)
     check_writable(options.out)
     settings = scene_config_of(options)
-    views = load_views(options.cloud, options)
+    depth = options.camera is not None or is_depth_image(options.cloud)
+    views = tuple(scaled_views(options.cloud, options.camera)) if depth else load_views(options.cloud, options)
     whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
     mesh = whole.mesh
     save_mesh(mesh, options.out)

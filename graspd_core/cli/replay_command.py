@@ -79,6 +79,8 @@ def run(options: argparse.Namespace) -> int:
     if options.out:
         check_writable(options.out if single else options.out / "probe")
     hand = load_hand(options.hand)
+    for warning in hand.named_warnings:
+        print(f"graspd: {warning}", file=sys.stderr)
     began, statuses, grasps, interrupted = time.perf_counter(), [], 0, False
     with Interrupt() as interrupt:
         for job in _jobs(options):

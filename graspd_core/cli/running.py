@@ -22,8 +22,12 @@ from graspd_core.types import GraspResult, Progress, ProgressHook, Stage, WatchH
 EXIT_OK, EXIT_BAD_INPUT, EXIT_TOO_FEW, EXIT_INTERRUPTED = 0, 2, 3, 130
 
 
+# Signals that end a run: what a terminal sends, and what a service or a batch system does.
+_ENDS = (signal.SIGINT, signal.SIGTERM)
+
+
 class Interrupt:
-    """The first Ctrl-C ends a run, which keeps what it has found so far; the second ends the process."""
+    """The first Ctrl-C or SIGTERM ends a run, which keeps what it has found so far; the second ends the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -32,12 +36,13 @@ class Interrupt:
         # Signals belong to the main thread; in another one, who runs us keeps them.
         self._mine = threading.current_thread() is threading.main_thread()
         if self._mine:
-            self._before = signal.signal(signal.SIGINT, self._handle)
+            self._before = {number: signal.signal(number, self._handle) for number in _ENDS}
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._mine:
-            signal.signal(signal.SIGINT, self._before)
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
 
     def came(self) -> bool:
         return self._event.is_set()

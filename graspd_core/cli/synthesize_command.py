@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import (
     add_address,
+    add_camera_option,
     add_object_options,
     add_planning_options,
     add_restriction_options,
@@ -38,12 +39,13 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
     parser = commands.add_parser("synthesize", help="plan grasps on a mesh, a cloud or a boxed shape")
     parser.set_defaults(run=run)
-    parser.add_argument("object", metavar="OBJECT", help="mesh or cloud file, or shape:NAME")
+    parser.add_argument("object", metavar="OBJECT", help="mesh, cloud or depth image, or shape:NAME")
     add_planning_options(parser)
+    add_camera_option(parser)
     add_object_options(parser)
     add_restriction_options(parser)
     sizes = parser.add_mutually_exclusive_group()
-    sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file")
+    sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file or the depth")
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
     parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="the grasps (docs/format.md)")
     parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="a page that shows them")
@@ -76,6 +78,7 @@ def run(options: argparse.Namespace) -> int:
                 alone=options.alone,
                 view_point=options.view_point,
                 settings=scene_config_of(options),
+                camera=options.camera,
             )
             hand = load_hand(options.hand)
     except DeadlinePassed:
@@ -83,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         result = not_loaded(options, config, options.began)
         print(summary(result, options.count, 0))
         return exit_status(result)
-    for warning in scene.object.warnings:
+    for warning in (*scene.object.warnings, *hand.named_warnings):
         print(f"graspd: {warning}", file=sys.stderr)
     page_of_run = nullcontext(Watched())
     if options.view:

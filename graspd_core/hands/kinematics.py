@@ -133,7 +133,8 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
     """Points of a `placement` in the base frame [m], for the link poses that `forward` gives."""
     batch = links.rotation.shape[0]
     poses = torch.cat([links.rotation, links.translation[..., None]], dim=-1)
-    columns = poses.permute(1, 3, 0, 2).reshape(-1, 3 * batch)
+    # Written out: of no pose at all, the number of rows could not be told from the size.
+    columns = poses.permute(1, 3, 0, 2).reshape(4 * poses.shape[1], 3 * batch)
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
 
 

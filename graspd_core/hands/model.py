@@ -17,6 +17,8 @@ from graspd_core.types import TriangleMesh
 PrimitiveKind = Literal["box", "sphere", "capsule", "cylinder", "hull"]
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
+# Where the base link stands in a file that says nothing of it.
+AT_ORIGIN = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 # Travel of a sliding joint that counts as much as a turn of one radian [m]: what a finger of 50 mm makes of it.
 METRES_PER_RADIAN = 0.05
 
@@ -112,6 +114,7 @@ class HandModel:
         candidate_normals: outward unit normals there.
         candidate_link: the link of each candidate.
         warnings: what had to be guessed while loading.
+        base_place: where the base link stands in the frame of its file, position [m] and quaternion wxyz.
         mimics: the coupled joints, in the order of their links.
         mount: where the base link sits on an arm, None where nobody said.
         skins: links, and the surfaces that their contact candidates lie on where it is not that of their solids [m].
@@ -146,6 +149,7 @@ class HandModel:
     candidate_normals: Float[np.ndarray, "candidates 3"]
     candidate_link: Int[np.ndarray, "candidates"]
     warnings: tuple[str, ...] = ()
+    base_place: tuple[tuple[float, float, float], tuple[float, float, float, float]] = AT_ORIGIN
     mimics: tuple[Mimic, ...] = ()
     mount: Mount | None = None
     skins: tuple[tuple[int, TriangleMesh], ...] = ()
@@ -154,6 +158,11 @@ class HandModel:
     def base_link(self) -> str:
         """Name of the root link, whose frame is the base frame."""
         return self.link_names[0]
+
+    @property
+    def named_warnings(self) -> tuple[str, ...]:
+        """The warnings, each with the hand's name."""
+        return tuple(f"hand {self.name}: {warning}" for warning in self.warnings)
 
     @property
     def num_joints(self) -> int:

@@ -151,7 +151,8 @@ def _rims(radius: float, half: float, spacing: float) -> tuple[Points, Points]:
 
 
 # What no sample depends on.
-_BESIDES = {"name", "urdf", "warnings", "mount", "adjacent", "candidate_points", "candidate_normals", "candidate_link"}
+_BESIDES = {"name", "urdf", "warnings", "mount", "base_place", "adjacent"}
+_BESIDES |= {"candidate_points", "candidate_normals", "candidate_link"}
 _CONTENT = {item.name for item in fields(HandModel)} - _BESIDES
 # Steps along the normal that tell a face that lies on another solid from one that is flush with it [m].
 _STEP = 1e-6

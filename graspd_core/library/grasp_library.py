@@ -34,7 +34,7 @@ from graspd_core.types import Grasp, GraspResult, Outcome, Timing, Verdict
 # How much a verification asks: what held under more is good where less is asked.
 STRICTNESS = {"none": 0, "standard": 1, "full": 1, "hard": 2, "hard_full": 2}
 # Not part of a hand's content: what it is called, where it is mounted, and points that are drawn anew for each plan.
-_NO_CONTENT = {"name", "urdf", "link_names", "joint_names", "warnings", "mount", "mimics"}
+_NO_CONTENT = {"name", "urdf", "link_names", "joint_names", "warnings", "mount", "mimics", "base_place"}
 _NO_CONTENT |= {"candidate_points", "candidate_normals", "candidate_link"}
 
 

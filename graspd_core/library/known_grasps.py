@@ -213,7 +213,7 @@ def known_grasps(
     told = restrictions_in_words(bound, refused, len(good), len(admitted)) if refused else ""
     result = library_result(library, good, count, time.perf_counter() - began)
     message = "; ".join(filter(None, (result.message, told)))
-    return replace(result, message=message, refused=refused, warnings=scene.object.warnings)
+    return replace(result, message=message, refused=refused, warnings=(*scene.object.warnings, *hand.named_warnings))
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:

@@ -113,7 +113,7 @@ def find_candidates(task: PlannerInput) -> Candidates:
 
 def expected_to_hold(grasps: Sequence[Grasp]) -> float:
     """Return how many of the grasps the ranking expects to pass the hold trial."""
-    return sum(0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps)
+    return sum((0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps), 0.0)
 
 
 def _searched(task: PlannerInput) -> Candidates:

@@ -105,6 +105,10 @@ class BoundRestriction:
         """Name of what is asked for, for the message of a run that found nothing."""
         return type(self).__name__
 
+    def why_none(self, others: BoundRestrictions) -> str:
+        """Say why no candidate was found under this and the run's `others`. Empty if `asked` says enough."""
+        return ""
+
     @property
     def aim(self) -> Aim | None:
         """Where initial poses are drawn, None for anywhere. Of several aims the first counts."""
@@ -188,6 +192,9 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))
         return f"{held} candidates held, {sum(refused.values())} refused: {reasons}"
-    if restrictions.each and not tried:
-        return f"no candidate was found under {', '.join(one.asked for one in restrictions.each)}"
-    return ""
+    if not restrictions.each or tried:
+        return ""
+    told = f"no candidate was found under {', '.join(one.asked for one in restrictions.each)}"
+    rest = ((one, tuple(other for other in restrictions.each if other is not one)) for one in restrictions.each)
+    reasons = (one.why_none(replace(restrictions, each=others)) for one, others in rest)
+    return "; ".join([told, *filter(None, reasons)])

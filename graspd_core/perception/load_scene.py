@@ -11,10 +11,12 @@ import numpy as np
 import torch
 
 from graspd_core.config import SceneConfig
-from graspd_core.errors import MeshError
+from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.perception.cloud.depth_files import is_depth_image, load_depth_view
+from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import Scene, build_scene, refuse_numbers
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.types import TriangleMesh
@@ -34,6 +36,7 @@ def load_scene(
     alone: bool = False,
     view_point: Sequence[float] | None = None,
     settings: SceneConfig | None = None,
+    camera: str | Path | None = None,
 ) -> Scene:
     """Build the scene of one object.
 
@@ -47,6 +50,8 @@ def load_scene(
         alone: a cloud shows the object and nothing else.
         view_point: where a cloud's camera stood [m]; None: where its file says, else at the origin.
         settings: how a cloud becomes a scene.
+        camera: file of the camera that took a depth image, which `source` is then (docs/clouds.md); there `scale` is
+            metres per unit of depth, and 1 leaves it to the camera's file.
 
     Raises:
         MeshError: the mesh cannot be read or used, has a target, or a number is out of range.
@@ -56,15 +61,11 @@ def load_scene(
     given = "mesh" if isinstance(source, TriangleMesh) else str(source)
     numbers = {"mass": mass, "friction": friction, "resolution": resolution}
     refuse_numbers(given, scale=scale, **numbers)
-    if not isinstance(source, TriangleMesh) and is_cloud_file(source):
+    if not isinstance(source, TriangleMesh) and (camera is not None or is_depth_image(source) or is_cloud_file(source)):
         # A mesh needs none of what makes an object of a cloud.
         from graspd_core.perception.scene_from_views import scene_from_views
 
-        place = None if view_point is None else np.asarray(view_point, dtype=float) / scale
-        views = [
-            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale)
-            for view in load_views(source, place)
-        ]
+        views = scaled_views(source, camera, scale, view_point)
         scene = scene_from_views(
             views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
         )
@@ -75,6 +76,21 @@ def load_scene(
         raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which thing is meant")
     mesh, warnings = _read_mesh(source, scale)
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
+
+
+def scaled_views(
+    source: str | Path, camera: str | Path | None, scale: float = 1.0, view_point: Sequence[float] | None = None
+) -> list[PointCloud]:
+    """What a cloud file or a depth image shows [m], as `load_scene` takes it. Raises CloudError: see there."""
+    if camera is not None:
+        if view_point is not None:
+            raise CloudError(f"view_point: {source} is a depth image, which tells where its camera stood")
+        return [load_depth_view(source, camera, None if scale == 1.0 else scale)]
+    if is_depth_image(source):
+        raise CloudError(f"{source}: an image, of depth perhaps: name the camera that took it, --camera camera.json")
+    place = None if view_point is None else np.asarray(view_point, dtype=float) / scale
+    views = load_views(source, place)
+    return [replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in views]
 
 
 def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[TriangleMesh, tuple[str, ...]]:

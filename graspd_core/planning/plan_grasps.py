@@ -114,7 +114,7 @@ def plan_grasps(
         seed=seed,
         timing=_timing(run, scene, found),
         ended_early=run.ended_early,
-        warnings=scene.object.warnings + _lifted_less(scene, found.mass),
+        warnings=(*scene.object.warnings, *hand.named_warnings, *_lifted_less(scene, found.mass)),
         refused=found.refused,
     )
     told = "" if run.over() else _why_few(run, scene, bound, found, result)

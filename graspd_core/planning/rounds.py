@@ -149,10 +149,11 @@ def run_rounds(
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
             candidates = find_candidates(PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **asked)).grasps
+        # Here, since a search that was interrupted leaves none to go through.
+        state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):
             admitted, refused = restrictions.admit(some)
-            spent = time.perf_counter() - began
-            state = replace(state, optimise_time=state.optimise_time + spent, refused=state.refused + refused)
+            state = replace(_searched_since(state, began), refused=state.refused + refused)
             tried = TriedGrasps()
             if ahead is None:
                 first = admitted[: enough - state.good]
@@ -180,6 +181,10 @@ def run_rounds(
             if state.good >= count or run.over():
                 break
     return state
+
+
+def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
+    return replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
 
 
 def _tried_lighter(

@@ -28,6 +28,7 @@ from graspd_core.arms.inverse_kinematics import (
 )
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble
+from graspd_core.hands.readers.xml_io import read_xml
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3, axis_rotation, random_rotations
 
@@ -280,6 +281,19 @@ def test_every_shipped_arm_is_listed_and_its_seed_posture_clear(arm: Arm):
     hits = hits_of_self(arm, arm_links(arm, torch.as_tensor(arm.seed)[None]))
     assert hits.what
     assert (hits.depth < 0).all()
+
+
+@pytest.mark.parametrize("path", sorted(config_dir().glob("*/*.urdf")), ids=lambda path: path.stem)
+def test_shipped_urdfs_hold_only_shapes_that_urdfdom_knows(path: Path):
+    """It is what robot_state_publisher and MoveIt read them with."""
+    shapes = {shape.tag for geometry in read_xml(path).iter("geometry") for shape in geometry}
+    assert shapes <= {"box", "cylinder", "sphere", "mesh"}
+
+
+def test_links_of_the_shipped_arms_are_capsules(arm: Arm):
+    """A cylinder with a ball at each end is one, so that an arm's distances need no more solids than before."""
+    assert {primitive.kind for primitive in arm.chain.primitives} == {"capsule"}
+    assert len(arm.capsules.radius) == {"ur5e_like": 9, "panda_like": 13}[arm.name]
 
 
 @pytest.mark.parametrize("hand", ["allegro_right", "allegro_left", "barrett_like", "leap_right", "parallel_gripper"])

@@ -197,15 +197,16 @@ def test_grasps_come_from_where_they_are_asked_to(tmp_path: Path, capsys: pytest
     assert "candidates held" in capsys.readouterr().out or json.loads(out.read_text())["refused"] == {}
 
 
-def test_the_first_interrupt_ends_the_run_and_the_second_the_process():
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_interrupt_ends_the_run_and_the_second_the_process(number: signal.Signals):
+    before = signal.getsignal(number)
     with Interrupt() as interrupt:
         assert not interrupt.came()
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
         assert interrupt.came()
         with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
+            signal.raise_signal(number)
+    assert signal.getsignal(number) is before
 
 
 def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
@@ -227,14 +228,15 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     assert "total" in done.stdout
 
 
-def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_in_a_process_of_its_own(tmp_path: Path, number: signal.Signals):
     out = tmp_path / "grasps.json"
     command = [*GRASPD, "synthesize", "shape:box", "-n", "32", "--preset", "accurate", "--out", str(out)]
     command += ["--mass", "0.1"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     assert "optimise" in process.stderr.readline()
-    os.kill(process.pid, signal.SIGINT)
+    os.kill(process.pid, number)
     output, errors = process.communicate()
     assert process.returncode == EXIT_INTERRUPTED, errors
     assert "Traceback" not in errors

@@ -15,12 +15,13 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from graspd_core import load_grasps, load_hand
+from graspd_core import load_grasps, load_hand, load_scene, plan_grasps
 from graspd_core.errors import FormatError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
 from graspd_core.types import Posture, Verdict
 from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.export_grasps import qpos
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign
 from graspd_dataset.inspect_dataset import tables_of
 
@@ -139,6 +140,59 @@ def one_npy(exported) -> tuple[Path, dict[str, Any]]:
 def written(folder: Path, values: Any) -> Path:
     np.save(folder / "grasp.npy", np.array(values, dtype=object), allow_pickle=True)
     return folder / "grasp.npy"
+
+
+MOVED = """<mujoco model="moved"><worldbody><body name="palm" pos="0 0.02 0.034" quat="0 1 0 1">
+<geom type="box" size=".04 .04 .01"/><body name="finger" pos="0.04 0 0.01">
+<joint name="hinge" axis="0 1 0" range="0 90"/>
+<geom type="capsule" fromto="0 0 0 0 0 .05" size=".01"/></body></body></worldbody></mujoco>"""
+
+
+def test_a_qpos_is_that_of_the_frame_of_the_hands_file(tmp_path: Path):
+    """That bench attaches the file's world, in which the base body stands somewhere."""
+    (tmp_path / "moved.xml").write_text(MOVED)
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
+    row = np.array([0.1, 0.2, 0.3, *np.roll(turn.as_quat(), 1), 0.5])
+    values = {f"{stage}_qpos": row for stage in STAGES} | {"obj_path": "x", "obj_scale": 1.0}
+    values["obj_pose"] = np.array([0.0, 0, 0, 1, 0, 0, 0])
+    hand = load_hand(tmp_path / "moved.xml", candidates=20)
+    (grasp,) = read_foreign(written(tmp_path, values), hand, mesh="shape:mug", order=("hinge",))
+    assert np.allclose(grasp.grasp.position, row[:3] + turn.apply([0.0, 0.02, 0.034]))
+    found = Rotation.from_quat(np.roll(grasp.grasp.quaternion_wxyz, -1))
+    assert (found.inv() * turn * Rotation.from_quat([1, 0, 1, 0])).magnitude() < 1e-9
+
+
+@pytest.fixture(scope="module")
+def shifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six grasps of a box whose hands are 34 mm farther along their approach than they were planned."""
+    folder = tmp_path_factory.mktemp("shifted")
+    found = plan_grasps(load_scene("shape:box"), HAND, count=6, preset="fast", verify="none", measure=False).grasps
+    for number, grasp in enumerate(found):
+        row: dict[str, Any] = {"hand_name": "allegro_right"}
+        turn = Rotation.from_quat(np.roll(grasp.grasp.quaternion_wxyz, -1))
+        for stage in STAGES:
+            posture = getattr(grasp, stage)
+            row[f"{stage}_position"] = posture.position + 0.034 * turn.apply(HAND.approach)
+            row[f"{stage}_quaternion_wxyz"] = posture.quaternion_wxyz
+            row[f"{stage}_joint_positions"] = posture.joint_positions
+        values = {"obj_path": "x", "obj_scale": 1.0, "obj_pose": np.array([0.0, 0, 0, 1, 0, 0, 0])}
+        values |= {f"{stage}_qpos": qpos(row, stage) for stage in STAGES}
+        np.save(folder / f"{number}.npy", np.array(values, dtype=object), allow_pickle=True)
+    return folder
+
+
+def test_a_frame_in_doubt_is_named_and_no_share_is_printed_for_it(shifted: Path, tmp_path: Path, graspd, capsys):
+    out = tmp_path / "out.json"
+    assert graspd("import", shifted, "--object", "shape:box", "--hand", "allegro_right", "--out", out) == 0
+    told = "grasps are more than 5 mm deep in the object: their poses are hardly those of the base link 'base_link'"
+    assert told in capsys.readouterr().err
+    assert told in json.loads(out.read_text())["outcome"]["warnings"][0]
+    words = ("--hand", "allegro_right", "--presets", "fast", "--trials", "standard", "--out", tmp_path / "out")
+    assert graspd("bench", "--import", shifted, "--objects", "shape:box", *words) == 0
+    printed = capsys.readouterr().out
+    (line,) = [line for line in printed.splitlines() if "| imported, frame in doubt |" in line]
+    assert "%" not in line
+    assert told in printed
 
 
 class Evil:

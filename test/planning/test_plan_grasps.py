@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 from graspd_core.verify import verification
+from graspd_core.verify.run_clock import result_of
 from graspd_core.verify.trial_registry import TRIALS
 
 # A search that nobody waits for.
@@ -145,11 +147,14 @@ def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
     def progress(report: Progress) -> None:
         if report.stage is Stage.OPTIMISE:
             steps.append(report.step)
+            time.sleep(0.3)
             stop.set()
 
     cancelled = plan_grasps(scene, hand, count=8, preset=ENDLESS, progress=progress, stop=stop.is_set)
     assert cancelled.outcome is Outcome.CANCELLED
     assert cancelled.grasps == ()
+    # It went into the search, which left nothing to try.
+    assert cancelled.timing.optimise >= 0.3
     assert len(steps) == 1
 
 
@@ -240,3 +245,13 @@ def test_a_wrong_request_is_refused(scene, hand, wrong: dict, culprit: str):
     with pytest.raises(ConfigError) as caught:
         plan_grasps(scene, hand, **wrong)
     assert culprit in str(caught.value)
+
+
+def test_a_grasp_that_touches_nothing_is_none_where_no_trial_is_asked_for(scene, hand):
+    """Hands that stay where they are drawn, off the object: none is what was asked for."""
+    found = plan_grasps(scene, hand, count=4, preset="fast", verify="none", measure=False).grasps
+    assert all(grasp.usable and grasp.contacts for grasp in found)
+    off = replace(found[0], contacts=())
+    assert not off.usable
+    result = result_of([*found, off], len(found) + 1, method="closed_form")
+    assert result.outcome is Outcome.TOO_FEW

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,6 +107,25 @@ def test_an_object_far_away_is_told_at_once(hand: HandModel, table: Scene):
     assert result.outcome is Outcome.NO_CANDIDATES
     assert not result.grasps
     assert "m from the base of panda_like, which brings barrett_like" in result.message
+
+
+@pytest.mark.parametrize(("name", "below", "link"), [("ur5e_like", 0.12, "upper_arm"), ("panda_like", 0.3, "link_2")])
+def test_an_arm_whose_every_posture_is_in_the_table_is_told_at_once(hand: HandModel, table: Scene, name, below, link):
+    assert table.support is not None
+    reach = Reach(load_arm(name), (-0.5, 0.1, table.support.offset - below))
+    result = planned(table, hand, reach)
+    assert result.outcome is Outcome.NO_CANDIDATES
+    told = f"every posture of {name} has its {link} in the table, whose surface is {below:.2f} m above the arm's base"
+    assert result.message.startswith(told)
+
+
+def test_an_object_out_of_reach_is_told_by_reasons_not_by_a_class(hand: HandModel):
+    """Near enough that a search begins, too far for any hand: the reasons of docs/arms.md, counted."""
+    scene = build_scene(make_shape("box"))
+    result = planned(scene, hand, Reach(load_arm("panda_like"), (-1.3, 0.1, 0.0)))
+    assert result.outcome is Outcome.NO_CANDIDATES
+    assert result.message.startswith("no candidate was found under the reach of panda_like; of 64 hands around the")
+    assert re.search(r": [1-9]\d* farther than the arm reaches", result.message)
 
 
 def test_poses_far_from_the_origin_are_reached_alike(hand: HandModel):

@@ -21,7 +21,7 @@ from graspd_core.optimize.restrictions import (
     restrictions_in_words,
 )
 from graspd_core.perception.scene import Scene
-from graspd_core.types import Grasp, Outcome
+from graspd_core.types import Grasp, Outcome, Plane
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,12 @@ def test_what_is_refused_is_not_tried_and_is_counted(scene, hand):
     assert found.message.startswith(f"{held} candidates held, {sum(found.refused.values())} refused: ")
 
 
+@pytest.mark.parametrize("support", [None, Plane(np.array([0.0, 0.0, 1.0]), -0.05)], ids=["free", "on a table"])
 @pytest.mark.parametrize("method", ["closed_form", "annealing", "graspd2022", "random_closure"])
-def test_every_method_ends_where_a_restriction_leaves_nothing(scene, hand, method):
+def test_every_method_ends_where_a_restriction_leaves_nothing(scene, hand, method, support):
     from graspd_core import load_preset, override
+
+    scene = replace(scene, support=support)
 
     preset = override(load_preset("fast"), {"method": method, "rounds.most": 1})
     if method == "random_closure":

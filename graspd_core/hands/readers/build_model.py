@@ -29,6 +29,8 @@ _DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 _LARGEST = 1e6
 # A joint that moves less than this is welded [rad] or [m].
 _STILL = 1e-6
+# An angle beyond this, up to a whole circle in degrees, may be meant in degrees [rad].
+_FULL_TURN, _CIRCLE = 2 * np.pi + 0.05, 360.5
 # Wider limits than this say nothing [rad]; a slide that is longer is in another unit [m].
 _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
@@ -236,7 +238,11 @@ def _settled(
     moving = [joint for joint in joints if joint.kind != "fixed"]
     followers = [joint for joint in moving if joint.name in couplings]
     leaders = {joint.name: joint for joint in moving if joint.name not in couplings}
-    warnings: list[str] = []
+    warnings = [
+        f"joint {joint.name!r}: limits of {joint.lower:g} to {joint.upper:g} rad; if they are in degrees, write radians"
+        for joint in moving
+        if joint.kind == "revolute" and _FULL_TURN < max(-joint.lower, joint.upper) <= _CIRCLE
+    ]
     for follower in followers:
         coupling = couplings[follower.name]
         narrow = _narrowed(leaders[coupling.leader], follower, coupling)

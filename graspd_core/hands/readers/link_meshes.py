@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from urllib.parse import unquote
@@ -36,25 +37,44 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
     Raises:
         HandError: no such file, or one that would have to be fetched.
     """
-    scheme, separator, rest = filename.replace("\\", "/").partition("://")
-    if not separator:
-        scheme, rest = "", scheme
+    scheme, rest = _address(filename)
     if scheme in ("http", "https", "ftp"):
         raise wrong(urdf, shape, f"mesh {filename!r} is not fetched from the network; name a local file")
     parents = urdf.resolve().parents
     if scheme in ("package", "model"):
-        package, _, inside = unquote(rest).partition("/")
-        candidates = [folder / inside for folder in _package_folders(package, parents)]
         # An unpacked archive often has another name than the package: then what follows the package's name decides.
-        candidates += [folder / inside for folder in parents]
+        folders, rest = [*_package_folders(rest.partition("/")[0], parents), *parents], rest.partition("/")[2]
     else:
-        plain = unquote(rest.removeprefix("localhost")) if scheme == "file" else rest
-        candidates = [folder / plain for folder in parents]
-    for candidate in candidates:
-        if inside_exists(candidate):
-            return candidate
+        folders = list(parents)
+    for folder in folders:
+        if inside_exists(folder / rest):
+            return folder / rest
     where = "in any package path, nor " if scheme in ("package", "model") else ""
     raise wrong(urdf, shape, f"mesh {filename!r} was not found {where}beside the file or above it")
+
+
+def _address(filename: str) -> tuple[str, str]:
+    """The scheme of a mesh's address, empty for a plain path, and what follows it."""
+    scheme, separator, rest = filename.replace("\\", "/").partition("://")
+    if not separator:
+        return "", scheme
+    return scheme, unquote(rest.removeprefix("localhost") if scheme == "file" else rest)
+
+
+def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...]:
+    """Say which packages were not found, whose meshes were taken from beside the URDF or above it."""
+    addresses = (_address(mesh.get("filename") or "") for mesh in meshes)
+    named = {rest.partition("/")[0] for scheme, rest in addresses if scheme in ("package", "model")}
+    parents = urdf.resolve().parents
+    lost = sorted(name for name in named if not any(map(_folder_exists, _package_folders(name, parents))))
+    return tuple(f"package {name!r} was not found: its meshes are those beside the file or above it" for name in lost)
+
+
+def _folder_exists(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
 
 
 def inside_exists(path: Path) -> bool:

@@ -28,8 +28,8 @@ from graspd_core.hands.readers.build_model import (
     refuse_crowds,
     resolved_couplings,
 )
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull
-from graspd_core.hands.readers.xml_io import FARTHEST, Element, as_text, read_xml, wrong
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, inside_exists, mesh_hull
+from graspd_core.hands.readers.xml_io import DEEPEST, FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.se3 import axis_rotation, rotation_from_quaternion
 from graspd_core.types import TriangleMesh
@@ -140,12 +140,14 @@ def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
 
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}
-_REFUSED = ("include", "replicate", "attach", "composite", "flexcomp", "plugin")
+_REFUSED = ("replicate", "attach", "composite", "flexcomp", "plugin")
 # What MuJoCo is shown: other sections and assets name files, ask for memory, or say nothing that counts here.
 _SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", "actuator")
 # Words whose text may look like a number.
 _NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
 _HEAVIEST, _MOST_CLASSES = 1e3, 300
+# Files that may be included together.
+_MOST_FILES = 30
 
 
 @dataclass(eq=False)
@@ -173,6 +175,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
         HandError: MuJoCo refuses the file, it has several bodies in the world, or uses what is not read.
     """
     root = read_xml(path) if root is None else root
+    _include(path, path, root, {path.resolve()})
     _refuse(path, root)
     parts = _compiled(path, root)
     world = parts.spec.worldbody
@@ -195,7 +198,51 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
         warnings.append(f"no colliding geom, so the visual ones are taken: {', '.join(parts.shown)}")
     efforts, couplings = _efforts(parts), resolved_couplings(path, _couplings(parts))
     joints = [replace(j, effort=min(j.effort, efforts.get(j.name, np.inf))) for j in parts.joints]
-    return assemble(path, root.get("model") or path.stem, parts.links, joints, couplings, tuple(warnings))
+    hand = assemble(path, root.get("model") or path.stem, parts.links, joints, couplings, tuple(warnings))
+    number = parts.spec.worldbody.id if hangs else base.id
+    x, y, z, *turn = (*parts.model.body_pos[number].tolist(), *parts.model.body_quat[number].tolist())
+    w, i, j, k = turn
+    return replace(hand, base_place=((x, y, z), (w, i, j, k)))
+
+
+def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
+    """Put what files hold in the place of each `<include>` below `parent`, as MuJoCo does, which `holder` holds.
+
+    Raises:
+        HandError: a file is not there, is no MJCF, or is included twice.
+    """
+    children: list[ET.Element] = []
+    for child in parent:
+        if depth > DEEPEST:
+            raise wrong(path, child, f"<{child.tag}> is nested more than {DEEPEST} deep")
+        if child.tag == "include":
+            file, included = _read_included(path, holder, child, seen)
+            _include(path, file, included, seen, depth + 1)
+            children += included
+        else:
+            _include(path, holder, child, seen, depth + 1)
+            children.append(child)
+    parent[:] = children
+
+
+def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path]) -> tuple[Path, ET.Element]:
+    """The file that an `<include>` names, beside the main file or beside the one that names it, and its root."""
+    name = place.get("file") or ""
+    told = f"<include file={shown(name)}>"
+    found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)
+    if found is None:
+        raise wrong(path, place, f"{told}: no such file beside {path.name}")
+    if found.resolve() in seen or len(seen) >= _MOST_FILES:
+        raise wrong(path, place, f"{told}: included twice, or one of more than {_MOST_FILES} files")
+    seen.add(found.resolve())
+    root = read_xml(found)
+    if root.tag not in ("mujoco", "mujocoinclude"):
+        raise wrong(path, place, f"{told}: its root element is <{root.tag}>; an MJCF file has <mujoco>")
+    for element in root.iter():
+        # Its lines would be taken for those of the main file.
+        if isinstance(element, Element):
+            element.line = 0
+    return found, root
 
 
 def _refuse(path: Path, root: ET.Element) -> None:
@@ -342,7 +389,10 @@ def _couplings(parts: _Parts) -> dict[str, Coupling]:
             continue
         kind = tie.type.name.removeprefix("mjEQ_").lower()
         if kind != "joint" or not tie.name2:
-            raise fault(parts.path, tie, f"equality <{kind}> is not read: only a joint tied to another is")
+            told = f"equality <{kind}> is not read: only a joint tied to another is"
+            if kind in ("connect", "weld"):
+                told += "; to tie the joints of the loop that it closes, write <joint joint1 joint2 polycoef> instead"
+            raise fault(parts.path, tie, told)
         constant, slope, *bends = tie.data[:5].tolist()
         if any(bends):
             given = shown(tie.data[:5].tolist())

@@ -18,13 +18,15 @@ from jaxtyping import Float
 from graspd_core.errors import HandError
 from graspd_core.hands.model import HandModel, JointKind, Primitive, PrimitiveKind
 from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble, read_couplings, refuse_crowds
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull, whole_mesh
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull, missing_packages, whole_mesh
 from graspd_core.hands.readers.xml_io import read_numbers, read_origin, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import simplify
 from graspd_core.types import TriangleMesh
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
+# Lengths that differ by less are the same [m].
+_SAME = 1e-6
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
 # Triangles of all meshes that a viewer draws of a hand together, and of each.
 _MOST_TRIANGLES, _FEWEST_TRIANGLES = 4000, 60
@@ -41,7 +43,30 @@ def _colliding(link: ET.Element) -> list[ET.Element]:
 def _shapes(
     path: Path, elements: Sequence[ET.Element], read_mesh: Callable[..., TriangleMesh]
 ) -> tuple[Primitive, ...]:
-    return tuple(_read_shape(path, element, read_mesh) for element in elements)
+    return _with_capsules([_read_shape(path, element, read_mesh) for element in elements])
+
+
+def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
+    """Return the shapes of a link with each cylinder and the two balls at its ends as one capsule, the same solid.
+
+    This is how a URDF writes a capsule, since urdfdom knows none.
+    """
+    found, taken = list(shapes), set[int]()
+    for i, shape in enumerate(shapes):
+        if shape.kind != "cylinder":
+            continue
+        half = shape.size[1] * shape.rotation[:, 2]
+        ends = [(shape.translation + sign * half, shape.size[0]) for sign in (-1.0, 1.0)]
+        balls = [next((j for j, b in enumerate(shapes) if j not in taken and _is_ball(b, *end)), -1) for end in ends]
+        if min(balls) >= 0:
+            found[i] = replace(shape, kind="capsule")
+            taken.update(balls)
+    return tuple(shape for i, shape in enumerate(found) if i not in taken)
+
+
+def _is_ball(shape: Primitive, center: Float[np.ndarray, "3"], radius: float) -> bool:
+    same = shape.kind == "sphere" and abs(shape.size[0] - radius) < _SAME
+    return same and float(np.abs(shape.translation - center).max()) < _SAME
 
 
 def _read_shape(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:
@@ -90,6 +115,8 @@ _KINDS: dict[str, JointKind] = {
     "prismatic": "prismatic",
     "fixed": "fixed",
 }
+# What to do with a xacro file.
+EXPAND = "expand it to a URDF first: xacro FILE > hand.urdf"
 # Joint types that only place a whole robot in the world.
 _FREE = ("floating", "planar")
 _MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
@@ -133,6 +160,9 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
         bodies.append(LinkSpec(name, *_inertial(path, link), _shapes(path, elements, hull)))
     if shown:
         dropped.append(f"no <collision>, so the <visual> is taken: {', '.join(shown)}")
+    dropped += missing_packages(
+        path, (mesh for link in links for shape in _colliding(link) for mesh in shape.iter("mesh"))
+    )
     name = str(root.get("name") or path.stem)
     return assemble(path, name, bodies, specs, read_couplings(path, joints), tuple(dropped))
 
@@ -199,14 +229,14 @@ def below_link(path: Path, root: ET.Element, link: str) -> None:
 def _refuse_xacro(path: Path, root: ET.Element) -> None:
     for top in root:
         if top.tag.startswith("xacro:"):
-            raise wrong(path, top, f"is a xacro file (<{top.tag}>); expand it to a URDF first")
+            raise wrong(path, top, f"is a xacro file (<{top.tag}>); {EXPAND}")
         if top.tag not in ("link", "joint"):
             continue
         for element in top.iter():
             unexpanded = [text for text in element.attrib.values() if "${" in text or "$(" in text]
             if unexpanded or element.tag.startswith("xacro:"):
                 what = unexpanded[0] if unexpanded else f"<{element.tag}>"
-                raise wrong(path, element, f"xacro left over in <{element.tag}>: {what}; expand it to a URDF first")
+                raise wrong(path, element, f"xacro left over in <{element.tag}>: {what}; {EXPAND}")
 
 
 def _below_world(

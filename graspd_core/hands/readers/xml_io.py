@@ -22,7 +22,7 @@ from graspd_core.errors import HandError
 # Of an error: a file may have a word of megabytes.
 _LONGEST = 1000
 _LARGEST_FILE = 32 * 2**20
-_DEEPEST = 150
+DEEPEST = 150
 # The largest hand known has some 1000 elements; each takes half a kilobyte, however short it is written.
 _MOST_ELEMENTS, _MOST_ATTRIBUTES = 20_000, 200
 # Nothing in a hand is farther than this from the frame that it is given in [m].
@@ -138,8 +138,8 @@ def _parsed(path: Path, text: str) -> Element:
             element.owner = stack[-1].owner
         if tag in _OWNERS and not attributes.get("name", "").isprintable():
             raise wrong(path, element, "has a name with a line end, or another character that cannot be printed")
-        if len(stack) >= _DEEPEST:
-            raise wrong(path, element, f"<{tag}> is nested more than {_DEEPEST} deep")
+        if len(stack) >= DEEPEST:
+            raise wrong(path, element, f"<{tag}> is nested more than {DEEPEST} deep")
         if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
             limits = f"{_MOST_ELEMENTS} elements, nor an element more than {_MOST_ATTRIBUTES} attributes"
             raise wrong(path, element, f"no hand has more than {limits}")

@@ -210,7 +210,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
         points = _read_points(path, ending)
         height = _pcd_height(path) if ending == "pcd" else 1
         return (seen_from(points.reshape(height if len(points) % height == 0 else 1, -1, 3), viewpoint),)
-    arrays = _read_numpy(path)
+    arrays = read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
             if viewpoint is not None:
@@ -264,7 +264,7 @@ def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
     camera = camera_from_calibration(width, height, matrix.reshape(-1).tolist(), distortion, model)
     views = []
     for index, image in enumerate(images):
-        pose = None if poses is None else _rigid(poses[index], place)
+        pose = None if poses is None else rigid(poses[index], place)
         views.append(cloud_from_depth(_metres(image, name), camera, pose))
     return tuple(views)
 
@@ -279,7 +279,7 @@ def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
     raise CloudError(f"{name!r} holds {image.dtype}; integers (mm) or floats (m) are needed")
 
 
-def _rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
+def rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
     pose = _numbers({name: pose}, name)
     turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
     square = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
@@ -298,7 +298,7 @@ def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
         return arrays[name].astype(float)
 
 
-def _read_numpy(path: Path) -> dict[str, np.ndarray]:
+def read_numpy(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an npz, or that of an npy as `points`."""
     try:
         # numpy leaves a spoilt file open when it is given the path.

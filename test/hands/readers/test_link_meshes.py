@@ -73,6 +73,14 @@ def test_a_package_is_found_where_ros_says(
     assert len(_read(workspace, name).primitives) == 1
 
 
+def test_a_mesh_taken_from_beside_the_file_is_warned_of(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its package is nowhere, but the path in it exists beside the URDF: perhaps another hand's mesh."""
+    found = _read(workspace, "package://lost/meshes/wedge one.obj")
+    assert "package 'lost' was not found: its meshes are those beside the file or above it" in found.warnings
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(workspace / "opt/share/far"))
+    assert _read(workspace, "package://far/m/wedge.obj").warnings == _read(workspace, "meshes/wedge one.obj").warnings
+
+
 @pytest.mark.parametrize("scale", ["-1 1 1", "1 -2 1", "-1 -1 -1", "0.5"])
 def test_a_mirrored_hull_is_wound_outwards(workspace: Path, scale: str) -> None:
     hull = _read(workspace, "meshes/wedge one.obj", scale).primitives[0]

@@ -178,10 +178,39 @@ def test_ranges_that_do_not_hold_limit_nothing(folder: Path) -> None:
     assert any("joint 'j2' turns without end" in text for text in hand.warnings)
 
 
+def test_included_files_are_read_as_if_they_stood_there(folder: Path) -> None:
+    """A hand of three files, one of which includes another in a body of the first."""
+    head, finger, rest = re.split(r'(?=  <body name="b")|(?=</body></worldbody>)', MJCF)
+    (folder / "parts").mkdir()
+    (folder / "parts" / "finger.xml").write_text(f"<mujocoinclude>{finger}</mujocoinclude>")
+    (folder / "parts" / "middle.xml").write_text('<mujoco><include file="finger.xml"/></mujoco>')
+    whole, parts = _read(folder, MJCF), _read(folder, f'{head}<include file="parts/middle.xml"/>{rest}')
+    assert parts.link_names == whole.link_names
+    assert [p.kind for p in parts.primitives] == [p.kind for p in whole.primitives]
+    (folder / "parts" / "finger.xml").write_text("<robot/>")
+    with pytest.raises(HandError, match=r"<include file='finger.xml'>: its root element is <robot>"):
+        _read(folder, f'{head}<include file="parts/middle.xml"/>{rest}')
+
+
+def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
+    """The base's frame stays the base body's own; grasps of others are poses of the file's world."""
+    place, turn = _read(folder, MJCF).base_place
+    assert place == (1.0, 2.0, 3.0)
+    # As the axes of z, y', x'' turn by 10, 20 and 30 degrees.
+    z, y, x = (np.radians(angle) / 2 for angle in (10, 20, 30))
+    assert turn[0] == pytest.approx(np.cos(z) * np.cos(y) * np.cos(x) + np.sin(z) * np.sin(y) * np.sin(x))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("<freejoint/>", '<include file="x.xml"/>', "body 'palm': <include> is not read"),
+        ("<freejoint/>", '<include file="x.xml"/>', "<include file='x.xml'>: no such file beside changed.xml"),
+        ("<freejoint/>", '<include file="changed.xml"/>', "<include file='changed.xml'>: included twice"),
+        (
+            "<equality>",
+            '<equality><connect body1="a" body2="b" anchor="0 0 0"/>',
+            "write <joint joint1 joint2 pol",
+        ),
         ('<body name="tip"', '<replicate count="9"/><body name="tip"', "body 'a2': <replicate> is not read"),
         ("</worldbody>", '<body name="mug"/></worldbody>', "the world has 2 bodies, a hand has one: palm, mug"),
         ('type="slide"', 'type="ball"', "joint 's1' is of type 'ball'; known: hinge, slide"),

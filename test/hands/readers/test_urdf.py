@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, load_hand, read_hand_file
+from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, hand_names, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel, Mimic, all_joint_names, all_joint_positions
 from graspd_core.hands.readers.urdf import read_urdf
 
@@ -29,6 +30,27 @@ def _read(tmp_path: Path, text: str | bytes) -> HandModel:
     path = tmp_path / "tiny.urdf"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return read_hand_file(path)
+
+
+@pytest.mark.parametrize(
+    ("radius", "shift", "kinds"),
+    [
+        (0.01, 0.0, ["capsule"]),
+        (0.009, 0.0, ["cylinder", "sphere", "sphere"]),
+        (0.01, 0.002, ["cylinder"] + ["sphere"] * 2),
+    ],
+)
+def test_a_cylinder_with_its_balls_is_a_capsule(tmp_path: Path, radius: float, shift: float, kinds: list[str]) -> None:
+    """Turned a quarter about y its axis lies along x; balls of another size or at another place are their own."""
+    ball = '<collision><origin xyz="{} 0 0"/><geometry><sphere radius="{}"/></geometry></collision>'
+    rod = '<cylinder radius="0.01" length="0.04"/>'
+    rod = f'<collision><origin rpy="0 1.570796327 0"/><geometry>{rod}</geometry></collision>'
+    text = ball.format(0.02 + shift, radius) + rod + ball.format(-0.02, radius)
+    finger = [p for p in _read(tmp_path, HAND.replace(BOX, text, 1)).primitives if p.link == 0]
+    assert sorted(p.kind for p in finger) == kinds
+    if kinds == ["capsule"]:
+        assert finger[0].size == (0.01, 0.02)
+        assert np.allclose(finger[0].rotation[:, 2], [1, 0, 0])
 
 
 def _changed(*pairs: tuple[str, str]) -> str:
@@ -118,6 +140,82 @@ def test_axes_are_normalised_and_inertials_optional(tmp_path: Path) -> None:
     hand = _read(tmp_path, _changed(('"0 1 0"', '"0 3e-9 4e-9"')))
     np.testing.assert_allclose(hand.joint_axis[1], [0, 0.6, 0.8])
     assert (hand.link_mass == 0).all()
+
+
+TWINS = "".join(
+    f'<link name="{side}_palm">{BOX}</link><joint name="{side}_arm" type="fixed"><parent link="torso"/>'
+    f'<child link="{side}_palm"/><origin xyz="0 {y} 0"/></joint>'
+    + "".join(
+        f'<link name="{side}_{k}">{BOX}</link>'
+        + HINGE.replace("hinge", f"{side}_j{k}").replace('"palm"', f'"{side}_palm"').replace("finger", f"{side}_{k}")
+        for k in "ab"
+    )
+    for side, y in (("left", 0.3), ("right", -0.3))
+)
+# The half of a 2F-140: the outer knuckle carries the finger, the inner one beside it carries nothing.
+KNUCKLES = "".join(
+    f'<link name="{child}">{BOX}</link><joint name="{child}_joint" type="revolute"><parent link="{parent}"/>'
+    f'<child link="{child}"/><origin xyz="{at}" rpy="{rpy}"/><axis xyz="1 0 0"/>'
+    '<limit lower="0" upper="0.7" effort="10" velocity="1"/>{}</joint>'
+    for parent, child, at, rpy in (
+        ("palm", "outer_knuckle", "0 -0.0306 0.0549", "2.3 0 0"),
+        ("outer_knuckle", "inner_finger", "0 0.0818 0.1", "0 0 0"),
+        ("palm", "inner_knuckle", "0 -0.0127 0.0614", "2.3 0 0"),
+    )
+)
+MIMIC = '<mimic joint="outer_knuckle_joint"/>'
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            HAND.replace('lower="-0.5" upper="1"', 'lower="-20" upper="90"'),
+            "joint 'hinge': limits of -20 to 90 rad; if they are in degrees, write radians",
+        ),
+        (HAND.replace('effort="2"', 'effort="6e4"'), "joint 'hinge': an effort of 6e+04 N·m, more than the 100 of any"),
+        (f'<robot name="two"><link name="torso"/>{TWINS}</robot>', "fingers hang from 'left_palm' and 'right_palm'"),
+        (
+            f'<robot name="open"><link name="palm">{BOX}</link>{KNUCKLES.format("", "", "")}</robot>',
+            "joints 'outer_knuckle_joint' and 'inner_knuckle_joint' stand side by side like those of a closed linkage",
+        ),
+    ],
+    ids=["degrees", "effort", "two hands", "open linkage"],
+)
+def test_what_a_hand_can_hardly_have_is_warned_of(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "tiny.urdf").write_text(text)
+    hand = load_hand(tmp_path / "tiny.urdf", candidates=20)
+    assert [warning for warning in hand.warnings if warning.startswith(told)], hand.warnings
+    assert all(warning.startswith(f"hand {hand.name}: ") for warning in hand.named_warnings)
+
+
+def test_what_is_as_it_should_be_is_not_warned_of(tmp_path: Path) -> None:
+    """A linkage whose joints follow, an effort that the description names, and every shipped hand."""
+    (tmp_path / "a.urdf").write_text(
+        f'<robot name="closed"><link name="palm">{BOX}</link>{KNUCKLES.format("", MIMIC, MIMIC)}</robot>'
+    )
+    assert not [w for w in load_hand(tmp_path / "a.urdf", candidates=20).warnings if "linkage" in w]
+    (tmp_path / "tiny.urdf").write_text(HAND.replace('effort="2"', 'effort="6e4"'))
+    (tmp_path / "tiny.yaml").write_text("urdf: tiny.urdf\neffort: 2.0\n")
+    assert not [w for w in load_hand(tmp_path / "tiny.yaml", candidates=20).warnings if "effort" in w]
+    assert [load_hand(name, candidates=20).warnings for name in hand_names()] == [()] * len(hand_names())
+
+
+def test_a_xacro_file_is_named_with_the_command(tmp_path: Path) -> None:
+    (tmp_path / "my.urdf.xacro").write_text(HAND)
+    with pytest.raises(HandError, match=r"my.urdf.xacro: is a xacro file; .*: xacro my.urdf.xacro > hand.urdf"):
+        load_hand(tmp_path / "my.urdf.xacro")
+
+
+def test_warnings_of_a_hand_come_with_the_grasps_and_into_the_file(tmp_path: Path, capsys) -> None:
+    from graspd_core.cli import main
+
+    (tmp_path / "tiny.urdf").write_text(HAND.replace('lower="-0.5" upper="1"', 'lower="-20" upper="90"'))
+    words = ["shape:sphere", "--hand", str(tmp_path / "tiny.urdf"), "-n", "1", "--verify", "none", "--preset", "fast"]
+    main(["synthesize", *words, "--out", str(tmp_path / "grasps.json")])
+    told = "hand tiny: joint 'hinge': limits of -20 to 90 rad; if they are in degrees, write radians"
+    assert f"graspd: {told}" in capsys.readouterr().err
+    assert told in json.loads((tmp_path / "grasps.json").read_text())["outcome"]["warnings"]
 
 
 @pytest.mark.parametrize(

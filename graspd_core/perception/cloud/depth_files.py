@@ -1,0 +1,191 @@
+"""A depth image from a file, and the camera that took it from another: what `--camera` takes.
+
+The camera's file is JSON: `width`, `height`, and `K` (row by row), Open3D's `intrinsic_matrix` (column by column), or
+`fx fy cx cy`. Where known, `distortion` and `distortion_model` as in CameraInfo, `T_world_camera` (4×4) and
+`depth_unit`: metres per unit of the image, or m, cm, mm or um. A `depth_scale` is refused, since some write metres,
+some millimetres, and some the units of a metre.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import CloudError, shown
+from graspd_core.perception.cloud.camera import (
+    DepthImage,
+    PinholeCamera,
+    camera_from_calibration,
+    cloud_from_depth,
+    depth_in_metres,
+)
+from graspd_core.perception.cloud.cloud_files import read_numpy, rigid
+from graspd_core.perception.cloud.point_cloud import PointCloud
+
+IMAGE_ENDINGS, DEPTH_ENDINGS = ("png", "tif", "tiff"), ("png", "tif", "tiff", "npy", "npz")
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+# Whole numbers are millimetres, as cameras send them.
+_WHOLE = 1e-3
+# Depth beyond this on the median is in another unit [m].
+_FARTHEST = 50.0
+_SIMPLE = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A camera as its file describes it.
+
+    Attributes:
+        camera: its image's size, matrix and lens.
+        T_world_camera: its pose (z forward, x right, y down). None where the file does not say.
+        unit: metres per unit of its depth images. None where the file does not say.
+    """
+
+    camera: PinholeCamera
+    T_world_camera: Float[np.ndarray, "4 4"] | None = None
+    unit: float | None = None
+
+
+def is_depth_image(path: str | Path) -> bool:
+    """Whether a path names an image by its ending, which needs a camera to become points."""
+    return Path(path).suffix.lower().lstrip(".") in IMAGE_ENDINGS
+
+
+def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = None) -> PointCloud:
+    """Read what one camera saw from its depth image and its own file, in the world's frame where the file has a pose.
+
+    Args:
+        image: a png or tiff of 16 bits or floats, an npy, or an npz with `depth`.
+        camera: see the top of this module.
+        unit: metres per unit of the image. None: what the camera's file says, else millimetres for whole numbers and
+            metres for floats.
+
+    Raises:
+        CloudError: a file cannot be read, is no depth image or camera, or they do not fit each other.
+    """
+    taken_by = load_depth_camera(camera)
+    pixels = _pixels(Path(image))
+    depth = _metres(pixels, unit or taken_by.unit, str(image))
+    try:
+        return cloud_from_depth(depth, taken_by.camera, taken_by.T_world_camera)
+    except CloudError as error:
+        raise CloudError(f"{image}: {error} ({camera})") from None
+
+
+def load_depth_camera(path: str | Path) -> DepthCamera:
+    """Read a camera's file. Raises CloudError: it is missing, no JSON, or lacks a key, which is named."""
+    try:
+        told = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CloudError(f"{path}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        raise CloudError(f"{path}: not JSON: {str(error)[:200]}") from None
+    if not isinstance(told, dict):
+        raise CloudError(f"{path}: {shown(told)}; a camera's file holds an object with width, height and K")
+    try:
+        return _camera_of(told)
+    except CloudError as error:
+        raise CloudError(f"{path}: {error}") from None
+
+
+def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
+    for key in ("width", "height"):
+        if key not in told:
+            raise CloudError(f"{key} is missing: the size of the image that the matrix is for; it has {_keys(told)}")
+    if "depth_scale" in told and "depth_unit" not in told:
+        raise CloudError(
+            f"depth_scale: {shown(told['depth_scale'])} means metres, millimetres or units of a metre by who wrote it; "
+            "write depth_unit, in metres per unit: 0.001 for millimetres"
+        )
+    width, height = (int(_numbers(told[key], (), key)) for key in ("width", "height"))
+    distortion = _numbers(told.get("distortion", []), None, "distortion").reshape(-1).tolist()
+    model = told.get("distortion_model", "plumb_bob" if len(distortion) <= 5 else "rational_polynomial")
+    camera = camera_from_calibration(width, height, _matrix(told), distortion, str(model))
+    pose = None
+    if "T_world_camera" in told:
+        pose = rigid(_numbers(told["T_world_camera"], (4, 4), "T_world_camera"), "T_world_camera")
+    return DepthCamera(camera, pose, _unit(told["depth_unit"]) if "depth_unit" in told else None)
+
+
+def _matrix(told: Mapping[str, Any]) -> list[float]:
+    """The nine numbers of K, row by row."""
+    if "K" in told:
+        return _numbers(told["K"], None, "K").reshape(-1).tolist()
+    if "intrinsic_matrix" in told:
+        return _numbers(told["intrinsic_matrix"], (9,), "intrinsic_matrix").reshape(3, 3).T.reshape(-1).tolist()
+    lost = [key for key in _SIMPLE if key not in told]
+    if lost:
+        raise CloudError(f"K is missing, and of fx, fy, cx, cy {lost[0]}; it has {_keys(told)}")
+    fx, fy, cx, cy = (float(_numbers(told[key], (), key)) for key in _SIMPLE)
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _unit(told: Any) -> float:
+    """Metres per unit, of a number or of text that begins with a unit."""
+    word = told.replace(",", " ").split()[:1] if isinstance(told, str) else None
+    if word and word[0] in _UNITS:
+        return _UNITS[word[0]]
+    unit = 0.0 if isinstance(told, str) else float(_numbers(told, (), "depth_unit"))
+    if not 0 < unit <= 1:
+        raise CloudError(f"depth_unit: {shown(told)}; valid: metres per unit up to 1, or {', '.join(_UNITS)}")
+    return unit
+
+
+def _numbers(told: Any, shape: tuple[int, ...] | None, key: str) -> np.ndarray:
+    try:
+        numbers = np.array(told, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.full(1, np.nan)
+    if not np.isfinite(numbers).all() or isinstance(told, bool) or (shape is not None and numbers.shape != shape):
+        wanted = "numbers" if shape is None else f"{' × '.join(map(str, shape))} numbers" if shape else "a number"
+        raise CloudError(f"{key}: {shown(told)}; expected {wanted}")
+    return numbers
+
+
+def _keys(told: Mapping[str, Any]) -> str:
+    return ", ".join(str(key)[:40] for key in list(told)[:20]) or "no key"
+
+
+def _pixels(path: Path) -> np.ndarray:
+    """The pixels of an image as the file has them."""
+    if not path.is_file():
+        raise CloudError(f"{path}: no such depth image")
+    if path.suffix.lower().lstrip(".") not in DEPTH_ENDINGS:
+        valid = ", ".join(DEPTH_ENDINGS)
+        raise CloudError(f"{path}: with a camera a depth image is needed; its ending may be: {valid}")
+    if not is_depth_image(path):
+        arrays = read_numpy(path)
+        name = "points" if path.suffix.lower() == ".npy" else "depth"
+        if name not in arrays:
+            raise CloudError(f"{path}: holds no array called 'depth'; it has: {', '.join(arrays) or 'none'}")
+        return arrays[name]
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image)
+    # A spoilt file shows as whatever it brings about in Pillow.
+    except Exception as error:
+        raise CloudError(f"{path}: not a readable image ({str(error)[:200] or type(error).__name__})") from None
+
+
+def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
+    """Depth [m], 0 where there is none. Raises CloudError: it is a picture, or its unit is hardly the one assumed."""
+    if pixels.ndim != 2 or pixels.dtype.kind not in "iuf" or pixels.dtype.itemsize < 2:
+        size = f"{' × '.join(map(str, pixels.shape))} of {pixels.dtype}"
+        raise CloudError(f"{name}: holds {size}, a picture; depth has one number of 16 bits or more a pixel")
+    unit = unit or (1.0 if pixels.dtype.kind == "f" else _WHOLE)
+    # What is too far for a number of 32 bits is infinitely far, which means no depth.
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = depth_in_metres((pixels.astype(float) * unit).astype(np.float32), "32FC1")
+    seen = depth[depth > 0]
+    if len(seen) and float(np.median(seen)) > _FARTHEST:
+        told = f"half of its depths are beyond {float(np.median(seen)):.0f} m at {unit:g} m a unit"
+        raise CloudError(f"{name}: {told}; say the unit: --units mm, or depth_unit in the camera's file")
+    return depth
