@@ -110,12 +110,17 @@ class Pace:
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """How a request ended, in the words of a GraspArray; the grasps of `result` are in the answer's frame."""
+    """How a request ended, in the words of a GraspArray; the grasps of `result` are in the answer's frame.
+
+    `mass` [kg] is what their object weighed in the trials, 0 without any. `mass_assumed`: nobody said it.
+    """
 
     status: int
     code: ErrorCode
     message: str
     result: GraspResult | None = None
+    mass: float = 0.0
+    mass_assumed: bool = False
 
 
 def ending_of(result: GraspResult) -> AnswerEnding:
@@ -139,6 +144,8 @@ def array_message(
         status=ending.status,
         error_code=str(ending.code),
         message=ending.message,
+        mass=_number(ending.mass, 0.0),
+        mass_assumed=ending.mass_assumed,
         elapsed=elapsed,
     )
     if ending.result is not None:
