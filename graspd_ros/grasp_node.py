@@ -171,11 +171,14 @@ class GraspNode(Node):
     def _on_goal(self, goal: SynthesizeGrasps.Goal, listener: Listener) -> str:
         return self._take_request(goal.request, "goal", listener)
 
-    def _on_planning_goal(self, goal: Any, listener: Listener) -> str:
+    def _on_planning_goal(self, goal: Any, listener: Goal) -> str:
         from graspd_ros.grasp_planning import request_from_goal
 
-        name, builder = self._request_builder.new_id("planning"), self._request_builder
-        make = lambda settings: request_from_goal(builder, self._hand.name, name, settings, goal, listener)  # noqa: E731
+        name, builder, hand = self._request_builder.new_id("planning"), self._request_builder, self._hand.name
+
+        def make(settings: Settings) -> Request:
+            return listener.messages.watching(request_from_goal(builder, hand, name, settings, goal, listener), goal)
+
         self._take("grasp_planning", name, make, listener)
         return name
 
@@ -354,6 +357,10 @@ class SynthesizeMessages:
     def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
         return SynthesizeGrasps.Result(result=message)
 
+    def succeeded(self, result: SynthesizeGrasps.Result) -> bool:
+        """Return true: the answer's status says what it is worth."""
+        return True
+
 
 class GoalServer:
     """An action server, whose goals go the way of all requests.
@@ -373,7 +380,7 @@ class GoalServer:
         action: Any,
         name: str,
         make_messages: Callable[[], Any],
-        submit: Callable[[Any, Listener], str],
+        submit: Callable[[Any, Goal], str],
         cancel: Callable[[str], bool],
     ) -> None:
         self._node = node
@@ -414,7 +421,7 @@ class Goal:
 
     def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node
-        self._messages = messages
+        self.messages = messages
         self._handle = handle
         self._on_end = on_end
         self._answer = Future()
@@ -424,12 +431,12 @@ class Goal:
         """Feedback; the first that is not of waiting tells that the goal is executed."""
         if message.stage != "queued":
             self._begin()
-        self._feed(self._messages.progressed(message))
+        self._feed(self.messages.progressed(message))
 
     def found(self, message: Grasp) -> None:
         """Feedback of those actions that give grasps while others are still tried."""
         self._begin()
-        self._feed(self._messages.found(message))
+        self._feed(self.messages.found(message))
 
     def _feed(self, feedback: Any | None) -> None:
         if feedback is not None:
@@ -453,15 +460,16 @@ class Goal:
     async def _conclude(self, handle: ServerGoalHandle) -> Any:
         message: GraspArray = await self._answer  # pyright: ignore[reportAssignmentType]
         try:
-            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+            result = self.messages.result(message)
+            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL) and self.messages.succeeded(result):
                 handle.succeed()
             elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
                 handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
             else:
                 handle.abort()
+            return result
         finally:
             self._on_end()
-        return self._messages.result(message)
 
 
 def _no_execution(handle: ServerGoalHandle) -> Any:

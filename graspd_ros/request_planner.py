@@ -18,8 +18,20 @@ import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
-from graspd_core import HandModel, load_preset, plan_grasps, save_result
-from graspd_core.types import Grasp, GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing, Verdict
+from graspd_core import HandModel, Scene, load_preset, plan_grasps, save_result
+from graspd_core.types import (
+    Grasp,
+    GraspResult,
+    Outcome,
+    Posture,
+    Progress,
+    ProgressHook,
+    Stage,
+    StopHook,
+    Timing,
+    Verdict,
+)
+from graspd_core.verify.prepared_grasp import arrival, make_metrics_context
 from graspd_core.verify.robustness import begin_in_thread
 from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
 from graspd_ros.error_codes import bad_request
@@ -215,7 +227,8 @@ class Planner:
         known = excluded and free and request.known is None
         planned = self._runs.next_best(request, excluded) if known else None
         if planned is None:
-            moved = lambda progress: tell(_placed(progress, T_out_object))  # noqa: E731
+            place = lambda grasp: grasp if T_out_object is None else moved_grasp(grasp, T_out_object)  # noqa: E731
+            moved = lambda progress: tell(_with_found(progress, place))  # noqa: E731
             planned = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, planned)
         result = planned.result
@@ -241,9 +254,12 @@ class Planner:
             result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
         else:
             scene = request.load()
+            arrived = _arrivals(scene, self._hand) if request.closes_late else lambda grasp: grasp
+            plan["progress"] = lambda progress: tell(_with_found(progress, arrived))
             plan |= {"deadline": max(request.time_left(), 1e-3), "restrictions": restrictions}
             count = settings.num_grasps + len(excluded)
             result = plan_grasps(scene, self._hand, count=count, verify=settings.verify, **plan)
+            result = replace(result, grasps=tuple(map(arrived, result.grasps)))
         if excluded:
             result = without(result, excluded, settings.num_grasps)
         mass, assumed = result.mass or 0.0, False
@@ -267,10 +283,23 @@ def _ended(work: Future[Any], over: StopHook) -> bool:
     return True
 
 
-def _placed(progress: Progress, T_out_object: Matrix | None) -> Progress:
-    if progress.found is None or T_out_object is None:
-        return progress
-    return replace(progress, found=moved_grasp(progress.found, T_out_object))
+def _with_found(progress: Progress, change: Callable[[Grasp], Grasp]) -> Progress:
+    return progress if progress.found is None else replace(progress, found=change(progress.found))
+
+
+def _arrivals(scene: Scene, hand: HandModel) -> Callable[[Grasp], Grasp]:
+    """Return a function that gives each grasp that failed no trial its `arrival`; tenths of a second the first time."""
+    context, known = make_metrics_context(scene.object, hand), dict[bytes, Posture | None]()
+
+    def arrived(grasp: Grasp) -> Grasp:
+        if grasp.verdict is Verdict.FAILED:
+            return grasp
+        key = b"".join(part.tobytes() for part in vars(grasp.grasp).values())
+        if key not in known:
+            known[key] = arrival(context, grasp, scene.support)
+        return replace(grasp, arrival=known[key])
+
+    return arrived
 
 
 def _empty(request: Request, stop: StopHook) -> Planned:

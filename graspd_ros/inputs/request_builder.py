@@ -120,7 +120,8 @@ class RequestBuilder:
         request = source.find(given)
         steering, exclude = self._steering(message, request), tuple(message.exclude)
         lost = [(told.header.frame_id, pose_matrix(told.pose, "exclude_poses")) for told in message.exclude_poses]
-        return replace(request, steering=steering, exclude=exclude, exclude_poses=tuple(lost))
+        asked = {"steering": steering, "exclude": exclude, "exclude_poses": tuple(lost)}
+        return replace(request, closes_late=message.closes_late, **asked)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
         """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
@@ -370,7 +371,8 @@ def frame_loader(
 
 def _from_cloud(given: SourceInput) -> Request:
     frame = cloud_frame(given.message.cloud, nanoseconds(given.now))
-    frame.check(nanoseconds(given.now), given.settings.cloud_max_age)
+    if given.message.cloud.data:  # of one without, that is what there is to say
+        frame.check(nanoseconds(given.now), given.settings.cloud_max_age)
     return _of_frame(given, frame)
 
 

@@ -192,6 +192,9 @@ def grasp_message(
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
+    if grasp.arrival is not None:
+        message.arrival_pose = pose_of_posture(grasp.arrival)
+        message.arrival_joints = joint_message(grasp.arrival, hand, header.stamp)
     if grasp.arm is not None:
         message.arm_trajectory = arm_trajectory(grasp, grasp.arm, pace)
         message.arm_stages = list(grasp.arm.stages)
