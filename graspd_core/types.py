@@ -184,6 +184,7 @@ class Grasp:
         trials: in the order that they were run; the first failure ends them.
         probability: of holding on the true object, where cameras saw it (docs/clouds.md); else None.
         arm: how the arm gets there, where one was given (docs/arms.md); else None.
+        arrival: where a hand that closes only after it has arrived waits, open and clear; None: none was looked for.
     """
 
     pregrasp: Posture
@@ -195,6 +196,7 @@ class Grasp:
     trials: tuple[TrialResult, ...] = ()
     probability: float | None = None
     arm: ArmPath | None = None
+    arrival: Posture | None = None
 
     @property
     def verdict(self) -> Verdict:

@@ -164,6 +164,7 @@ def moved_grasp(grasp: Grasp, T: Matrix) -> Grasp:
         pregrasp=_moved_posture(grasp.pregrasp, T),
         grasp=_moved_posture(grasp.grasp, T),
         squeeze=_moved_posture(grasp.squeeze, T),
+        arrival=None if grasp.arrival is None else _moved_posture(grasp.arrival, T),
         contacts=tuple(_moved_contact(contact, T) for contact in grasp.contacts),
     )
 

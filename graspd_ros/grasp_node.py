@@ -24,32 +24,41 @@ from rclpy.action.server import ActionServer, CancelResponse, RCLError, ServerGo
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from graspd_core import hand_names, load_hand, warm_up
-from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.errors import CloudError, ConfigError, GraspdError
 from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.convert import nanoseconds
 from graspd_ros.error_codes import RequestError, sentence_of
 from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
-from graspd_ros.inputs.sensor_frames import ImagePairs, SensorFrame, Views, cloud_frame, depth_sensor_frame
+from graspd_ros.inputs.sensor_frames import (
+    DepthMessage,
+    ImagePairs,
+    SensorFrame,
+    Views,
+    cloud_frame,
+    depth_sensor_frame,
+)
+from graspd_ros.inputs.sensor_topics import SensorTopic
 from graspd_ros.inputs.solids import Thing, changed_things
 from graspd_ros.inputs.tf_listener import TransformListener, heard_robot
 from graspd_ros.outputs.responses import RECEIVED, Responses, health_message, resident_memory
-from graspd_ros.parameters import LiveSettings, Settings, doubts
+from graspd_ros.parameters import LiveSettings, Settings
 from graspd_ros.request import Listener, Request
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
 GOAL_PATIENCE = 0.3  # seconds that the executor has at the end to tell clients how their goals ended
 RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
+IMAGES = "depth images"  # those that find no calibration, beside the names of topics from which nothing comes
 OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline passed while they waited
 # A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
 REQUEST_DEPTH = 500
@@ -66,17 +75,16 @@ class GraspNode(Node):
 
     def __init__(self, on_failure: Callable[[], None]) -> None:
         super().__init__("graspd")
-        self._settings = LiveSettings(self)
+        transforms = TransformBuffer()
+        self._settings = LiveSettings(self, transforms.frames)
         settings = self._settings.now
-        for doubt in doubts(self, settings):
-            self.get_logger().warning(doubt)
         # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
         torch.set_num_threads(settings.torch_threads)
         self._hand = load_hand(settings.hand, prefix=settings.hand_prefix)
         self._on_failure = on_failure
         self._ready = False
         self._announcing = threading.Lock()
-        self._listener = TransformListener(self, TransformBuffer())
+        self._listener = TransformListener(self, transforms)
         self._pairs = ImagePairs()
         self._things: Mapping[str, Thing] = {}
         self._request_builder = RequestBuilder(
@@ -95,6 +103,7 @@ class GraspNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # health does not stop where simulated time does
         self.create_timer(1.0, self._on_diagnostics_due, clock=steady)
+        self.create_timer(1.0, self._watch_sensors, clock=steady)
         late = lambda request: request.time_left() <= 0  # noqa: E731
         self.create_timer(OVERDUE_PERIOD, lambda: self._worker.end_waiting(late, overdue()), clock=steady)
         self._worker.start()
@@ -107,9 +116,14 @@ class GraspNode(Node):
         listen(GraspRequest, "~/request", self._on_request, REQUEST_DEPTH)
         listen(String, "~/mesh", self._on_mesh, 10)
         listen(String, "~/cancel", self._on_cancel, REQUEST_DEPTH)
-        listen(PointCloud2, "points", self._on_points, qos_profile_sensor_data)
-        listen(Image, "depth/image_rect", self._on_depth, qos_profile_sensor_data)
-        listen(CameraInfo, "depth/camera_info", self._on_depth, qos_profile_sensor_data)
+        image = SensorTopic(self, Image, "depth/image_rect", self._on_depth)
+        name, ending = "depth/image_rect/compressedDepth", "/compressedDepth"
+        self._sensors = (
+            SensorTopic(self, PointCloud2, "points", self._on_points),
+            image,
+            SensorTopic(self, CameraInfo, "depth/camera_info", self._on_depth),
+            SensorTopic(self, CompressedImage, name, self._on_depth, instead_of=image, ending=ending),
+        )
         if collision_objects:
             listen(_collision_object(), collision_objects, self._on_collision_object, THINGS_DEPTH)
         self.create_service(ListHands, "~/list_hands", self._on_list_hands)
@@ -157,11 +171,14 @@ class GraspNode(Node):
     def _on_goal(self, goal: SynthesizeGrasps.Goal, listener: Listener) -> str:
         return self._take_request(goal.request, "goal", listener)
 
-    def _on_planning_goal(self, goal: Any, listener: Listener) -> str:
+    def _on_planning_goal(self, goal: Any, listener: Goal) -> str:
         from graspd_ros.grasp_planning import request_from_goal
 
-        name, builder = self._request_builder.new_id("planning"), self._request_builder
-        make = lambda settings: request_from_goal(builder, self._hand.name, name, settings, goal, listener)  # noqa: E731
+        name, builder, hand = self._request_builder.new_id("planning"), self._request_builder, self._hand.name
+
+        def make(settings: Settings) -> Request:
+            return listener.messages.watching(request_from_goal(builder, hand, name, settings, goal, listener), goal)
+
         self._take("grasp_planning", name, make, listener)
         return name
 
@@ -171,9 +188,14 @@ class GraspNode(Node):
         except RequestError as error:  # too large to keep
             self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
 
-    def _on_depth(self, message: Image | CameraInfo) -> None:
-        if pair := self._pairs.add(message):
-            self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
+    def _on_depth(self, message: DepthMessage | CameraInfo) -> None:
+        try:
+            pair = self._pairs.add(message)
+        except CloudError as error:  # no image
+            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
+        else:
+            if pair is not None:
+                self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
 
     def _on_collision_object(self, message: Any) -> None:
         try:
@@ -210,6 +232,18 @@ class GraspNode(Node):
         response.success, response.message = True, f"dropped {len(self._request_builder.views.clouds)} views"
         self._request_builder.views = Views()
         return response
+
+    def _watch_sensors(self) -> None:
+        """Tell once what does not arrive on the sensors' topics; a client that asks for it is told why, too."""
+        before = self._request_builder.missing
+        missing = {sensor.name: told for sensor in self._sensors if (told := sensor.check())}
+        for name in missing.keys() - before.keys():  # some publish on demand only: no fault by itself
+            self.get_logger().warning(missing[name])
+        if told := self._pairs.doubt():
+            missing[IMAGES] = told
+            if IMAGES not in before:
+                self._responses.images_not_taken(told)
+        self._request_builder.missing = missing
 
     def _on_diagnostics_due(self) -> None:
         running, waiting = self._worker.state()
@@ -323,6 +357,10 @@ class SynthesizeMessages:
     def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
         return SynthesizeGrasps.Result(result=message)
 
+    def succeeded(self, result: SynthesizeGrasps.Result) -> bool:
+        """Return true: the answer's status says what it is worth."""
+        return True
+
 
 class GoalServer:
     """An action server, whose goals go the way of all requests.
@@ -342,7 +380,7 @@ class GoalServer:
         action: Any,
         name: str,
         make_messages: Callable[[], Any],
-        submit: Callable[[Any, Listener], str],
+        submit: Callable[[Any, Goal], str],
         cancel: Callable[[str], bool],
     ) -> None:
         self._node = node
@@ -383,7 +421,7 @@ class Goal:
 
     def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node
-        self._messages = messages
+        self.messages = messages
         self._handle = handle
         self._on_end = on_end
         self._answer = Future()
@@ -393,12 +431,12 @@ class Goal:
         """Feedback; the first that is not of waiting tells that the goal is executed."""
         if message.stage != "queued":
             self._begin()
-        self._feed(self._messages.progressed(message))
+        self._feed(self.messages.progressed(message))
 
     def found(self, message: Grasp) -> None:
         """Feedback of those actions that give grasps while others are still tried."""
         self._begin()
-        self._feed(self._messages.found(message))
+        self._feed(self.messages.found(message))
 
     def _feed(self, feedback: Any | None) -> None:
         if feedback is not None:
@@ -422,15 +460,16 @@ class Goal:
     async def _conclude(self, handle: ServerGoalHandle) -> Any:
         message: GraspArray = await self._answer  # pyright: ignore[reportAssignmentType]
         try:
-            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL):
+            result = self.messages.result(message)
+            if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL) and self.messages.succeeded(result):
                 handle.succeed()
             elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
                 handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
             else:
                 handle.abort()
+            return result
         finally:
             self._on_end()
-        return self._messages.result(message)
 
 
 def _no_execution(handle: ServerGoalHandle) -> Any:

@@ -32,25 +32,50 @@ class PlanningMessages:
     def __init__(self, hand: HandModel) -> None:
         self._hand = hand
         self._found: list[Any] = []
+        self._touch: tuple[str, ...] = ()
+        self._up: tuple[str, tuple[float, float, float]] | None = None
+
+    def watching(self, request: Request, goal: Any) -> Request:
+        """Return a goal's request; from the goal and from what is loaded for it come what may be touched and up."""
+        self._touch = (goal.object.name,) if goal.object.name else ()
+
+        def loaded() -> Scene:
+            scene = request.load()
+            if scene.support is not None:
+                x, y, z = map(float, scene.support.normal)
+                self._up = request.frame, (x, y, z)
+            return scene
+
+        return replace(request, load=loaded, closes_late=True)
 
     def progressed(self, message: GraspProgress) -> None:
         """Nothing: the action has no word for it."""
 
-    def found(self, message: Grasp) -> GraspPlanning.Feedback:
+    def found(self, message: Grasp) -> GraspPlanning.Feedback | None:
+        if not message.arrival_joints.name:
+            return None
         self._found.append(self._grasp(message))
         return GraspPlanning.Feedback(grasps=list(self._found))
 
     def result(self, message: GraspArray) -> GraspPlanning.Result:
-        """Those that failed no trial, best first: MoveIt's message cannot say that one is doubted."""
+        """Return those that failed no trial and that MoveIt can reach, best first.
+
+        MoveIt's message cannot say that one is doubted.
+        """
         good = [grasp for grasp in message.grasps if all(trial.passed for trial in grasp.trials)]
-        return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good])
+        return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good if grasp.arrival_joints.name])
+
+    def succeeded(self, result: GraspPlanning.Result) -> bool:
+        """Return whether there is a grasp: a goal without any is aborted."""
+        return bool(result.grasps)
 
     def _grasp(self, message: Grasp) -> Any:
-        """Back along the way that it came: nobody says here where up is."""
+        """Lift it off what it stands on, or back along the way that the hand came where nobody says where up is."""
         x, y, z = (array_of(message.pregrasp_pose.position) - array_of(message.grasp_pose.position)).tolist()
         back = (x, y, z) if any((x, y, z)) else (0.0, 0.0, 1.0)
-        effort, frame = self._hand.effort.tolist(), message.header.frame_id
-        return moveit_grasp(message, retreat=back, retreat_frame=frame, retreat_distance=RETREAT, effort=effort)
+        frame, direction = self._up or (message.header.frame_id, back)
+        retreat = {"retreat": direction, "retreat_frame": frame, "retreat_distance": RETREAT}
+        return moveit_grasp(message, **retreat, effort=self._hand.effort.tolist(), touch=self._touch)
 
 
 def request_from_goal(

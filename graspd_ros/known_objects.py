@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,8 @@ def answer_known(
     if entry is not None and not restrictions and request.surface is None and not request.things:
         grasps = unlike(library.grasps(entry, hand), excluded)[:count]
         if len(grasps) >= count:
-            return library_result(library, grasps, count, time.perf_counter() - began), None
+            found = library_result(library, grasps, count, time.perf_counter() - began)
+            return replace(found, mass=entry.mass), None
     scene = request.load()
     plan |= {"deadline": max(request.time_left(), 1e-3), "count": count}
     plan |= {"verify": settings.verify, "restrictions": restrictions}

@@ -24,6 +24,16 @@ if TYPE_CHECKING:
 
     from graspd_ros.grasp_node import GraspNode
 
+# Of these all have to be of one ROS: what another Python or release compiled cannot be loaded, or not beside them.
+ROS_PACKAGES = (
+    "rclpy",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "std_msgs",
+    "geometry_msgs",
+    "sensor_msgs",
+    "graspd_msgs",
+)
 EXIT_STOPPED, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
 STOP_TIMEOUT = 2.0  # seconds that a busy worker has to notice that it must stop
 # Seconds that a thread may keep Python from others (5 ms by itself): the executor asks for it several times a message.
@@ -47,6 +57,9 @@ def run_command(
 
     `args` are without the name (None: of this process); `parse` takes those that are not for ROS.
     """
+    if told := foreign_ros():
+        sys.stderr.write(f"{name}: {told}\n")
+        return EXIT_BAD_INPUT
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
     import rclpy
@@ -68,13 +81,17 @@ def run_command(
     return EXIT_STOPPED
 
 
-def foreign_rclpy(file: str) -> str:
-    """One line about an rclpy that comes before the environment's own; empty where there is one rclpy only."""
-    own = next((Path(sys.prefix) / "lib").glob("python3*/site-packages/rclpy/__init__.py"), None)
-    if own is None or Path(file).resolve() == own.resolve():
-        return ""
-    where = Path(file).parents[1]
-    return f"rclpy is that of {where}, not this environment's: unset PYTHONPATH, or do not source another ROS"
+def foreign_ros() -> str:
+    """Return one line about a ROS that comes before the environment's own; empty where there is one ROS only."""
+    for package in ROS_PACKAGES:
+        own = next((Path(sys.prefix) / "lib").glob(f"python3*/site-packages/{package}/__init__.py"), None)
+        # Found without being imported: what another Python compiled would only raise.
+        spec = importlib.util.find_spec(package)
+        if own is None or spec is None or not spec.origin or Path(spec.origin).resolve() == own.resolve():
+            continue
+        where = Path(spec.origin).parents[1]
+        return f"{package} is that of {where}, not this environment's: unset PYTHONPATH, or do not source another ROS"
+    return ""
 
 
 def probe() -> str:
@@ -82,8 +99,7 @@ def probe() -> str:
 
     `graspd doctor` asks for it in a process of its own.
     """
-    spec = importlib.util.find_spec("rclpy")
-    if spec is not None and spec.origin and (told := foreign_rclpy(spec.origin)):
+    if told := foreign_ros():
         raise ImportError(told)
     import rclpy
     from geometry_msgs.msg import PoseStamped
@@ -105,6 +121,8 @@ def main(args: list[str] | None = None) -> int:
     """Run the node until a signal; 0 when stopped, 1 when it cannot go on, 2 for a bad argument or parameter."""
     try:
         _refuse_arguments(sys.argv[1:] if args is None else args)
+        if told := foreign_ros():
+            raise ConfigError(told)
     except ConfigError as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         return EXIT_BAD_INPUT
@@ -179,8 +197,6 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
     """The node; None where an argument or a parameter is bad, which standard error then says."""
     import rclpy
 
-    if told := foreign_rclpy(str(rclpy.__file__)):
-        sys.stderr.write(f"graspd_node: {told}\n")
     if told := log_directory():
         sys.stderr.write(f"graspd_node: {told}\n")
     from rclpy.exceptions import ParameterException

@@ -5,7 +5,7 @@ from __future__ import annotations
 import array
 import dataclasses
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -25,6 +25,7 @@ CLOUD_POLICIES = ("newest", "each", "off")
 MOST_GRASPS = 256
 BUDGETS = (0.1, 3600.0)  # seconds
 SCALES = (1e-6, 1e6)
+MASSES = (1e-6, 100.0)  # kilograms
 _CORNERS = ("roi_min", "roi_max", "view_point")
 WORKSPACE = 10.0  # metres from the camera: beyond any depth sensor that grasps
 
@@ -172,7 +173,7 @@ class Settings:
     deadline: float = _setting(60.0, "time that one request may take [s]", low=BUDGETS[0], high=BUDGETS[1])
     seed: int = _setting(0, "seed of the random starts", low=0, high=2**63 - 1)
     mass: float = _setting(
-        0.0, "mass of the object [kg]; 0: not known, the heavy end of what its volume allows", low=0.0, high=100.0
+        0.0, "mass of the object [kg]; 0: not known, the heavy end of what its volume allows", low=0.0, high=MASSES[1]
     )
     friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
     mesh_scale: float = _setting(1.0, "factor from the mesh file's unit to metres", low=SCALES[0], high=SCALES[1])
@@ -201,45 +202,87 @@ class Settings:
 
 
 class LiveSettings:
-    """A node's parameters as settings, in `now`, read anew when one of them changes.
+    """A node's parameters as settings, in `now`, read anew when one changes; what is doubted is logged.
 
-    Raises ConfigError: a value given at the start is not a valid choice; rclpy's ParameterException: of the wrong type
-    or out of range.
+    `frames` are those that /tf knows by now. Raises ConfigError: a value given at the start is not a valid choice;
+    rclpy's ParameterException: of the wrong type or out of range.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, frames: Callable[[], Sequence[str]] = tuple) -> None:
         fields, defaults = dataclasses.fields(Settings), Settings()
         for setting in fields:
             node.declare_parameter(setting.name, getattr(defaults, setting.name), _descriptor(setting))
         for setting in fields:
             _check_value(setting.name, node.get_parameter(setting.name).value)
-        self._node = node
+        self._node, self._frames = node, frames
+        # An integer that stands for a number is one from here on: who describes or gets it sees no other type.
+        given = [node.get_parameter(setting.name) for setting in fields if not setting.metadata["read_only"]]
+        node.set_parameters(_of_their_types(given))
+        self._doubts: list[str] = []
         self._read([])
+        for told in [*unknown_names(node), *self._doubts]:
+            node.get_logger().warning(told)
+        node.add_pre_set_parameters_callback(_of_their_types)
         node.add_on_set_parameters_callback(check_parameters)
-        node.add_post_set_parameters_callback(self._read)
+        node.add_post_set_parameters_callback(self._changed)
 
-    def _read(self, _: list[Parameter]) -> None:
+    def _changed(self, changed: list[Parameter]) -> None:
+        before = self._doubts
+        self._read(changed)
+        for told in self._doubts:
+            if told not in before:
+                self._node.get_logger().warning(told)
+
+    def _read(self, changed: list[Parameter]) -> None:
         fields = dataclasses.fields(Settings)
         values: dict[str, Any] = {s.name: _word(s, self._node.get_parameter(s.name).value) for s in fields}
         for name in ("mesh_roots", "marker_parts"):
             values[name] = list(values[name] or [])
         self.now = Settings(**values)
+        names = {parameter.name for parameter in changed}
+        self._doubts = doubts(self.now) + _unknown_frames(self.now, names, tuple(self._frames()))
 
 
-def doubts(node: Node, settings: Settings) -> list[str]:
-    """What the node should warn of at its start: names that no parameter has, and values that leave nothing to do."""
+def unknown_names(node: Node) -> list[str]:
+    """Return a sentence for each name given at the start that no parameter has."""
     told, known = [], [setting.name for setting in dataclasses.fields(Settings)]
     # rclpy keeps what was given to the node in no public place, and says nothing of what nobody declares.
     for name in getattr(node, "_parameter_overrides", {}):
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             near = difflib.get_close_matches(name, known, 1)
             told.append(f"parameter {name}: there is none; " + (f"is {near[0]} meant?" if near else "it is ignored"))
+    return told
+
+
+def doubts(settings: Settings) -> list[str]:
+    """Return what the node should warn of: values that leave nothing to do."""
+    told = []
     if any(low > high for low, high in zip(settings.roi_min, settings.roi_max, strict=True)):
         told.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
     for root in settings.mesh_roots:
         if not root.startswith("package://") and not Path(root).is_dir():
             told.append(f"mesh_roots: {root!r} is no directory")
     return told
+
+
+def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
+    """Say of each frame that was set now whether /tf lacks it; before anything came, nobody knows."""
+    told = []
+    for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
+        frame = getattr(settings, name).removeprefix("/")
+        if name in changed and frame and known and frame not in known:
+            told.append(f"parameter {name}: /tf knows no frame {frame!r} by now; known: {', '.join(known)}")
+    return told
+
+
+def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
+    """Return parameters with integers as numbers where numbers are meant, and words that YAML reads as truth values."""
+    kept = []
+    for parameter in parameters:
+        setting = Settings.__dataclass_fields__.get(parameter.name)
+        value = parameter.value if setting is None else _word(setting, parameter.value)
+        kept.append(parameter if value is parameter.value else Parameter(parameter.name, value=value))
+    return kept
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:

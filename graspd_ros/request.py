@@ -67,6 +67,7 @@ class Request:
         steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
             GraspdError. None where nothing is asked.
         shown: reads the points that the request's region_mask shows, in `frame` [m]; None where there is no image.
+        closes_late: whether the hand closes only when it has arrived, so that grasps need their `arrival`.
         things: what stood in the planning scene by then, by id, wherever it is; empty where no such topic is heard.
         accepted: when the request came, by the monotonic clock [s].
     """
@@ -88,6 +89,7 @@ class Request:
     surface: Plane | None = None
     steering: Callable[[], Steering] | None = None
     shown: Callable[[], Float[np.ndarray, "points 3"]] | None = None
+    closes_late: bool = False
     things: Mapping[str, Thing] = field(default_factory=dict)
     accepted: float = field(default_factory=time.monotonic)
 

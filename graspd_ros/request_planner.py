@@ -18,8 +18,20 @@ import numpy as np
 import torch
 from builtin_interfaces.msg import Time
 
-from graspd_core import HandModel, load_preset, plan_grasps, save_result
-from graspd_core.types import Grasp, GraspResult, Outcome, Progress, ProgressHook, Stage, StopHook, Timing, Verdict
+from graspd_core import HandModel, Scene, load_preset, plan_grasps, save_result
+from graspd_core.types import (
+    Grasp,
+    GraspResult,
+    Outcome,
+    Posture,
+    Progress,
+    ProgressHook,
+    Stage,
+    StopHook,
+    Timing,
+    Verdict,
+)
+from graspd_core.verify.prepared_grasp import arrival, make_metrics_context
 from graspd_core.verify.robustness import begin_in_thread
 from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
 from graspd_ros.error_codes import bad_request
@@ -44,11 +56,21 @@ Lookup = Callable[[str, str, Time, StopHook], Matrix]
 
 @dataclass(frozen=True)
 class Planned:
-    """A result in the frame it is told in, where it was written, if it was, and whether there was a run at all."""
+    """A result in the frame it is told in.
+
+    Attributes:
+        result: the grasps.
+        file: where it was written; empty: nowhere.
+        worked_on: whether there was a run at all.
+        mass: what the object weighed in the trials [kg]; 0 where there was none.
+        mass_assumed: whether nobody said the mass.
+    """
 
     result: GraspResult
     file: str = ""
     worked_on: bool = True
+    mass: float = 0.0
+    mass_assumed: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,7 +78,11 @@ class _Run:
     object_key: str
     frame: str
     T_frame_object: Matrix | None
-    grasps: tuple[Grasp, ...]
+    planned: Planned
+
+    @property
+    def grasps(self) -> tuple[Grasp, ...]:
+        return self.planned.result.grasps
 
 
 class RecentRuns:
@@ -65,9 +91,9 @@ class RecentRuns:
     def __init__(self) -> None:
         self._runs: OrderedDict[str, _Run] = OrderedDict()
 
-    def keep(self, request: Request, result: GraspResult) -> None:
+    def keep(self, request: Request, planned: Planned) -> None:
         """Remember a result, in the frame that it was planned in."""
-        self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, result.grasps)
+        self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, planned)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
 
@@ -94,8 +120,8 @@ class RecentRuns:
             raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; kept: {kept}")
         return run, run.grasps[int(rank)]
 
-    def next_best(self, request: Request, excluded: Sequence[Matrix]) -> GraspResult | None:
-        """What is left of the runs on the very same object; None where nothing good is."""
+    def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
+        """Return what is left of the runs on the very same object; None if nothing good is."""
         runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
@@ -105,7 +131,8 @@ class RecentRuns:
             return None
         outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
         told = f"{min(count, len(left))} grasps of an earlier run, none like the {len(excluded)} excluded"
-        return GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", told)
+        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", told)
+        return replace(runs[-1].planned, result=result, file="")
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
@@ -198,20 +225,22 @@ class Planner:
         # A library has what that run found, and more.
         free = request.steering is None and not reach and not request.things
         known = excluded and free and request.known is None
-        result, file = self._runs.next_best(request, excluded) if known else None, ""
-        if result is None:
-            moved = lambda progress: tell(_placed(progress, T_out_object))  # noqa: E731
-            result, file = self._search(request, excluded, reach, stop, moved)
-        self._runs.keep(request, result)
-        return Planned(result if T_out_object is None else moved_result(result, T_out_object), file)
+        planned = self._runs.next_best(request, excluded) if known else None
+        if planned is None:
+            place = lambda grasp: grasp if T_out_object is None else moved_grasp(grasp, T_out_object)  # noqa: E731
+            moved = lambda progress: tell(_with_found(progress, place))  # noqa: E731
+            planned = self._search(request, excluded, reach, stop, moved)
+        self._runs.keep(request, planned)
+        result = planned.result
+        return replace(planned, result=result if T_out_object is None else moved_result(result, T_out_object))
 
     def _lookup_at(self, stamp: Time, stop: StopHook) -> FrameLookup:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _search(
         self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, tell: ProgressHook
-    ) -> tuple[GraspResult, str]:
-        """A run, without grasps like those excluded, and the file that it was written to."""
+    ) -> Planned:
+        """Search for grasps, leave out those like the excluded, and write what is left to a file if one is wanted."""
         settings = request.settings
         config = load_preset(settings.preset)
         steering = () if request.steering is None else (request.steering(),)
@@ -225,19 +254,26 @@ class Planner:
             result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
         else:
             scene = request.load()
+            arrived = _arrivals(scene, self._hand) if request.closes_late else lambda grasp: grasp
+            plan["progress"] = lambda progress: tell(_with_found(progress, arrived))
             plan |= {"deadline": max(request.time_left(), 1e-3), "restrictions": restrictions}
             count = settings.num_grasps + len(excluded)
             result = plan_grasps(scene, self._hand, count=count, verify=settings.verify, **plan)
+            result = replace(result, grasps=tuple(map(arrived, result.grasps)))
         if excluded:
             result = without(result, excluded, settings.num_grasps)
+        mass, assumed = result.mass or 0.0, False
+        if scene is not None:
+            mass, assumed = result.mass or scene.object.mass, scene.object.mass_assumed
+        planned = Planned(result, mass=mass, mass_assumed=assumed)
         if not settings.output_dir or stop():
-            return result, ""
+            return planned
         path = Path(settings.output_dir) / f"{request.id}.json"
         # As planned: a mesh's grasps in the mesh's own frame, wherever it stands.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
         seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
         save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
-        return result, str(path)
+        return replace(planned, file=str(path))
 
 
 def _ended(work: Future[Any], over: StopHook) -> bool:
@@ -247,10 +283,23 @@ def _ended(work: Future[Any], over: StopHook) -> bool:
     return True
 
 
-def _placed(progress: Progress, T_out_object: Matrix | None) -> Progress:
-    if progress.found is None or T_out_object is None:
-        return progress
-    return replace(progress, found=moved_grasp(progress.found, T_out_object))
+def _with_found(progress: Progress, change: Callable[[Grasp], Grasp]) -> Progress:
+    return progress if progress.found is None else replace(progress, found=change(progress.found))
+
+
+def _arrivals(scene: Scene, hand: HandModel) -> Callable[[Grasp], Grasp]:
+    """Return a function that gives each grasp that failed no trial its `arrival`; tenths of a second the first time."""
+    context, known = make_metrics_context(scene.object, hand), dict[bytes, Posture | None]()
+
+    def arrived(grasp: Grasp) -> Grasp:
+        if grasp.verdict is Verdict.FAILED:
+            return grasp
+        key = b"".join(part.tobytes() for part in vars(grasp.grasp).values())
+        if key not in known:
+            known[key] = arrival(context, grasp, scene.support)
+        return replace(grasp, arrival=known[key])
+
+    return arrived
 
 
 def _empty(request: Request, stop: StopHook) -> Planned:

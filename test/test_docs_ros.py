@@ -115,6 +115,10 @@ def endpoints(node: GraspNode) -> dict[str, tuple[str, str, QoSProfile]]:
             package = kind.__module__.split(".")[0]
             if package not in ("rcl_interfaces", "rosgraph_msgs"):
                 found[end.topic_name] = f"{package}/{kind.__name__}", direction, end.qos_profile
+    # One of the sensors' is heard only where somebody publishes it.
+    for topic in node._sensors:
+        package = topic._kind.__module__.split(".")[0]
+        found[topic.name] = f"{package}/{topic._kind.__name__}", "in", topic._qos
     return found
 
 
@@ -132,7 +136,8 @@ def test_topics_are_those_of_the_node_in_type_direction_and_qos(node: GraspNode)
     for topic, (kind, direction, qos) in live.items():
         cells = documented[topic]
         assert re.match(re.escape(kind) + r"\b", cells[0]), f"{topic}: {kind}"
-        assert cells[1:] == [direction, qos_words(qos)], topic
+        offered = topic in {sensor.name for sensor in node._sensors}
+        assert cells[1:] == [direction, f"as offered, {qos.depth}" if offered else qos_words(qos)], topic
 
 
 def test_services_and_actions_are_those_of_the_node(node: GraspNode):

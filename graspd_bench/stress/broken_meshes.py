@@ -30,8 +30,8 @@ _TOLD = {
     "millions-of-faces": "simplified from ",
     "one-triangle": "not closed",
     "nan-vertices": "NaN",
-    "millimetres": "--units mm",
-    "centimetres": "--units cm",
+    "millimetres": "from mm",
+    "centimetres": "from cm",
     "crate-1200-mm": "fingertips of allegro_right open to ",
 }
 

@@ -16,7 +16,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
-from graspd_core.io.messages import CameraPlace
+from graspd_core.io.messages import ORIGIN, CameraPlace, frame_doubt
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.types import GraspResult, Outcome, Timing
@@ -190,6 +190,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
         BagError: nothing can be read, or the frame wanted is not in the bag.
     """
     transforms, place = None, CameraPlace(options.view_point, options.sensor_frame)
+    told = set[str]()
     frames = read_frames(
         path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit
     )
@@ -202,7 +203,11 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
                 known = ", ".join(transforms.frames())
                 raise BagError(f"{path}: no frame {name!r}; its transforms know: {known}")
         try:
-            yield frame, frame.view(transforms, options.frame, place)
+            seen = frame.view(transforms, options.frame, place)
+            if place == ORIGIN and frame.frame not in told and (doubt := frame_doubt(frame.frame, frame.view().points)):
+                print(f"graspd: {doubt}", file=sys.stderr)
+            told.add(frame.frame)
+            yield frame, seen
         except (CloudError, TransformError) as error:
             yield frame, str(error)
 

@@ -14,25 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from graspd_core.errors import BagError
-from graspd_core.io.messages import (
-    ORIGIN,
-    CameraPlace,
-    add_transforms,
-    cloud_from_depth_message,
-    no_lookup,
-    stamp_of,
-)
-from graspd_core.perception.cloud.camera import (
-    ENCODINGS,
-)
-from graspd_core.perception.cloud.point_cloud import (
-    PointCloud,
-    transform_cloud,
-)
+from graspd_core.io.messages import ORIGIN, CameraPlace, add_transforms, cloud_from_depth_message, no_lookup, stamp_of
+from graspd_core.perception.cloud.camera import ENCODINGS
+from graspd_core.perception.cloud.point_cloud import PointCloud, transform_cloud
 from graspd_core.transforms import TransformBuffer
 
 BAG_ENDINGS = ("mcap", "db3")
 CLOUD, IMAGE, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+PACKED = "sensor_msgs/msg/CompressedImage"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
@@ -54,7 +43,7 @@ class BagFrame:
         stamp: time in its header [ns].
         frame: the frame in which it is recorded.
         topic: the topic it was recorded on.
-        message: a PointCloud2 or a depth Image.
+        message: a PointCloud2, a depth Image, or a CompressedImage of depth.
         info: CameraInfo of a depth image.
     """
 
@@ -80,7 +69,7 @@ class BagFrame:
             cloud = place.cloud(self.message, lookup)
         else:
             # REP 118 and image_pipeline: rectified images say so in the last part of their name.
-            rectified = re.search(r"(^|_)rect(_|$)", self.topic.rsplit("/", 1)[-1]) is not None
+            rectified = re.search(r"(^|_)rect(_|$)", _image_name(self.topic).rsplit("/", 1)[-1]) is not None
             cloud = cloud_from_depth_message(self.message, self.info, rectified=rectified)
         if target is None or target.removeprefix("/") == self.frame.removeprefix("/"):
             return cloud
@@ -142,7 +131,7 @@ def read_frames(
         chosen = _choose(path, reader, topic)
         connections = [c for c in reader.connections if c.topic == chosen.name]
         info = None
-        if chosen.type == IMAGE:
+        if chosen.type != CLOUD:
             info_name = _info_topic(path, reader, chosen.name, info_topic)
             infos = [c for c in reader.connections if c.topic == info_name]
             connections += infos
@@ -253,14 +242,18 @@ def _topics(reader: Any) -> tuple[BagTopic, ...]:
 def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
     topics = _topics(reader)
     clouds = [t for t in topics if t.type == CLOUD and t.count]
-    images = [t for t in topics if t.type == IMAGE and t.count and (t.name == name or _is_depth(path, reader, t))]
-    offered = ", ".join(t.name for t in (*clouds, *images)) or "none"
+    images, packed = (
+        [t for t in topics if t.type == kind and t.count and (t.name == name or _is_depth(path, reader, t))]
+        for kind in (IMAGE, PACKED)
+    )
+    offered = ", ".join(t.name for t in (*clouds, *images, *packed)) or "none"
     if name is not None:
-        found = next((t for t in (*clouds, *images) if t.name == name), None)
+        found = next((t for t in (*clouds, *images, *packed) if t.name == name), None)
         if found is None:
             raise BagError(f"{path}: no clouds or depth images on {name!r}; topics with some: {offered}")
         return found
-    candidates = clouds or images
+    # Beside an image its packed form is the same one again.
+    candidates = clouds or images or packed
     if not candidates:
         have = ", ".join(f"{t.name} ({t.type.rsplit('/', 1)[-1]})" for t in topics) or "none"
         raise BagError(f"{path}: no topic with clouds or depth images; it has: {have}")
@@ -270,7 +263,15 @@ def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
 
 
 def _is_depth(path: str | Path, reader: Any, topic: BagTopic) -> bool:
-    return _first(path, reader, topic.name).encoding in ENCODINGS
+    first = _first(path, reader, topic.name)
+    if topic.type == PACKED:
+        return "compressedDepth" in first.format or first.format.partition(";")[0] in ENCODINGS
+    return first.encoding in ENCODINGS
+
+
+def _image_name(topic: str) -> str:
+    """The name of an image whose packed form comes on `topic`."""
+    return re.sub("/compressed(Depth)?$", "", topic)
 
 
 def _first(path: str | Path, reader: Any, topic: str) -> Any:
@@ -282,7 +283,7 @@ def _first(path: str | Path, reader: Any, topic: str) -> Any:
 
 def _info_topic(path: str | Path, reader: Any, image: str, name: str | None) -> str:
     known = [t.name for t in _topics(reader) if t.type == INFO and t.count]
-    wanted = name or image.rsplit("/", 1)[0] + "/camera_info"
+    wanted = name or _image_name(image).rsplit("/", 1)[0] + "/camera_info"
     if wanted in known:
         return wanted
     if name is None and len(known) == 1:

@@ -11,10 +11,13 @@ from jaxtyping import Float
 
 from graspd_core.errors import CloudError, TransformError
 from graspd_core.perception.cloud.camera import (
+    DepthImage,
     PinholeCamera,
     camera_from_calibration,
     cloud_from_depth,
     depth_from_bytes,
+    depth_from_compressed,
+    size_of_compressed,
 )
 from graspd_core.perception.cloud.point_cloud import (
     CloudLayout,
@@ -24,6 +27,9 @@ from graspd_core.perception.cloud.point_cloud import (
 )
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 from graspd_core.transforms import SECOND, TransformBuffer
+
+# Mean share of a direction in those from the camera to its points, where it is the one that the camera looks along.
+_AHEAD = 0.8
 
 
 def stamp_of(message: Any) -> int:
@@ -95,6 +101,27 @@ def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
     raise TransformError(f"transform {source} -> {target}: no transforms are given")
 
 
+def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
+    """Return what speaks against a frame's name: by REP 103 cameras look along z in optical frames, along x in bodies.
+
+    The points are seen from the frame's origin. Empty: nothing, or the name says neither.
+    """
+    named = "z" if "optical" in frame else "x" if frame.endswith(("_link", "_frame")) else ""
+    reach = np.linalg.norm(points, axis=1)
+    known = np.isfinite(reach) & (reach > 0)
+    if not named or not known.any():
+        return ""
+    x, _, z = (points[known] / reach[known, None]).mean(0)
+    other, ahead = ("x", x) if named == "z" else ("z", z)
+    if ahead < _AHEAD:
+        return ""
+    meant = "body" if other == "x" else "optical"
+    return (
+        f"the points lie along {other} of {frame!r}, which by its name looks along {named} (REP 103): if so, every "
+        f"grasp is turned by 90 degrees; name the camera's {meant} frame in header.frame_id"
+    )
+
+
 def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     """The camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P without any for a rectified one.
 
@@ -112,14 +139,30 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     shown = matrix.copy()
     shown[:2, 2] -= roi.x_offset, roi.y_offset
     shown[:2] /= bins[:, None]
-    width, height = (roi.width or info.width) // bins[0], (roi.height or info.height) // bins[1]
+    width, height = image_size(info)
     # Once it is taken out, its model does not matter: that of a fisheye lens is not known here.
     distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
     return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, model)
 
 
-def depth_from_message(image: Any) -> Float[np.ndarray, "height width"]:
-    """Depth [m] of a sensor_msgs/Image, 0 where there is none. Raises CloudError: no depth image, or a broken one."""
+def image_size(message: Any) -> tuple[int, int]:
+    """Return width and height of a depth image, packed or not, or of the images that a CameraInfo is of [pixels].
+
+    Raises:
+        CloudError: a packed image that does not say it.
+    """
+    if hasattr(message, "roi"):
+        bins = max(message.binning_x, 1), max(message.binning_y, 1)
+        return (message.roi.width or message.width) // bins[0], (message.roi.height or message.height) // bins[1]
+    if hasattr(message, "format"):
+        return size_of_compressed(memoryview(message.data))
+    return message.width, message.height
+
+
+def depth_from_message(image: Any) -> DepthImage:
+    """Depth [m] of a sensor_msgs/Image or CompressedImage, 0 where there is none. Raises CloudError: no depth."""
+    if hasattr(image, "format"):
+        return depth_from_compressed(memoryview(image.data), image.format)
     return depth_from_bytes(
         memoryview(image.data),
         width=image.width,
@@ -130,20 +173,34 @@ def depth_from_message(image: Any) -> Float[np.ndarray, "height width"]:
     )
 
 
-def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
-    """What a depth image and its sensor_msgs/CameraInfo show, in the camera's optical frame.
+def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple[DepthImage, PinholeCamera]:
+    """Return a depth image [m], 0 where there is none, and its camera from its sensor_msgs/CameraInfo.
 
     Args:
-        image: a sensor_msgs/Image of an encoding for depth.
+        image: a sensor_msgs/Image of an encoding for depth, or a CompressedImage of `compressedDepth`.
         info: the camera's calibration, for an image of the same size.
         rectified: whether distortion has been taken out of the image.
 
     Raises:
-        CloudError: the image is no depth, is broken, shows nothing, or does not fit the calibration.
+        CloudError: the image is no depth, is broken, or is of another frame than the calibration.
     """
-    cloud = cloud_from_depth(depth_from_message(image), camera_from_message(info, rectified=rectified))
+    theirs, own = info.header.frame_id, image.header.frame_id
+    if theirs and theirs.removeprefix("/") != own.removeprefix("/"):
+        raise CloudError(f"depth image in {own!r}, but its camera_info in {theirs!r}")
+    camera = camera_from_message(info, rectified=rectified)
+    return depth_from_message(image), camera
+
+
+def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
+    """Return what a depth image shows, in the camera's optical frame. The arguments are those of `depth_and_camera`.
+
+    Raises:
+        CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
+    """
+    depth, camera = depth_and_camera(image, info, rectified=rectified)
+    cloud = cloud_from_depth(depth, camera)
     if len(cloud.points) == 0:
-        raise CloudError(f"depth image: none of its {image.width} x {image.height} pixels has a depth")
+        raise CloudError(f"depth image: none of its {depth.shape[1]} x {depth.shape[0]} pixels has a depth")
     return cloud
 
 

@@ -30,12 +30,11 @@ SMALL, LARGE = 0.008, 0.5
 # A graspable thing is about this large [m], and within this ratio of it.
 USUAL, SPREAD = 0.12, 6.0
 
-# What would turn a file's coordinates into metres: the number that library, command line and node take, the option that
-# says the same, and the factor.
+# What would turn a file's coordinates into metres: the number that library, command line and node take, and the factor.
 REMEDIES = {
-    "scale 0.001 (--units mm)": 1e-3,
-    "scale 0.01 (--units cm)": 1e-2,
-    "scale 0.0254 (--units inch)": 0.0254,
+    "scale 0.001 (from mm)": 1e-3,
+    "scale 0.01 (from cm)": 1e-2,
+    "scale 0.0254 (from inches)": 0.0254,
     "scale 0.1": 0.1,
 }
 

@@ -192,7 +192,9 @@ def load_preset(name: str) -> PlanConfig:
     Raises:
         ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
     """
-    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else config_dir() / "presets" / f"{name}.yaml"
+    by_path = Path(name).suffix in (".yaml", ".yml") or "/" in name
+    path = Path(name) if by_path else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
-        raise ConfigError(f"unknown preset {name!r}; valid presets: {', '.join(preset_names())}, or a .yaml file")
+        told = f"preset {name}: no such file" if by_path else f"unknown preset {name!r}"
+        raise ConfigError(f"{told}; valid presets: {', '.join(preset_names())}, or a .yaml file")
     return plan_config(read_yaml(path), where=path.name)

@@ -7,7 +7,7 @@ the object or into itself. The wrench space of unit contact forces gives the qua
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -38,10 +38,13 @@ from graspd_core.mesh.surface_queries import (
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.types import Posture
+from graspd_core.types import Grasp, Plane, Posture
 from graspd_core.verify.hold_trial import place_hand, start_penetration
 from graspd_core.verify.world import World, trial_data
 
+# Where a hand may wait that closes only after it has arrived: how far it is closed, and how far it is drawn back to the
+# pregrasp [m]. Where it sinks in by more than `_SUNK` [m], there or at these shares of the way back, it may not.
+_CLOSED, _DRAWN_BACK, _SUNK, _WAY_BACK = (0.0, 0.25, 0.5, 0.75), (0.0, 0.001, 0.002, 0.003), 1e-5, (0.5, 1.0)
 # Samples and a seed that the optimiser's candidates never see.
 _SAMPLES, _SEED = 4000, 20_000
 
@@ -162,6 +165,36 @@ def penetration(context: MetricsContext, placed: PlacedHand) -> float:
         local = (context.points - placed.translations[link]) @ placed.rotations[link]
         worst = max(worst, float(depth_inside(context.hand, link, local).max(initial=0.0)))
     return worst
+
+
+def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
+    """Return an open posture at the grasp whose straight way from the pregrasp is clear of object and support.
+
+    graspd's trial closes the fingers on the way. Some planners do so only after the hand has arrived, where fingers as
+    open as the pregrasp's may be in the object. The hand is closed in part, else drawn back by at most 3 mm. None:
+    neither helps.
+    """
+    open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
+    back = grasp.pregrasp.position - grasp.grasp.position
+    length = float(np.linalg.norm(back))
+
+    def height(placed: PlacedHand) -> float:
+        return 0.0 if support is None else float((placed.points @ support.normal).min()) - support.offset
+
+    low = min(0.0, *(height(placed_hand(context, posture)) for posture in (grasp.pregrasp, grasp.grasp)))
+
+    def clear(share: float, at: float) -> bool:
+        joints = open_joints + share * closing
+        posture = replace(grasp.grasp, position=grasp.grasp.position + at * back, joint_positions=joints)
+        placed = placed_hand(context, posture)
+        return height(placed) >= low - _SUNK and penetration(context, placed) <= _SUNK
+
+    for drawn in (min(drawn / length, 1.0) if length else 0.0 for drawn in _DRAWN_BACK):
+        for share in _CLOSED:
+            if clear(share, drawn) and all(clear(share, part) for part in _WAY_BACK):
+                joints = open_joints + share * closing
+                return replace(grasp.grasp, position=grasp.grasp.position + drawn * back, joint_positions=joints)
+    return None
 
 
 def contact_depth(context: MetricsContext, posture: Posture) -> float | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.inputs import sensor_frames as seen
 from graspd_ros.inputs.sensor_frames import Lookup, SensorFrame, Views, cloud_frame, place_of
 from graspd_ros.inputs.solids import plane_of, with_support
-from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
+from graspd_ros.parameters import BUDGETS, MASSES, MOST_GRASPS, SCALES, Settings
 from graspd_ros.request import MOST_ID, KnownObject, Listener, Request
 
 MOST_EXCLUDED = 256
@@ -52,6 +52,8 @@ _DEFAULTS = Steering()
 class RequestBuilder:
     """Makes requests, and holds what they may be made of: the newest frame and the kept views.
 
+    `missing` says in one line, by the topic's name, what does not arrive from sensors.
+
     Used by the executor's thread only. Frames and views are immutable, so that requests may hold on to them.
 
     Args:
@@ -63,6 +65,7 @@ class RequestBuilder:
         self, hand: str, now: Callable[[], Time], lookup: Lookup, lookup_in_time: Lookup | None = None
     ) -> None:
         self.newest: SensorFrame | None = None
+        self.missing: Mapping[str, str] = {}
         self.views = Views()
         self._hand = hand
         self._now = now
@@ -79,9 +82,17 @@ class RequestBuilder:
         """Drop the newest frame and the views."""
         self.newest, self.views = None, Views()
 
+    def latest(self, settings: Settings) -> SensorFrame:
+        """Return the newest frame. Raises RequestError: there is none, and what is known of why, or it is too old."""
+        if self.newest is None:
+            why = "".join(f"; {told}" for told in self.missing.values())
+            raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has come yet{why}")
+        self.newest.check(nanoseconds(self._now()), settings.cloud_max_age)
+        return self.newest
+
     def add_view(self, settings: Settings) -> None:
         """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
-        frame = latest_frame(self.newest, nanoseconds(self._now()), settings)
+        frame = self.latest(settings)
         cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup)
         if settings.segment:
             check_scene([cloud])
@@ -113,7 +124,8 @@ class RequestBuilder:
         request = source.find(given)
         steering, exclude = self._steering(message, request), tuple(message.exclude)
         lost = [(told.header.frame_id, pose_matrix(told.pose, "exclude_poses")) for told in message.exclude_poses]
-        return replace(request, steering=steering, exclude=exclude, exclude_poses=tuple(lost))
+        asked = {"steering": steering, "exclude": exclude, "exclude_poses": tuple(lost)}
+        return replace(request, closes_late=message.closes_late, **asked)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
         """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
@@ -145,7 +157,7 @@ class RequestBuilder:
         return self.from_loader(request_id, header, settings, load, listener)
 
     def _frame_loader(self, settings: Settings, frame: SensorFrame) -> Callable[[], Scene]:
-        frame.check_age(nanoseconds(self._now()), settings.cloud_max_age)
+        frame.check(nanoseconds(self._now()), settings.cloud_max_age)
         return frame_loader(frame, settings, place_of(settings), self.lookup_in_time)
 
 
@@ -166,6 +178,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
     if message.seed < -1:
         raise bad_request(f"seed: {message.seed}; valid: 0 or more, -1 for the parameter")
     _check_range("time_budget", message.time_budget, BUDGETS, "s, 0 for the parameter")
+    _check_range("mass", message.mass, MASSES, "kg, 0 for the parameter")
     _check_range("mesh_scale", message.mesh_scale, SCALES, "m, 0 for 1")
     if len(message.cloud.data) > seen.MOST_CLOUD_BYTES:
         raise bad_request(f"cloud: {len(message.cloud.data)} bytes; at most {seen.MOST_CLOUD_BYTES} are taken")
@@ -208,6 +221,7 @@ def settings_of(message: GraspRequest, settings: Settings) -> Settings:
         preset=message.preset or settings.preset,
         seed=settings.seed if message.seed < 0 else message.seed,
         deadline=message.time_budget or settings.deadline,
+        mass=message.mass or settings.mass,
         mesh_scale=message.mesh_scale or 1.0,
         segment=settings.segment and not message.alone,
     )
@@ -324,14 +338,6 @@ class Source:
     find: Callable[[SourceInput], Request]
 
 
-def latest_frame(newest: SensorFrame | None, now: int, settings: Settings) -> SensorFrame:
-    """The newest frame at `now` [ns]. Raises RequestError: there is none, or it is too old."""
-    if newest is None:
-        raise RequestError(ErrorCode.NO_CLOUD, "no cloud or depth image has come yet")
-    newest.check_age(now, settings.cloud_max_age)
-    return newest
-
-
 def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
     """Return a function that reads a mesh."""
     mass, friction, scale = settings.mass or None, settings.friction, settings.mesh_scale
@@ -358,19 +364,23 @@ def frame_loader(
 
     def load() -> Scene:
         cloud = seen.seen_by_camera(frame, place, lookup)
+        told = frame.doubts(cloud)
         if mask is None:
             target = None if point is None else Target(point=point)
-            return seen.scene_of_views((seen.trimmed(cloud, settings),), settings, target)
+            return seen.scene_of_views((seen.trimmed(cloud, settings),), settings, target, told)
         points, shown = seen.masked_points(frame, mask)
-        inside = seen.within(points, settings)
-        return seen.scene_of_views((replace(cloud, points=points[inside]),), settings, Target(mask=shown[inside]))
+        marked = replace(cloud, points=points)
+        inside = seen.within(marked, settings)
+        marked = replace(marked, points=points[inside])
+        return seen.scene_of_views((marked,), settings, Target(mask=shown[inside]), told)
 
     return load
 
 
 def _from_cloud(given: SourceInput) -> Request:
     frame = cloud_frame(given.message.cloud, nanoseconds(given.now))
-    frame.check_age(nanoseconds(given.now), given.settings.cloud_max_age)
+    if given.message.cloud.data:  # of one without, that is what there is to say
+        frame.check(nanoseconds(given.now), given.settings.cloud_max_age)
     return _of_frame(given, frame)
 
 
@@ -411,7 +421,7 @@ def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: Know
 
 
 def _from_latest_cloud(given: SourceInput) -> Request:
-    return _of_frame(given, latest_frame(given.builder.newest, nanoseconds(given.now), given.settings))
+    return _of_frame(given, given.builder.latest(given.settings))
 
 
 def _from_views(given: SourceInput) -> Request:
@@ -444,7 +454,8 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     message, place = given.message, place_of(given.settings, given.message)
     point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
     load = frame_loader(frame, given.settings, place, given.builder.lookup_in_time, point, mask)
-    meant = "" if mask is not None else f"{point} {place} {given.settings.segment}"
+    physics = f"{given.settings.mass} {given.settings.friction}"
+    meant = "" if mask is not None else f"{point} {place} {given.settings.segment} {physics}"
     key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
     shown = lambda: _shown(frame, message.region_mask)  # noqa: E731
     return given.request(frame.frame, frame.stamp, load, object_key=key, shown=shown)

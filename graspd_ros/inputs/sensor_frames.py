@@ -7,6 +7,7 @@ its object has the wrong shape, and grasps are verified on what is not there.
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,32 +18,38 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspRequest
 from jaxtyping import Bool, Float
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from graspd_core import PinholeCamera, PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
+from graspd_core import PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
 from graspd_core.config import load_scene_config
-from graspd_core.errors import CloudError
 from graspd_core.io.messages import (
     ORIGIN,
     CameraPlace,
-    camera_from_message,
-    depth_from_message,
+    depth_and_camera,
+    frame_doubt,
+    image_size,
     no_lookup,
     pixels_from_message,
 )
 from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import transform_cloud
-from graspd_core.transforms import SECOND
+from graspd_core.perception.cloud.voxel_downsample import unit_hint
 from graspd_core.verify.robustness import begin_other_shapes
 from graspd_ros.convert import Matrix, array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
-from graspd_ros.parameters import Settings
+from graspd_ros.parameters import WORKSPACE, Settings
 
 CLOUD = "cloud"  # the kind of frame whose camera the message does not name
 Pixels = Float[np.ndarray, "height width 3"]
 # `T_target_source` of two frames at a time; may raise a TransformError.
 Lookup = Callable[[str, str, Time], Matrix]
 
+DepthMessage = Image | CompressedImage
+_Kind = tuple[str, int, int]  # frame, width and height of an image, packed or not, or of what a CameraInfo is of
+
+MOST_CALIBRATIONS = 8  # kept of one topic; cameras that share it have one each
+AHEAD = 0.5  # seconds in the future that a stamp is taken without a word
+UNPAIRED = 2.0  # seconds that images may come without a calibration before that is told
 MOST_CLOUD_BYTES = 2**27  # 128 MiB: 4 million points of 32 bytes
 MOST_VIEWS = 64
 MOST_VIEW_POINTS = 200_000  # kept of each view: 64 views take 300 MB at most
@@ -69,15 +76,32 @@ class SensorFrame:
     read: Callable[..., PointCloud]
     pixels: Callable[[], Pixels] | None = None
 
-    def check_age(self, now: int, limit: float) -> None:
-        """Refuse what is older than `limit` seconds at `now` [ns]; 0 is no limit. Raises RequestError."""
+    def check(self, now: int, limit: float) -> None:
+        """Refuse what names no frame, and stamps that are `limit` seconds from `now` [ns], 0 is no limit.
+
+        Raises:
+            RequestError: which of these it is.
+        """
+        if not self.frame.strip("/"):
+            told = f"the {self.kind} names no frame: its header.frame_id is empty, so that its grasps could be anywhere"
+            raise RequestError(ErrorCode.BAD_CLOUD, f"{told}; have its publisher set one")
         age = (now - (nanoseconds(self.stamp) or self.arrived)) * 1e-9
-        if limit and age > limit:
-            raise RequestError(
-                ErrorCode.STALE_CLOUD,
-                f"the {self.kind} in {self.frame!r} is {age:.1f} s old, more than cloud_max_age={limit:g} s "
-                "(a bag's needs use_sim_time, or cloud_max_age 0)",
-            )
+        if not limit or -limit <= age <= limit:
+            return
+        told, hint = f"is {age:.1f} s old", "a bag's needs use_sim_time, or cloud_max_age 0"
+        if age < 0:
+            told = f"has a stamp {-age:.1f} s in the future"
+            hint = "its clock is not the node's, or use_sim_time is set for one of them only"
+        more = f"more than cloud_max_age={limit:g} s ({hint})"
+        raise RequestError(ErrorCode.STALE_CLOUD, f"the {self.kind} in {self.frame!r} {told}, {more}")
+
+    def doubts(self, cloud: PointCloud) -> tuple[str, ...]:
+        """Return what is odd about the message of a cloud, one sentence each."""
+        ahead = (nanoseconds(self.stamp) - self.arrived) * 1e-9
+        told = f"the {self.kind} came {ahead:.1f} s before its stamp: its clock is ahead of the node's"
+        # Where the camera stood elsewhere, its direction is not the frame's.
+        turned = "" if cloud.viewpoint.any() else frame_doubt(self.frame, cloud.points)
+        return tuple(said for said in (told if ahead > AHEAD else "", turned) if said)
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
@@ -90,68 +114,79 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
     return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, lambda: pixels_from_message(message))
 
 
-def depth_sensor_frame(image: Image, info: CameraInfo, arrived: int) -> SensorFrame:
+def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
     """Return a depth image with its calibration as a frame; it is read only when it is used."""
 
     def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
         # A depth image knows by itself.
-        return cloud_from_depth(*depth_and_camera(image, info))
+        return cloud_from_depth(*depth_and_camera(image, info, rectified=True))
 
     def pixels() -> Pixels:
-        depth, camera = depth_and_camera(image, info)
+        depth, camera = depth_and_camera(image, info, rectified=True)
         return camera_rays(camera) * np.where(depth > 0, depth, np.nan)[..., None]
 
     return SensorFrame("depth image", image.header.frame_id, image.header.stamp, arrived, read, pixels)
 
 
-def depth_and_camera(image: Image, info: CameraInfo) -> tuple[Float[np.ndarray, "height width"], PinholeCamera]:
-    """Return a depth image [m], 0 where there is none, and its camera, which is that of P: the image is rectified.
-
-    Raises CloudError: no depth encoding, sizes that contradict each other, another frame, or no calibration.
-    """
-    if info.header.frame_id and info.header.frame_id != image.header.frame_id:
-        raise CloudError(f"depth image in {image.header.frame_id!r}, but its camera_info in {info.header.frame_id!r}")
-    camera = camera_from_message(info, rectified=True)
-    return depth_from_message(image), camera
-
-
 class ImagePairs:
-    """Finds the CameraInfo of each depth image by its stamp. Not for several threads.
+    """Give each depth image the last calibration of its frame and size. Not for several threads.
 
-    Each image is given out once, with the nearest calibration in time; what is older than the last pair is dropped.
-    Stamps of a pair differ by `slop` [s] at most. Of each kind `capacity` messages wait for their partner.
+    An image that comes before any such calibration waits for it, the newest one only. A CameraInfo without a frame is
+    of any. `clock` tells seconds that only rise.
     """
 
-    def __init__(self, slop: float = 0.01, capacity: int = 4) -> None:
-        self._slop = round(slop * SECOND)
-        self._capacity = capacity
-        self._images: OrderedDict[int, Any] = OrderedDict()
-        self._infos: OrderedDict[int, Any] = OrderedDict()
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._infos: OrderedDict[_Kind, CameraInfo] = OrderedDict()
+        self._waiting: DepthMessage | None = None
+        self._images = self._calibrations = 0  # since the last pair
+        self._alone_since = 0.0
 
-    def add(self, message: Image | CameraInfo) -> tuple[Image, CameraInfo] | None:
-        """Take an image or a calibration; return the pair that it completes, if it does."""
-        is_image, stamp = isinstance(message, Image), nanoseconds(message.header.stamp)
-        own, others = (self._images, self._infos) if is_image else (self._infos, self._images)
-        own[stamp] = message
-        own.move_to_end(stamp)
-        while len(own) > self._capacity:
-            own.popitem(last=False)
-        partner = min(others, key=lambda other: abs(other - stamp), default=None)
-        if partner is None or abs(partner - stamp) > self._slop:
+    def add(self, message: DepthMessage | CameraInfo) -> tuple[DepthMessage, CameraInfo] | None:
+        """Take an image or a calibration; return the pair that it completes, if any. Raises CloudError: no image."""
+        if isinstance(message, CameraInfo):
+            self._calibrations += 1
+            kind = _kind(message)
+            self._infos[kind] = message
+            self._infos.move_to_end(kind)
+            while len(self._infos) > MOST_CALIBRATIONS:
+                self._infos.popitem(last=False)
+            image, self._waiting = self._waiting, None
+        else:
+            if not self._images:
+                self._alone_since = self._clock()
+            self._images += 1
+            image = message
+        if image is None:
             return None
-        return self._pair(stamp, partner) if is_image else self._pair(partner, stamp)
+        kind = _kind(image)
+        info = self._infos.get(kind) or self._infos.get(("", *kind[1:]))
+        if info is None:
+            self._waiting = image
+            return None
+        self._images = self._calibrations = 0
+        self._waiting = None
+        return image, info
 
-    def __len__(self) -> int:
-        """Messages that wait."""
-        return len(self._images) + len(self._infos)
+    def doubt(self) -> str:
+        """Return why images find no calibration, in one line; empty if they do, or have for less than `UNPAIRED`."""
+        if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
+            return ""
+        last = next(reversed(self._infos.values()), None)
+        of = "none has come" if last is None else f"the last one is {_shown_kind(last)}"
+        return (
+            f"depth images: {self._images} and {self._calibrations} CameraInfos came, and none of them pairs; the last "
+            f"image is {_shown_kind(self._waiting)}, a CameraInfo of its frame and size is needed, and {of}"
+        )
 
-    def _pair(self, image_stamp: int, info_stamp: int) -> tuple[Image, CameraInfo]:
-        # The calibration stays: a second image within the slop may need it.
-        pair = self._images.pop(image_stamp), self._infos[info_stamp]
-        for kept, newest in ((self._images, image_stamp), (self._infos, info_stamp)):
-            for stamp in [stamp for stamp in kept if stamp < newest]:
-                del kept[stamp]
-        return pair
+
+def _kind(message: Any) -> _Kind:
+    return (message.header.frame_id.removeprefix("/"), *image_size(message))
+
+
+def _shown_kind(message: Any) -> str:
+    frame, width, height = _kind(message)
+    return f"{width} x {height} in {frame[:64]!r}"
 
 
 def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraPlace:
@@ -221,15 +256,19 @@ class Views:
         return Views(frame, sensor_frame.stamp, (*self.clouds, cloud))
 
 
-def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Target | None) -> Scene:
+def scene_of_views(
+    views: tuple[PointCloud, ...], settings: Settings, target: Target | None, doubts: tuple[str, ...] = ()
+) -> Scene:
     """Return the scene that clouds in one frame show; `target` says which object is meant, in that frame.
+
+    `doubts` become warnings of its object.
 
     Raises GraspdError: the clouds show no usable object, or the file of the settings has changed and cannot be used.
     """
     # Beside its distance grid, if grasps will have to hold on it.
     certainty = load_preset(settings.preset).certainty
     ahead = None if settings.verify == "none" else partial(begin_other_shapes, certainty.probability)
-    return scene_from_views(
+    scene = scene_from_views(
         views,
         target=target,
         alone=not settings.segment,
@@ -238,20 +277,25 @@ def scene_of_views(views: tuple[PointCloud, ...], settings: Settings, target: Ta
         friction=settings.friction,
         ahead=ahead,
     )
+    return replace(scene, object=replace(scene.object, warnings=(*doubts, *scene.object.warnings)))
 
 
 def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
-    """The points inside the workspace, one a voxel where the settings give a voxel its size."""
-    points = cloud.points[within(cloud.points, settings)]
-    if not len(points):
-        workspace = f"roi_min={settings.roi_min} to roi_max={settings.roi_max}"
-        told = f"none of {len(cloud.points)} points lies in the workspace, {workspace}"
-        raise RequestError(ErrorCode.BAD_CLOUD, told)
-    inside = replace(cloud, points=points)
+    """Return the points inside the workspace, one a voxel where the settings give a voxel its size."""
+    inside = replace(cloud, points=cloud.points[within(cloud, settings)])
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 
-def within(points: Float[np.ndarray, "n 3"], settings: Settings) -> Bool[np.ndarray, "n"]:
-    """Which points lie in the workspace; NaN does not."""
-    low, high = np.array(settings.roi_min), np.array(settings.roi_max)
-    return np.asarray(((points >= low) & (points <= high)).all(1))
+def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
+    """Return which points lie in the workspace; NaN does not. Raises RequestError: none does, and where they lie."""
+    points, low, high = cloud.points, np.array(settings.roi_min), np.array(settings.roi_max)
+    inside = np.asarray(((points >= low) & (points <= high)).all(1))
+    if inside.any():
+        return inside
+    seen = points[np.isfinite(points).all(1)]
+    span = f", they lie from {seen.min(0).round(3).tolist()} to {seen.max(0).round(3).tolist()}" if len(seen) else ""
+    told = (
+        f"none of {len(points)} points lies in the workspace, roi_min={settings.roi_min} to roi_max={settings.roi_max}"
+    )
+    unit = unit_hint((cloud,), WORKSPACE) if len(seen) else ""
+    raise RequestError(ErrorCode.BAD_CLOUD, f"{told}{span}{unit}")

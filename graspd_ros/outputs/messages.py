@@ -110,12 +110,17 @@ class Pace:
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """How a request ended, in the words of a GraspArray; the grasps of `result` are in the answer's frame."""
+    """How a request ended, in the words of a GraspArray; the grasps of `result` are in the answer's frame.
+
+    `mass` [kg] is what their object weighed in the trials, 0 without any. `mass_assumed`: nobody said it.
+    """
 
     status: int
     code: ErrorCode
     message: str
     result: GraspResult | None = None
+    mass: float = 0.0
+    mass_assumed: bool = False
 
 
 def ending_of(result: GraspResult) -> AnswerEnding:
@@ -139,6 +144,8 @@ def array_message(
         status=ending.status,
         error_code=str(ending.code),
         message=ending.message,
+        mass=_number(ending.mass, 0.0),
+        mass_assumed=ending.mass_assumed,
         elapsed=elapsed,
     )
     if ending.result is not None:
@@ -185,6 +192,9 @@ def grasp_message(
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
+    if grasp.arrival is not None:
+        message.arrival_pose = pose_of_posture(grasp.arrival)
+        message.arrival_joints = joint_message(grasp.arrival, hand, header.stamp)
     if grasp.arm is not None:
         message.arm_trajectory = arm_trajectory(grasp, grasp.arm, pace)
         message.arm_stages = list(grasp.arm.stages)

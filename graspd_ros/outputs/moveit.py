@@ -37,6 +37,7 @@ def moveit_grasp(
     retreat_distance: float = 0.1,
     T_parent_base: Matrix | None = None,
     effort: Sequence[float] = (),
+    touch: Sequence[str] = (),
     messages: ModuleType | None = None,
 ) -> Any:
     """The moveit_msgs/Grasp of a graspd_msgs/Grasp.
@@ -48,6 +49,7 @@ def moveit_grasp(
         retreat_distance: how far to lift [m].
         T_parent_base: pose of the hand's base link in the end effector's parent link; None: as the hand is mounted by
             its description, and where that has no mount, they are one.
+        touch: names of what the hand may touch on its way and afterwards: the object.
         effort: most that each joint of the trajectory may press with, in its order [N·m] or [N]; empty: not told.
         messages: module with the message classes; None: moveit_msgs.msg.
 
@@ -61,11 +63,17 @@ def moveit_grasp(
     if not (np.isfinite(up).all() and up.any()):
         raise ConfigError(f"retreat: {retreat}; it must be a direction")
     messages = messages or _moveit_messages()
-    way = matrix_of_pose(grasp.grasp_pose)[:3, 3] - matrix_of_pose(grasp.pregrasp_pose)[:3, 3]
-    pose = grasp.mount_grasp_pose if grasp.mount_link else grasp.grasp_pose
-    if T_parent_base is not None:
-        pose = pose_of_matrix(matrix_of_pose(grasp.grasp_pose) @ np.linalg.inv(T_parent_base))
     first, *closing = deepcopy(grasp.trajectory.points)
+    T_frame_grasp = T_frame_base = matrix_of_pose(grasp.grasp_pose)
+    if waits := dict(zip(grasp.arrival_joints.name, grasp.arrival_joints.position, strict=True)):
+        # MoveIt's approach ends with the hand still open.
+        T_frame_base = matrix_of_pose(grasp.arrival_pose)
+        first.positions = [waits[name] for name in grasp.trajectory.joint_names]
+    way = T_frame_base[:3, 3] - matrix_of_pose(grasp.pregrasp_pose)[:3, 3]
+    T_base_parent = np.eye(4) if T_parent_base is None else np.linalg.inv(T_parent_base)
+    if T_parent_base is None and grasp.mount_link:
+        T_base_parent = np.linalg.inv(T_frame_grasp) @ matrix_of_pose(grasp.mount_grasp_pose)
+    pose = pose_of_matrix(T_frame_base @ T_base_parent)
     for point in closing:
         point.effort = list(effort)
     quality = next((metric.value for metric in grasp.metrics if metric.name == "epsilon"), 0.0)
@@ -77,6 +85,7 @@ def moveit_grasp(
         grasp_quality=quality,
         pre_grasp_approach=_translation(messages, way, grasp.header.frame_id, float(np.linalg.norm(way))),
         post_grasp_retreat=_translation(messages, up, retreat_frame, retreat_distance),
+        allowed_touch_objects=list(touch),
     )
 
 

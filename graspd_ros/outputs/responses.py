@@ -321,6 +321,10 @@ class Responses:
         """A message about a thing of the planning scene that is no use; things stay as they were."""
         self._refused("", "collision_objects", code_of(error), sentence_of(error))
 
+    def images_not_taken(self, told: str) -> None:
+        """Tell that depth images come, and why none of them is used."""
+        self._refused("", "sensors", ErrorCode.NO_CLOUD, told)
+
     def _refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
         self.publishers.tell("refused", request_id, source, code=code, message=message)
         self._log().warning(f"{request_id or source}: refused: {message}")
@@ -393,16 +397,17 @@ class Responses:
             if time.monotonic() - self._superseded_told >= COUNT_PERIOD:
                 self._tell_superseded(request.id)
         else:
-            found = report.value.result if report.value else None
-            answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], result=found))
+            found = {"result": report.value.result, **_weight(report.value)} if report.value else {}
+            answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], **found))
             self.publishers.tell(report.ending.value, request.id, request.source)
             self._publish(answer, request.listener)
 
     def _result(self, request: Request, planned: Planned) -> None:
         result, hand = planned.result, self._hand
         # Everything is made before anything is published: a result that cannot be told is an error as a whole.
-        answer = self._answer(request, messages.ending_of(result))
-        event = result_event(result)
+        ending = dataclasses.replace(messages.ending_of(result), **_weight(planned))
+        answer = self._answer(request, ending)
+        event = {**result_event(result), **_weight(planned)}
         shown = []
         best = presentable(result)
         if best is not None:
@@ -474,6 +479,10 @@ class Responses:
 
     def _log(self):
         return self._node.get_logger()
+
+
+def _weight(planned: Planned) -> dict[str, Any]:
+    return {"mass": planned.mass, "mass_assumed": planned.mass_assumed}
 
 
 def _pace(request: Request) -> Pace:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
+from bag_writer import (
+    Record,
+    camera_info_message,
+    cloud_message,
+    depth_message,
+    packed_message,
+    transforms_message,
+    write_bag,
+)
 
 from graspd_bench.rendering.render import look_at, render_depth
+from graspd_core.cli.options import bag_views
 from graspd_core.errors import BagError, CloudError, TransformError
 from graspd_core.io.bags import bag_topics, is_bag, read_frames, read_raw, read_transforms
 from graspd_core.io.messages import camera_from_message
@@ -127,6 +137,44 @@ def test_a_rectified_image_of_a_fisheye_camera_has_no_distortion_left():
     assert camera_from_message(info, rectified=True).distortion == ()
     with pytest.raises(CloudError, match="unknown distortion model 'equidistant'"):
         camera_from_message(info)
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_packed_depth_is_read_like_the_image_that_it_was(tmp_path, encoding):
+    depth = render_depth(make_shape("sphere"), CAMERA, look_at((0.4, 0.0, 0.2), (0, 0, 0)))
+    plain = depth_message(depth, OPTICAL, START, encoding=encoding)
+    info = Record("/d/camera_info", START, camera_info_message(CAMERA, OPTICAL, START))
+    packed = Record("/d/image_rect/compressedDepth", START, packed_message(depth, OPTICAL, START, encoding))
+    write_bag(tmp_path / "plain", [info, Record("/d/image_rect", START, plain)])
+    write_bag(tmp_path / "packed", [info, packed])
+    write_bag(tmp_path / "both", [info, packed, Record("/d/image_rect", START, plain)])
+    (expected,), (found,), (chosen,) = (list(read_frames(tmp_path / name)) for name in ("plain", "packed", "both"))
+    assert (found.topic, chosen.topic) == ("/d/image_rect/compressedDepth", "/d/image_rect")
+    # Rectified by its name, as the plain one is. Half a step of the inverse depth is 0.01 mm at 0.45 m.
+    np.testing.assert_allclose(found.view().points, expected.view().points, atol=2e-5)
+
+
+def test_a_calibration_of_another_frame_is_refused_in_a_recording_as_in_the_node(tmp_path):
+    records = [
+        Record("/d/camera_info", START, camera_info_message(CAMERA, "colour_optical_frame", START)),
+        Record("/d/image", START, depth_message(np.full((120, 160), 0.5), OPTICAL, START)),
+    ]
+    write_bag(tmp_path / "bag", records)
+    (frame,) = read_frames(tmp_path / "bag")
+    with pytest.raises(CloudError, match="'camera_optical_frame', but its camera_info in 'colour_optical_frame'"):
+        frame.view()
+
+
+def test_depth_in_a_frame_whose_name_says_another_direction_is_told(tmp_path, capsys):
+    for frame in (OPTICAL, "camera_link"):
+        records = [
+            Record("/points", START + i, cloud_message(np.ones((60, 3)) * [0, 0, 1], frame, START)) for i in (0, 1)
+        ]
+        write_bag(tmp_path / frame, records)
+        options = argparse.Namespace(topic=None, camera_info=None, every=1, limit=None, frame=None)
+        assert len(list(bag_views(tmp_path / frame, options))) == 2
+        told = capsys.readouterr().err
+        assert told.count("the points lie along z of 'camera_link'") == (frame == "camera_link")
 
 
 @pytest.mark.parametrize("lost", ["depth", "camera_info"])

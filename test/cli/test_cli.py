@@ -42,6 +42,7 @@ BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
 BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--hand", "claw"], "unknown hand 'claw'; known: allegro_left, allegro_right"),
     (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
+    (["--preset", "mine/best.yaml"], "preset mine/best.yaml: no such file; valid presets: accurate"),
     (["-n", "many"], "invalid int value: 'many'"),
     (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
     (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),

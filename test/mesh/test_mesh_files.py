@@ -74,11 +74,11 @@ def test_bad_files_are_named(tmp_path, make, complaint):
 @pytest.mark.parametrize(
     ("factor", "complaint"),
     [
-        (1000.0, r"90 m across.*scale 0.001 \(--units mm\) makes it 90 mm$"),
-        (100.0, r"9 m across.*scale 0.01 \(--units cm\) makes it 90 mm, scale 0.0254 \(--units inch\) makes it 229 mm"),
+        (1000.0, r"90 m across.*scale 0.001 \(from mm\) makes it 90 mm$"),
+        (100.0, r"9 m across.*scale 0.01 \(from cm\) makes it 90 mm, scale 0.0254 \(from inches\) makes it 229 mm"),
         (
             1 / 0.0254,
-            r"3.543 m across.*scale 0.0254 \(--units inch\) makes it 90 mm.*scale 0.01 \(--units cm\) makes it 35.4 mm",
+            r"3.543 m across.*scale 0.0254 \(from inches\) makes it 90 mm.*scale 0.01 \(from cm\) makes it 35.4 mm",
         ),
         (1e-3, "9e-05 m across.*scale 1000 makes it 90 mm"),
         (1e6, r"9e\+04 m across.*scale 1e-06 makes it 90 mm$"),
@@ -97,7 +97,7 @@ def test_wrong_units_are_guessed_and_not_applied(factor, complaint):
         (
             0.9,
             "large for a hand; if the file is not in metres, scale 0.1 makes it 90 mm, "
-            "scale 0.0254 (--units inch) makes it 22.9 mm",
+            "scale 0.0254 (from inches) makes it 22.9 mm",
         ),
         (0.09, None),
         (0.45, None),
@@ -113,11 +113,11 @@ def test_small_and_large_things_are_allowed_and_doubted(size, doubt):
 @pytest.mark.parametrize(
     ("scale", "size", "advice"),
     [
-        (0.01, 0.9, "in another unit, scale 0.001 (--units mm) makes it 90 mm"),
+        (0.01, 0.9, "in another unit, scale 0.001 (from mm) makes it 90 mm"),
         (
             1e-3,
             0.005,
-            "in another unit, scale 0.0254 (--units inch) makes it 127 mm, scale 0.01 (--units cm) makes it 50 mm, "
+            "in another unit, scale 0.0254 (from inches) makes it 127 mm, scale 0.01 (from cm) makes it 50 mm, "
             "scale 0.1 makes it 500 mm",
         ),
         (10.0, 0.9, "in another unit, scale 1 makes it 90 mm"),

@@ -1,10 +1,15 @@
-"""A node like any other, but for its planner: it raises what the seed says. Started by test_node_process.py."""
+"""A node like any other, but for its planner: it raises what the seed says, or is sure of no grasp.
+
+Started by test_node_process.py.
+"""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from typing import Any
 
+from graspd_core.types import HYPOTHESES, Outcome, TrialResult
 from graspd_ros import request_planner as planning
 from graspd_ros.node import main
 
@@ -15,13 +20,19 @@ ERRORS: dict[int, BaseException] = {
     4: SystemExit(3),
     5: BaseException("no reason at all"),
 }
+DOUBTS = 7
 honest = planning.plan_grasps
 
 
 def rigged(*args: Any, seed: int, **kwargs: Any):
     if seed in ERRORS:
         raise ERRORS[seed]
-    return honest(*args, seed=seed, **kwargs)
+    if seed != DOUBTS:
+        return honest(*args, seed=seed, **kwargs)
+    found = honest(*args, seed=seed, **kwargs | {"progress": lambda progress: None})
+    doubt = TrialResult(HYPOTHESES, False, 0.0, 0.0, "holds on the likeliest shape only")
+    doubted = tuple(replace(grasp, trials=(*grasp.trials, doubt)) for grasp in found.grasps)
+    return replace(found, grasps=doubted, outcome=Outcome.TOO_FEW)
 
 
 if __name__ == "__main__":

@@ -10,16 +10,22 @@ import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose
+from graspd_msgs.msg import Grasp, GraspArray, TrialResult
 from grasping_msgs.action import GraspPlanning
 from grasping_msgs.msg import Object
+from sensor_msgs.msg import JointState
 from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_bench.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
+from graspd_core import HandModel, load_scene
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import cloud_from_depth
+from graspd_core.types import Posture
+from graspd_core.verify.prepared_grasp import make_metrics_context, penetration, placed_hand
+from graspd_ros.convert import array_of, matrix_of, matrix_of_pose, wxyz_of_matrix
 from graspd_ros.error_codes import code_of
 from graspd_ros.grasp_planning import PlanningMessages, request_from_goal
 from graspd_ros.inputs.request_builder import RequestBuilder
@@ -85,28 +91,75 @@ def test_each_kind_of_object_gets_grasps_and_feedback_before(client, planning, m
     assert all(effort > 0 for point in best.grasp_posture.points for effort in point.effort)
     assert len(best.grasp_posture.points[0].effort) == len(best.grasp_posture.joint_names)
     assert best.pre_grasp_approach.desired_distance > 0
-    assert best.post_grasp_retreat.direction.header.frame_id == best.grasp_pose.header.frame_id
+    # Without a surface nobody says where up is: back along the way.
+    retreat, approach = best.post_grasp_retreat.direction, best.pre_grasp_approach.direction
+    assert retreat.header.frame_id == best.grasp_pose.header.frame_id
+    assert np.dot(array_of(retreat.vector), array_of(approach.vector)) == pytest.approx(-1.0, abs=0.2)
+    assert list(best.allowed_touch_objects) == []
+    (answer,) = client.spin_until(lambda: client.answers, "the answer")
+    assert not any("/tmp" in told for told in answer.warnings)
+
+
+def waiting(grasp: Any, hand: HandModel) -> Posture:
+    """Where MoveIt's approach ends: `grasp_pose`, with the hand as open as before."""
+    T = matrix_of_pose(grasp.grasp_pose.pose)
+    if hand.mount is not None:
+        T = T @ matrix_of(hand.mount.position, hand.mount.quaternion_wxyz)
+    opening = dict(zip(grasp.pre_grasp_posture.joint_names, grasp.pre_grasp_posture.points[0].positions, strict=True))
+    return Posture(T[:3, 3], wxyz_of_matrix(T), np.array([opening[name] for name in hand.joint_names]))
+
+
+def test_the_approach_of_moveit_ends_clear_of_object_and_table_and_lifts_before_it_leaves(client, planning):
+    hand = load_hand("allegro_right")
+    client.set_parameters(**FEW | {"num_grasps": 6})
+    table = Plane(coef=[0.0, 0.0, -2.0, 2 * float(make_shape("mug").vertices[:, 2].min())])
+    target = mug()
+    target.name, target.surface, target.header.frame_id = "my mug", table, "table"
+    status, grasps, _ = ask(client, planning, target)
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    context = make_metrics_context(load_scene("shape:mug").object, hand)
+    for grasp in grasps:
+        # Before, with the pregrasp's fingers, it was up to 3 mm deep in most of such objects.
+        placed = placed_hand(context, waiting(grasp, hand))
+        assert penetration(context, placed) < 1e-4
+        assert placed.points[:, 2].min() > make_shape("mug").vertices[:, 2].min() - 0.002
+        assert list(grasp.allowed_touch_objects) == ["my mug"]
+        retreat = grasp.post_grasp_retreat
+        assert (retreat.direction.header.frame_id, retreat.desired_distance) == ("table", pytest.approx(0.1))
+        np.testing.assert_allclose(array_of(retreat.direction.vector), [0.0, 0.0, 1.0], atol=1e-9)
+    assert len(grasps) >= 4
+    answer = client.spin_until(lambda: client.answers, "the answer")[-1]
+    assert not any("/tmp" in told for told in answer.warnings), answer.warnings
 
 
 def test_the_result_holds_no_grasp_that_failed_a_trial():
-    from graspd_msgs.msg import Grasp, GraspArray, TrialResult
+    hand = load_hand("allegro_right")
+    waits = JointState(name=list(hand.joint_names), position=hand.open_posture.tolist())
 
     def grasp(name: str, verdict: int, **trials: bool) -> Grasp:
         tried = [TrialResult(name=trial, passed=passed) for trial, passed in trials.items()]
         point = JointTrajectoryPoint()
-        way = JointTrajectory(points=[point, point, point])
-        return Grasp(id=name, verdict=verdict, trials=tried, trajectory=way)
+        way = JointTrajectory(joint_names=list(hand.joint_names), points=[point, point, point])
+        return Grasp(id=name, verdict=verdict, trials=tried, trajectory=way, arrival_joints=waits)
 
+    unreached = grasp("unreached", Grasp.VERIFIED, hold=True)
+    unreached.arrival_joints = JointState()
+
+    doubted = grasp("doubted", Grasp.UNVERIFIED, hold=True, hypotheses=False)
     message = GraspArray(
         grasps=[
+            unreached,
             grasp("sure", Grasp.VERIFIED, hold=True, hypotheses=True),
-            grasp("doubted", Grasp.UNVERIFIED, hold=True, hypotheses=False),
+            doubted,
             grasp("untried", Grasp.UNVERIFIED),
             grasp("failed", Grasp.FAILED, hold=False),
         ]
     )
-    answer = PlanningMessages(load_hand("allegro_right")).result(message)
+    messages = PlanningMessages(hand)
+    answer = messages.result(message)
     assert [theirs.id for theirs in answer.grasps] == ["sure", "untried"]
+    assert messages.succeeded(answer)
+    assert not messages.succeeded(messages.result(GraspArray(grasps=[unreached, doubted])))
 
 
 def test_a_group_that_is_no_hand_and_an_object_without_shape_are_aborted_and_told_on_status(client, planning):

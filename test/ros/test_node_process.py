@@ -11,8 +11,12 @@ import time
 from pathlib import Path
 
 import pytest
+from action_msgs.msg import GoalStatus
 from graspd_msgs.action import SynthesizeGrasps
-from graspd_msgs.msg import GraspArray, GraspRequest
+from graspd_msgs.msg import Grasp, GraspArray, GraspRequest
+from grasping_msgs.action import GraspPlanning
+from grasping_msgs.msg import Object
+from shape_msgs.msg import SolidPrimitive
 
 from graspd_ros.node import main
 
@@ -138,6 +142,17 @@ def test_a_request_whose_work_blows_up_is_answered_and_the_next_is_served(client
     client.spin_for(0.3)
     assert len(client.answers) == 6
     assert process.alive()
+    # Doubted grasps are some for a client that reads their verdicts, and none for MoveIt.
+    client.send_request(id="doubted", seed=7, **SPHERE, **FEW)
+    answer = client.answer("doubted")
+    assert (answer.status, answer.grasps[0].verdict) == (GraspArray.PARTIAL, Grasp.UNVERIFIED)
+    client.set_parameters(seed=7, num_grasps=1, preset="fast")
+    solid = SolidPrimitive(type=SolidPrimitive.BOX, dimensions=[0.05, 0.05, 0.12])
+    planning = client.actions(GraspPlanning, "grasp_planning")
+    handle = client.send_goal(planning, GraspPlanning.Goal(object=Object(primitives=[solid])))
+    ended = client.done(handle.get_result_async(), "result")
+    assert (ended.status, list(ended.result.grasps)) == (GoalStatus.STATUS_ABORTED, [])
+    planning.destroy()
     client.send_request(id="orphan", seed=6, **SPHERE, **LONG)
     client.spin_until(lambda: [p for p in client.progress if p.request_id == "orphan"], "progress")
     process.stop(signal.SIGKILL)

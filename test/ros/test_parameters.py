@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ import pytest
 import rclpy
 import yaml
 from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from graspd_core import PointCloud
 from graspd_core.paths import config_dir
 from graspd_ros.inputs.sensor_frames import scene_of_views
-from graspd_ros.parameters import LiveSettings, Settings, check_parameters, doubts
+from graspd_ros.parameters import LiveSettings, Settings, check_parameters
 
 
 @pytest.mark.parametrize(
@@ -26,6 +28,7 @@ from graspd_ros.parameters import LiveSettings, Settings, check_parameters, doub
         ("cloud_policy", True, "'on' is not one of newest, each, off"),
         ("cloud_policy", 3, "3 is not one of newest, each, off"),
         ("preset", "no_such_preset", "valid presets"),
+        ("preset", "/no/such/preset.yaml", "preset /no/such/preset.yaml: no such file"),
         ("scene_config", "none.yaml", "none.yaml: No such file"),
         ("roi_min", [0.0, 1.0], "three finite numbers"),
         ("roi_max", [0.0, 1.0, math.nan], "three finite numbers"),
@@ -74,33 +77,73 @@ def test_a_scene_file_sets_the_reconstruction_and_is_refused_by_its_key(tmp_path
     assert answer.reason.startswith("parameter scene_config: scene.yaml.reconstruction: unknown key 'most_faces'")
 
 
-def started(*arguments: str) -> tuple[Settings, list[str]]:
-    """What a node makes of its arguments, and what it warns of."""
-    context = Context()
-    rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))], context=context)
-    node = rclpy.create_node("parameters", context=context)
-    try:
-        settings = LiveSettings(node).now
-        return settings, doubts(node, settings)
-    finally:
+@pytest.fixture
+def started() -> Iterator[Callable[..., tuple[Node, LiveSettings]]]:
+    """Makes what a node makes of its arguments."""
+    made: list[Node] = []
+
+    def started(*arguments: str, frames: tuple[str, ...] = ()) -> tuple[Node, LiveSettings]:
+        context = Context()
+        rclpy.init(args=["--ros-args", *(part for given in arguments for part in ("-p", given))], context=context)
+        made.append(rclpy.create_node("parameters", context=context))
+        return made[-1], LiveSettings(made[-1], lambda: frames)
+
+    yield started
+    for node in made:
+        context = node.context
         node.destroy_node()
         rclpy.shutdown(context=context)
 
 
-def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(tmp_path: Path):
-    settings, told = started(
-        "deadline:=5", "roi_min:=[-1, -1, 0]", f"mesh_roots:=[{tmp_path}]", "view_point:=[0, 0, 1]"
+def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(started, tmp_path: Path, capfd):
+    _, live = started(
+        "deadline:=5", "roi_min:=[-1, -1, 0]", f"mesh_roots:=[{tmp_path}]", "view_point:=[0, 0, 1]", "cloud_policy:=off"
     )
+    settings = live.now
     assert (settings.deadline, settings.roi_min, settings.view_point) == (5.0, [-1.0, -1.0, 0.0], [0.0, 0.0, 1.0])
     assert isinstance(settings.deadline, float)
-    assert told == []
-    _, told = started("num_grasp:=3", "nothing_like_it:=1", "roi_min:=[20.0, 0.0, 0.0]", "mesh_roots:=[/no/such/place]")
-    assert told[:2] == [
-        "parameter num_grasp: there is none; is num_grasps meant?",
-        "parameter nothing_like_it: there is none; it is ignored",
-    ]
-    assert "is above roi_max" in told[2]
-    assert told[3] == "mesh_roots: '/no/such/place' is no directory"
+    assert "[WARN]" not in "".join(capfd.readouterr())
+    started("num_grasp:=3", "nothing_like_it:=1", "roi_min:=[20.0, 0.0, 0.0]", "mesh_roots:=[/no/such/place]")
+    told = "".join(capfd.readouterr())
+    assert "parameter num_grasp: there is none; is num_grasps meant?" in told
+    assert "parameter nothing_like_it: there is none; it is ignored" in told
+    assert "is above roi_max" in told
+    assert "mesh_roots: '/no/such/place' is no directory" in told
+
+
+def test_who_describes_a_parameter_sees_the_same_type_whatever_was_set(started):
+    node, live = started("deadline:=5", "roi_min:=[-1, -1, 0]", "cloud_policy:=off")
+    names = ("mass", "deadline", "roi_min", "roi_max", "cloud_policy")
+    kinds = {name: node.describe_parameter(name).type for name in names}
+    numbers, word = Parameter.Type.DOUBLE_ARRAY.value, Parameter.Type.STRING.value
+    assert kinds == {"mass": 3, "deadline": 3, "roi_min": numbers, "roi_max": numbers, "cloud_policy": word}
+    # As `ros2 param set` sends `mass 1`, `roi_max "[1, 1, 2]"` and `cloud_policy off`.
+    given = {"mass": 1, "deadline": 7, "roi_min": [0, 0, 0], "roi_max": [1, 1, 2], "cloud_policy": False}
+    results = node.set_parameters([Parameter(name, value=value) for name, value in given.items()])
+    assert all(result.successful for result in results)
+    assert {name: node.describe_parameter(name).type for name in names} == kinds
+    assert node.get_parameter("mass").value == 1.0
+    assert node.get_parameter("cloud_policy").value == "off"
+    assert (live.now.mass, live.now.roi_max, live.now.cloud_policy) == (1.0, [1.0, 1.0, 2.0], "off")
+    (refused,) = node.set_parameters([Parameter("mass", value="heavy")])
+    assert not refused.successful
+
+
+def test_what_is_warned_of_at_the_start_is_warned_of_while_the_node_runs(started, capfd):
+    node, _ = started(frames=("base_link", "camera_depth_optical_frame"))
+    capfd.readouterr()
+    for name, value, told in (
+        ("roi_max", [-20.0, 1.0, 1.0], "roi_max=[-20.0, 1.0, 1.0]: no point lies in the workspace"),
+        ("mesh_roots", ["/no/such/place"], "mesh_roots: '/no/such/place' is no directory"),
+        ("sensor_frame", "camera", "parameter sensor_frame: /tf knows no frame 'camera' by now; known: base_link, cam"),
+    ):
+        (result,) = node.set_parameters([Parameter(name, value=value)])
+        assert result.successful
+        assert "".join(capfd.readouterr()).count(told) == 1
+        node.set_parameters([Parameter("seed", value=1)])
+        assert told not in "".join(capfd.readouterr())
+    node.set_parameters([Parameter("sensor_frame", value="/base_link")])
+    assert "sensor_frame" not in "".join(capfd.readouterr())
 
 
 def test_the_shipped_parameter_file_holds_every_parameter_at_its_default():

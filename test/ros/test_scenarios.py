@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import Record, camera_info_message, depth_message, transforms_message, write_bag
+from bag_writer import Record, camera_info_message, depth_message, packed_depth, transforms_message, write_bag
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
@@ -24,6 +24,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
 
 from graspd_bench.rendering.depth_noise import DEFAULT
@@ -241,3 +243,49 @@ def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_no
     assert "is 10.0 s old" in late.message
     client.node.destroy_subscription(subscription)
     assert process.alive()
+
+
+def test_depth_whose_calibration_comes_once_is_grasped_packed_too_and_what_does_not_pair_is_told(client, node):
+    ((depth, _),) = depth_views(tabletop("cylinder", yaw=0.3), CAMERA, ring_poses(1, elevation=0.8), DEFAULT)
+    client.set_parameters(cloud_policy="off", **ONE)
+    depth[~np.isfinite(depth)] = 0
+    plain = Image(height=240, width=320, encoding="32FC1", step=1280, data=depth.astype("<f4").tobytes())
+    packed = CompressedImage(format="16UC1; compressedDepth png", data=packed_depth(depth))
+    topics = {Image: "/depth/image_rect", CompressedImage: "/depth/image_rect/compressedDepth"}
+
+    def latest(kind: type, name: str) -> GraspArray:
+        message = plain if kind is Image else packed
+        publisher = client.node.create_publisher(kind, topics[kind], 10)
+        asked: list[str] = []
+
+        def sent() -> bool:
+            message.header.frame_id, message.header.stamp = "camera_depth_optical_frame", client.now()
+            publisher.publish(message)
+            client.spin_for(0.2)
+            asked.append(f"{name}-{len(asked)}")
+            client.send_request(id=asked[-1], source=GraspRequest.LATEST_CLOUD)
+            answer = client.answer(asked[-1])
+            return answer.error_code != "NO_CLOUD" or "none of them pairs" in answer.message
+
+        client.spin_until(sent, "an answer about the image")
+        client.node.destroy_publisher(publisher)
+        return client.answer(asked[-1])
+
+    missing = latest(Image, "alone")
+    assert (missing.status, missing.error_code) == (GraspArray.REFUSED, "NO_CLOUD")
+    assert missing.message.startswith("no cloud or depth image has come yet; ")
+    assert "; depth images: " in missing.message
+    assert "and 0 CameraInfos came, and none of them pairs; the last image is 320 x 240" in missing.message
+    assert client.event(event="refused", source="sensors")["code"] == "NO_CLOUD"
+    # Once, and without a stamp.
+    calibration = CameraInfo(height=240, width=320, k=[308.0, 0, 159.5, 0, 308.0, 119.5, 0, 0, 1])
+    infos = client.node.create_publisher(CameraInfo, "/depth/camera_info", 10)
+    client.spin_until(infos.get_subscription_count, "match of the calibration")
+    calibration.header.frame_id = "camera_depth_optical_frame"
+    infos.publish(calibration)
+    for kind in (Image, CompressedImage):
+        client.call(Trigger, "reset")
+        answer = latest(kind, kind.__name__)
+        assert answer.status == GraspArray.SUCCEEDED, answer.message
+        assert answer.header.frame_id == "camera_depth_optical_frame"
+    client.node.destroy_publisher(infos)

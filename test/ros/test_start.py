@@ -5,10 +5,11 @@ from __future__ import annotations
 import ast
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-import rclpy
 from geometry_msgs.msg import Point, Pose
 from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspRequest
@@ -19,7 +20,7 @@ from std_msgs.msg import Header, String
 from graspd_core import load_hand
 from graspd_core.errors import HandError
 from graspd_core.paths import config_dir
-from graspd_ros.node import foreign_rclpy, log_directory
+from graspd_ros.node import foreign_ros, log_directory
 
 LAUNCH = Path(__file__).parents[2] / "graspd_ros" / "launch" / "graspd.launch.py"
 pytestmark = pytest.mark.timeout(300)
@@ -28,11 +29,21 @@ HANDS = {"left": "allegro_left", "right": "allegro_right"}
 FEW = {"num_grasps": 1, "preset": "fast", "deadline": 100.0}
 
 
-def test_an_rclpy_before_the_environments_own_is_told_in_one_line():
-    assert foreign_rclpy(str(rclpy.__file__)) == ""
-    told = foreign_rclpy("/opt/ros/jazzy/lib/python3.12/site-packages/rclpy/__init__.py")
-    assert told.startswith("rclpy is that of /opt/ros/jazzy/lib/python3.12/site-packages, not this environment's")
-    assert "\n" not in told
+@pytest.mark.parametrize("package", ["rclpy", "sensor_msgs"])
+@pytest.mark.parametrize("program", ["graspd_ros.node", "graspd_ros.player"])
+def test_a_ros_before_the_environments_own_is_told_in_one_line(tmp_path, program: str, package: str):
+    assert foreign_ros() == ""
+    # As a sourced ROS of another Python stands there: it is found, and its compiled part cannot be loaded.
+    other = tmp_path / "ros" / "lib" / "python3.12" / "site-packages"
+    (other / package).mkdir(parents=True)
+    (other / package / "__init__.py").write_text("raise ImportError('No module named rclpy._rclpy_pybind11')")
+    environment = {**os.environ, "PYTHONPATH": f"{other}:{os.environ.get('PYTHONPATH', '')}"}
+    done = subprocess.run([sys.executable, "-m", program], env=environment, capture_output=True, text=True)
+    name = {"graspd_ros.node": "graspd_node", "graspd_ros.player": "graspd_play"}[program]
+    told = (
+        f"{name}: {package} is that of {other}, not this environment's: unset PYTHONPATH, or do not source another ROS"
+    )
+    assert (done.returncode, done.stderr.splitlines()) == (2, [told])
 
 
 def test_logs_go_to_another_place_where_the_usual_one_cannot_be_written(tmp_path, monkeypatch: pytest.MonkeyPatch):

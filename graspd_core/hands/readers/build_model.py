@@ -118,7 +118,8 @@ def assemble(
     chain, couplings, mended = _settled(path, [into[link] for link in order[1:]], couplings)
     joint_fields = _actuated([joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings])
     if not joint_fields["joint_names"]:
-        raise HandError(f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp")
+        told = f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp"
+        raise HandError("; ".join([told, *mended]))
     return HandModel(
         name=name,
         urdf=str(path),
@@ -262,7 +263,11 @@ def _settled(
         if follower.kind == "prismatic" and slide > _LONGEST_SLIDE:
             raise _too_long(path, follower.name, slide)
     still = {name: joint.lower for name, joint in leaders.items() if joint.upper - joint.lower < _STILL}
-    warnings += [f"joint {name!r} cannot move: its limits coincide; welded" for name in still]
+    at_zero = " at 0, which is what a <limit> without lower and upper means"
+    warnings += [
+        f"joint {name!r} cannot move: its limits coincide{at_zero if value == 0 else ''}; welded"
+        for name, value in still.items()
+    ]
     left = {name: coupling for name, coupling in couplings.items() if coupling.leader not in still}
     for name in couplings.keys() - left.keys():
         leader, multiplier, offset = couplings[name]

@@ -9,6 +9,8 @@ camera's picture ends is told too: what reaches there may go on, and nobody saw 
 
 from __future__ import annotations
 
+import io
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -43,7 +45,19 @@ SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
 # Most objects are far from the outline, which the hull of so many points shows as well as that of all.
 HULL_POINTS = 2000
 # Encoding: type of a pixel, and metres per unit of it.
-ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
+ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0), "64FC1": ("f8", 1.0)}
+# What a picture of another encoding is asked for instead, by the beginning of its name.
+_REMEDIES = {
+    "8U": "8 bits a pixel hold no depth that can be measured by: publish 16UC1 (millimetres) or 32FC1 (metres)",
+    "mono8": "8 bits a pixel hold no depth that can be measured by: publish 16UC1 (millimetres) or 32FC1 (metres)",
+    "rgb": "it is a colour picture: name the depth image's topic",
+    "bgr": "it is a colour picture: name the depth image's topic",
+}
+# CompressedImage of `compressedDepth`: the format of its inverse depth as int32, then the two numbers of its
+# quantisation as float32. A PNG begins with 8 bytes that are always the same; its sizes follow at byte 16.
+_QUANTISED = struct.Struct("<iff")
+_PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
+_MOST_PIXELS = 2**26
 
 
 @dataclass(frozen=True)
@@ -243,6 +257,62 @@ def depth_from_bytes(
     return depth_in_metres(pixels.astype(dtype.newbyteorder("=")), encoding)
 
 
+def size_of_compressed(data: memoryview) -> tuple[int, int]:
+    """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError: there is none."""
+    at = _png_begins(data) + 16
+    if len(data) < at + _PNG_SIZES.size:
+        raise CloudError(f"depth image: {len(data)} bytes are no whole PNG")
+    width, height = _PNG_SIZES.unpack_from(data, at)
+    if width * height > _MOST_PIXELS:
+        raise CloudError(f"depth image: a PNG of {width} x {height} pixels; at most {_MOST_PIXELS} are read")
+    return width, height
+
+
+def depth_from_compressed(data: memoryview, told: str) -> DepthImage:
+    """Return depth [m] of a sensor_msgs/CompressedImage of `compressedDepth`, or of a plain PNG of 16 bits.
+
+    32FC1 comes as inverse depth v, quantised with two numbers a and b that stand before the PNG: a / (v - b).
+
+    Args:
+        data: the message's bytes.
+        told: its `format`, as "16UC1; compressedDepth png".
+
+    Raises:
+        CloudError: a format that is no depth, or bytes that are not what it says.
+    """
+    from PIL import Image
+
+    encoding = told.partition(";")[0].strip() if ";" in told else "16UC1"
+    kind, unit = _encoding(encoding)
+    size_of_compressed(data)
+    begins = _png_begins(data)
+    try:
+        with Image.open(io.BytesIO(data[begins:])) as picture:
+            mode, pixels = picture.mode, np.asarray(picture)
+    except Exception as error:  # what the library lets through of a spoilt file is of any kind
+        raise CloudError(f"depth image: a broken PNG ({error})") from None
+    if not mode.startswith("I"):
+        raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; one of 16 bits is depth")
+    if kind[0] == "u":
+        return depth_in_metres(pixels.astype(np.uint16), encoding)
+    if not begins:
+        raise CloudError(f"depth image: format {told[:64]!r} without the {_QUANTISED.size} bytes of its quantisation")
+    _, a, b = _QUANTISED.unpack_from(data)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth = unit * np.float32(a) / (pixels.astype(np.float32) - np.float32(b))
+    return depth_in_metres(np.where(pixels > 0, depth, np.float32(0)).astype(np.float32), "32FC1")
+
+
+def _png_begins(data: memoryview) -> int:
+    for at in (_QUANTISED.size, 0):
+        if bytes(data[at : at + len(_PNG)]) == _PNG:
+            return at
+    raise CloudError(
+        "depth image: a CompressedImage without a PNG; valid: compressedDepth of format png (rvl is not read, jpeg is "
+        "no depth)"
+    )
+
+
 def cloud_from_depth(
     depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
@@ -274,5 +344,6 @@ def cloud_from_depth(
 
 def _encoding(name: str) -> tuple[str, float]:
     if name not in ENCODINGS:
-        raise CloudError(f"depth image: encoding {name!r} is no depth; valid: {', '.join(ENCODINGS)}")
+        remedy = next((f"; {said}" for begins, said in _REMEDIES.items() if name.startswith(begins)), "")
+        raise CloudError(f"depth image: encoding {name[:64]!r} is no depth; valid: {', '.join(ENCODINGS)}{remedy}")
     return ENCODINGS[name]

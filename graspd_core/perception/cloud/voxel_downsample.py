@@ -84,7 +84,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
         if len(points) < finite:
             roi = "" if settings.roi_low is None and settings.roi_high is None else " and in the region of interest"
             few = f"only {len(points)} of {finite} points are within {settings.max_range:g} m of the camera{roi}"
-        raise CloudError(f"cloud: {few}; at least {MIN_POINTS} are needed{_unit_hint(views, settings.max_range)}")
+        raise CloudError(f"cloud: {few}; at least {MIN_POINTS} are needed{unit_hint(views, settings.max_range)}")
     voxel, size = _voxels(points, settings.voxel, settings.max_voxels)
     count = np.bincount(voxel)
     mean = np.column_stack([np.bincount(voxel, points[:, axis]) / count for axis in range(3)])
@@ -128,7 +128,7 @@ def _unmeasured(views: Sequence[PointCloud], given: int) -> str:
     return f"cloud: all {given} points are NaN or infinite"
 
 
-def _unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
+def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
     """What unit the points would be near the camera in, if they are not in metres."""
     some = np.concatenate([view.points[:: 1 + len(view.points) // 10_000] - view.viewpoint for view in views])
     away = float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))

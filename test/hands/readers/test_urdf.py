@@ -103,6 +103,12 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
             '<limit lower="0.3" upper="0.3"/></joint></robot>',
             r"joint 'stuck' cannot move: its limits coincide; welded",
         ),
+        (
+            "</robot>",
+            '<link name="x"/><joint name="stuck" type="revolute"><parent link="palm"/><child link="x"/>'
+            '<limit effort="3" velocity="1"/></joint></robot>',
+            r"joint 'stuck' cannot move: its limits coincide at 0, which is what a <limit> without lower and upper",
+        ),
     ],
 )
 def test_what_is_mended_leaves_a_warning(tmp_path: Path, old: str, new: str, warning: str) -> None:
@@ -243,6 +249,11 @@ def test_warnings_of_a_hand_come_with_the_grasps_and_into_the_file(tmp_path: Pat
         ("<collision>", '<inertial><mass value="-1"/></inertial><collision>', "link 'palm' has a negative mass"),
         (HINGE, "", "one root link, this file has 2: palm, finger"),
         (f'<link name="finger">{BOX}</link>{HINGE}', "", r"'tiny' has no joint that moves \(1 links\)"),
+        (
+            '<limit lower="-0.5" upper="1"',
+            "<limit",
+            r"'tiny' has no joint that moves \(2 links\).*; joint 'hinge' cannot move: .* at 0",
+        ),
         ('<child link="finger"/>', '<child link="thumb"/>', "child link 'thumb', which the file does not define"),
         ('xyz="0 1 0"', 'xyz="0 up 0"', "<axis xyz='0 up 0'>: expected 3 finite number"),
         ('size="0.02 0.02 0.04"', 'size="0.02 0 0.04"', "sizes must be positive"),

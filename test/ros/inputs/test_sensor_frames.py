@@ -3,30 +3,41 @@
 from __future__ import annotations
 
 import array
+from typing import Any
 
 import numpy as np
 import pytest
+from bag_writer import packed_depth
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError, TransformError
-from graspd_core.io.messages import camera_from_message, points_from_message
+from graspd_core.io.messages import (
+    camera_from_message,
+    depth_and_camera,
+    depth_from_message,
+    frame_doubt,
+    image_size,
+    points_from_message,
+)
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.sensor_frames import (
+    MOST_CALIBRATIONS,
+    UNPAIRED,
     CameraPlace,
     ImagePairs,
     cloud_frame,
-    depth_and_camera,
+    depth_sensor_frame,
     place_of,
     seen_by_camera,
 )
@@ -37,7 +48,7 @@ OPTICAL, BASE = "camera_depth_optical_frame", "base_link"
 NOW = Time(sec=1000)
 HEIGHT = float(np.ptp(make_shape("bottle").vertices[:, 2]))
 SECOND = 1_000_000_000
-DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
 
 
 def header(stamp: int = 0, frame: str = "camera") -> Header:
@@ -91,40 +102,156 @@ def test_a_rectified_image_has_the_camera_of_p_and_no_distortion():
     assert camera_from_message(calibration(p=[0.0] * 12), rectified=True).fx == 60.0
 
 
-def test_images_and_calibrations_of_one_stamp_find_each_other_in_any_order():
+def packed(depth: np.ndarray, encoding: str = "16UC1", kind: str = "compressedDepth png") -> CompressedImage:
+    """What image_transport sends of a depth image [m], with the 12 bytes of compressedDepth or without."""
+    data = packed_depth(depth, encoding)[0 if "compressedDepth" in kind else 12 :]
+    return CompressedImage(header=header(), format=f"{encoding}; {kind}", data=array.array("B", data))
+
+
+DEPTH = np.random.default_rng(0).integers(300, 4000, (5, 7)) / 1000 * (np.arange(35).reshape(5, 7) % 6 > 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "off"),
+    [
+        (packed(DEPTH), 1e-6),
+        (packed(DEPTH, kind="compressedDepth"), 1e-6),  # as older ones write it
+        (packed(DEPTH, kind="png compressed 16UC1"), 1e-6),
+        (packed(DEPTH, "32FC1"), 8e-4),  # half of a step of the inverse depth is 0.5 z² / 10100, 0.8 mm at 4 m
+        (image(DEPTH, "64FC1"), 1e-9),
+    ],
+)
+def test_depth_comes_packed_too(message, off: float):
+    found, camera = depth_and_camera(message, calibration(7, 5), rectified=True)
+    np.testing.assert_allclose(found, DEPTH, atol=off)
+    assert (found == 0).sum() == (DEPTH == 0).sum()
     pairs = ImagePairs()
-    first, second = image(np.ones((1, 1)), "16UC1", stamp=SECOND), image(np.ones((1, 1)), "16UC1", stamp=2 * SECOND)
+    pairs.add(calibration(7, 5))
+    assert pairs.add(message) is not None
+    read = depth_sensor_frame(message, calibration(7, 5), 0).read()
+    np.testing.assert_allclose(read.points[:, 2], DEPTH[DEPTH > 0], atol=off)
+    assert camera.width == 7
+
+
+@pytest.mark.parametrize(
+    ("message", "culprit"),
+    [
+        (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "without a PNG; valid: compressedDepth"),
+        (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:60]), "a broken PNG"),
+        (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:30]), "no whole PNG"),
+        (
+            CompressedImage(format="rgb8; png compressed bgr8", data=packed(DEPTH).data),
+            "a colour picture: name the depth",
+        ),
+        (CompressedImage(format="32FC1; png", data=packed(DEPTH, kind="png").data), "12 bytes of its quantisation"),
+        (Image(encoding="8UC1", height=1, width=1, step=1, data=bytes(1)), "publish 16UC1 .millimetres. or 32FC1"),
+    ],
+)
+def test_what_holds_no_depth_is_refused_with_what_to_publish(message, culprit: str):
+    with pytest.raises(CloudError, match=culprit):
+        depth_from_message(message)
+
+
+def test_an_image_takes_the_last_calibration_of_its_frame_and_size():
+    now = [0.0]
+    pairs = ImagePairs(lambda: now[0])
+    first, *others = (image(np.ones((48, 64)), "16UC1", stamp=k * SECOND) for k in range(4))
     assert pairs.add(first) is None
-    assert pairs.add(calibration(stamp=2 * SECOND)) is None
-    found = pairs.add(calibration(stamp=SECOND))
-    assert found is not None
-    assert found[0] is first
-    assert found[1].header.stamp.sec == 1
-    found = pairs.add(second)
-    assert found is not None
-    assert (found[0], found[1].header.stamp.sec) == (second, 2)
+    # Other cameras' calibrations are not taken, and theirs stay theirs.
+    assert pairs.add(calibration(32, 24)) is None
+    other = calibration()
+    other.header.frame_id = "elsewhere"
+    assert pairs.add(other) is None
+    assert pairs.doubt() == ""
+    now[0] = UNPAIRED
+    assert pairs.doubt() == (
+        "depth images: 1 and 2 CameraInfos came, and none of them pairs; the last image is 64 x 48 in 'camera', "
+        "a CameraInfo of its frame and size is needed, and the last one is 64 x 48 in 'elsewhere'"
+    )
+    # Once, without a stamp, and long before or after: it holds for all images.
+    own = calibration(stamp=0)
+    assert pairs.add(own) == (first, own)
+    assert pairs.doubt() == ""
+    for later in others:
+        assert pairs.add(later) == (later, own)
+    # A newer one takes its place, whatever its stamp.
+    newer = calibration(stamp=30_000_000)
+    assert pairs.add(newer) is None
+    assert pairs.add(first) == (first, newer)
 
 
-def test_stamps_pair_within_the_slop_only():
-    pairs = ImagePairs(slop=0.01)
-    assert pairs.add(calibration(stamp=SECOND)) is None
-    assert pairs.add(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_001)) is None
-    assert pairs.add(image(np.ones((1, 1)), "16UC1", stamp=SECOND + 10_000_000)) is not None
+def test_images_without_any_calibration_are_counted():
+    now = [0.0]
+    pairs = ImagePairs(lambda: now[0])
+    for _ in range(200):
+        assert pairs.add(image(np.ones((48, 64)), "16UC1")) is None
+        now[0] += 0.2
+    assert pairs.doubt().startswith("depth images: 200 and 0 CameraInfos came")
+    assert pairs.doubt().endswith("and none has come")
+    # Of binned and cropped images the size counts that they are sent with; one without a frame is of any.
+    binned = calibration(128, 96, binning_x=2, binning_y=2)
+    binned.header.frame_id = ""
+    assert pairs.add(binned) is not None
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=80))
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 20)), max_size=80))
 def test_memory_is_bounded_and_no_image_is_given_out_twice(arrivals: list[tuple[bool, int]]):
-    pairs = ImagePairs(slop=0.001, capacity=3)
-    given_out: list[Image] = []
-    for is_image, tick in arrivals:
-        stamp = tick * SECOND // 30
-        message = image(np.ones((1, 1)), "16UC1", stamp=stamp) if is_image else calibration(1, 1, stamp=stamp)
+    pairs = ImagePairs()
+    given_out: list[Any] = []
+    for is_image, width in arrivals:
+        message = image(np.ones((1, width + 1)), "16UC1") if is_image else calibration(width + 1, 1)
         pair = pairs.add(message)
-        assert len(pairs) <= 6
+        assert len(pairs._infos) <= MOST_CALIBRATIONS
         if pair is not None:
-            assert pair[0].header.stamp == pair[1].header.stamp
+            assert image_size(pair[0]) == image_size(pair[1])
             assert not any(pair[0] is image for image in given_out)
             given_out.append(pair[0])
+
+
+def test_a_cloud_without_a_frame_or_with_a_stamp_of_another_clock_is_refused(scene):
+    grid, _, T = scene
+    taker, cloud = builder(T), message(grid, "", True)
+    with pytest.raises(RequestError, match=r"the cloud names no frame: its header.frame_id is empty") as refused:
+        taker.from_message("r", Settings(), GraspRequest(cloud=cloud))
+    assert refused.value.code is ErrorCode.BAD_CLOUD
+    cloud.header = Header(frame_id=OPTICAL, stamp=Time(sec=NOW.sec + 60))
+    with pytest.raises(RequestError, match=r"has a stamp 60.0 s in the future, more than cloud_max_age=5 s") as refused:
+        taker.from_message("r", Settings(), GraspRequest(cloud=cloud))
+    assert refused.value.code is ErrorCode.STALE_CLOUD
+    cloud.header.stamp.sec = NOW.sec + 2
+    (told, *_) = taker.from_message("r", Settings(), GraspRequest(cloud=cloud)).load().object.warnings
+    assert told == "the cloud came 2.0 s before its stamp: its clock is ahead of the node's"
+    cloud.header.stamp = NOW
+    assert "clock" not in str(taker.from_message("r", Settings(), GraspRequest(cloud=cloud)).load().object.warnings)
+
+
+def test_data_that_contradicts_the_name_of_its_frame_is_told(scene):
+    grid, _, T = scene
+    body = grid[..., [2, 0, 1]] * [1, -1, -1]  # x forward, y left, z up
+    doubted = "which by its name looks along"
+    for points, frame, told in (
+        (grid, OPTICAL, False), (grid, "camera", False), (grid, "camera_link", True),
+        (grid, "camera_depth_frame", True), (body, "camera_link", False), (body, OPTICAL, True),
+    ):  # fmt: skip
+        asked = GraspRequest(cloud=message(points, frame, True))
+        warnings = builder(T).from_message("r", Settings(cloud_max_age=0.0), asked).load().object.warnings
+        assert (doubted in str(warnings)) is told, frame
+    assert frame_doubt("camera_link", body.reshape(-1, 3)) == ""
+
+
+def test_a_workspace_without_a_point_says_where_they_are_and_names_the_unit(scene):
+    grid, _, T = scene
+    taker = builder(T)
+    asked = GraspRequest(cloud=message(1000 * grid, OPTICAL, False))
+    with pytest.raises(
+        RequestError, match=r"none of .* lies in the workspace.* if they are in millimetres, divide"
+    ) as no:
+        taker.from_message("r", Settings(cloud_max_age=0.0), asked).load()
+    assert "they lie from [" in str(no.value)
+    asked = GraspRequest(cloud=message(grid, OPTICAL, True), target_mask=mask_of(np.isfinite(grid[..., 0])))
+    behind = Settings(cloud_max_age=0.0, roi_max=[10.0, 10.0, 0.0])
+    with pytest.raises(RequestError, match=r"roi_max=\[10.0, 10.0, 0.0\], they lie from"):
+        taker.from_message("r", behind, asked).load()
 
 
 def encode(points: np.ndarray, order: str, formats: list[str], offsets: list[int], step: int, row_padding: int):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from moveit_msgs.msg import Grasp as MoveItGrasp
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from graspd_core.errors import ConfigError
@@ -76,10 +78,34 @@ def test_the_pose_is_that_of_the_arms_last_link():
     np.testing.assert_allclose(matrix_of_pose(back), matrix_of_pose(message().grasp_pose), atol=1e-12)
 
 
+def test_a_hand_that_closes_late_waits_where_the_grasp_says():
+    ours = message()
+    joints = np.linspace(HAND.lower, HAND.upper, 3)[1]
+    ours.arrival_pose, ours.mount_link = deepcopy(ours.grasp_pose), "tool0"
+    ours.arrival_pose.position.z = 0.221
+    ours.mount_grasp_pose = pose_of_matrix(matrix_of_pose(ours.grasp_pose) @ pose_matrix_of(0.0, 0.0, -0.1))
+    # All movable joints, in whatever order: those of the trajectory are picked by name.
+    ours.arrival_joints = JointState(name=list(HAND.joint_names)[::-1], position=joints[::-1].tolist())
+    theirs: Any = moveit_grasp(ours, **UP, touch=("can",))
+    np.testing.assert_allclose(theirs.pre_grasp_posture.points[0].positions, joints)
+    assert list(theirs.grasp_posture.points[-1].positions) == list(ours.trajectory.points[-1].positions)
+    waits = matrix_of_pose(ours.arrival_pose) @ pose_matrix_of(0.0, 0.0, -0.1)
+    np.testing.assert_allclose(matrix_of_pose(theirs.grasp_pose.pose), waits, atol=1e-12)
+    assert theirs.pre_grasp_approach.desired_distance == pytest.approx(0.079)
+    assert list(theirs.allowed_touch_objects) == ["can"]
+
+
+def pose_matrix_of(*place: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = place
+    return T
+
+
 def test_the_pose_of_a_mounted_hand_is_that_of_the_link_that_carries_it():
     ours = message()
     ours.mount_link, ours.mount_grasp_pose = "tool0", Pose(position=Point(z=0.4))
-    assert moveit_grasp(ours, **UP).grasp_pose.pose == ours.mount_grasp_pose
+    pose = moveit_grasp(ours, **UP).grasp_pose.pose
+    np.testing.assert_allclose(matrix_of_pose(pose), matrix_of_pose(ours.mount_grasp_pose), atol=1e-12)
     # What is said here counts for more.
     theirs = moveit_grasp(ours, **UP, T_parent_base=np.eye(4))
     np.testing.assert_allclose(matrix_of_pose(theirs.grasp_pose.pose), matrix_of_pose(ours.grasp_pose), atol=1e-12)

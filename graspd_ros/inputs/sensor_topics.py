@@ -1,0 +1,129 @@
+"""Topics of sensors: heard with the quality of service that their publishers offer, and watched for what is lost.
+
+rmw's own BEST_AVAILABLE decides once, when the subscription is made. A camera that starts later would be asked for what
+it does not offer, and nothing would come. Here the choice is made again as publishers come and go.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+DEPTH = 5
+SILENCE = 5.0  # seconds that a publisher may be there without a message before that is told
+REPEAT = 10.0  # seconds between two lines about messages that were lost
+REMEDY = (
+    "large messages get lost in Fast DDS' shared memory of 512 KB; start both processes with "
+    "FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds.xml, or have the sensor publish reliably (docs/ros.md, Large clouds)"
+)
+
+
+class SensorTopic:
+    """One topic of a sensor. Used by the executor's thread only.
+
+    Args:
+        node: hears the topic, and logs what is lost.
+        kind: type of its messages.
+        name: of the topic, before remapping.
+        callback: takes each message.
+        instead_of: a topic that is heard rather than this one where anybody publishes it. Where this one's name is not
+            remapped, it has the other's with `ending` behind it.
+        ending: see above.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: Any,
+        name: str,
+        callback: Callable[[Any], None],
+        *,
+        instead_of: SensorTopic | None = None,
+        ending: str = "",
+    ) -> None:
+        self._node, self._kind, self._callback, self._instead_of = node, kind, callback, instead_of
+        self.name = node.resolve_topic_name(name)
+        if instead_of is not None and self.name == node.resolve_topic_name(name, only_expand=True):
+            self.name = instead_of.name + ending
+        self._received = self._lost = 0
+        self._silent_since = self._told = -float("inf")
+        self._subscription: Subscription | None = None
+        self._qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        # What somebody asks for is left as it is; rclpy keeps it in no public place.
+        self._fixed = f"qos_overrides.{self.name}.subscription.reliability" in getattr(node, "_parameter_overrides", {})
+        if instead_of is None:
+            self._listen(QoSOverridingOptions.with_default_policies())
+
+    def publishers(self) -> list[Any]:
+        """Return what is known of those who publish messages of its type."""
+        kind = f"{self._kind.__module__.partition('.')[0]}/msg/{self._kind.__name__}"
+        return [info for info in self._node.get_publishers_info_by_topic(self.name) if info.topic_type == kind]
+
+    def check(self) -> str:
+        """Ask for what is offered now; return what does not arrive, empty if all does. To be called once a second."""
+        publishers = self.publishers()
+        if self._instead_of is not None and (not publishers or self._instead_of.publishers()):
+            self._stop()
+            return ""
+        self._follow(publishers)
+        if not publishers:
+            self._silent_since = -float("inf")
+            return self._other_types()
+        if self._received:
+            return ""
+        if self._silent_since < 0:
+            self._silent_since = time.monotonic()
+        silent = time.monotonic() - self._silent_since
+        lost = f"{self._lost} messages were lost on the way: {REMEDY}" if self._lost else "nothing has come"
+        return f"{self.name}: somebody publishes for {silent:.0f} s, and {lost}" if silent >= SILENCE else ""
+
+    def _other_types(self) -> str:
+        types = {info.topic_type for info in self._node.get_publishers_info_by_topic(self.name)}
+        heard = f"this node hears {self._kind.__name__}"
+        return f"{self.name}: somebody publishes {', '.join(sorted(types))}, {heard}" if types else ""
+
+    def _follow(self, publishers: list[Any]) -> None:
+        offers = [info.qos_profile for info in publishers]
+        reliable = bool(offers) and all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+        kept = reliable and all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+        wanted = QoSProfile(
+            depth=self._qos.depth,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+        )
+        same = (wanted.reliability, wanted.durability) == (self._qos.reliability, self._qos.durability)
+        if self._subscription is None or (offers and not same and not self._fixed):
+            self._stop()
+            self._qos = wanted
+            self._listen()
+
+    def _listen(self, overrides: QoSOverridingOptions | None = None) -> None:
+        lost = SubscriptionEventCallbacks(message_lost=lambda status: self._on_lost(status.total_count_change))
+        self._subscription = self._node.create_subscription(
+            self._kind, self.name, self._take, self._qos, event_callbacks=lost, qos_overriding_options=overrides
+        )
+
+    def _stop(self) -> None:
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _take(self, message: Any) -> None:
+        self._received += 1
+        self._callback(message)
+
+    def _on_lost(self, count: int) -> None:
+        self._lost += count
+        if time.monotonic() - self._told >= REPEAT:
+            self._told = time.monotonic()
+            of = self._lost + self._received
+            self._node.get_logger().warning(
+                f"{self.name}: {self._lost} of {of} messages were lost on the way: {REMEDY}"
+            )

@@ -1,0 +1,183 @@
+"""Topics of sensors over DDS, from processes of their own: large clouds, what is offered, what is lost or missing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+
+from graspd_ros.inputs import sensor_topics
+from graspd_ros.inputs.sensor_topics import SensorTopic
+
+pytestmark = pytest.mark.timeout(300)
+LARGE = 1_200_000  # bytes of a cloud that Fast DDS' shared memory of 512 KB does not hold
+
+# Publishes so many messages of so many bytes, when somebody asks with the reliability that it is told to wait for.
+PUBLISHER = """
+import sys, time, rclpy
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs import msg
+
+kind, topic, reliability, durability, asked, count, size = sys.argv[1:8]
+rclpy.init(args=[])
+node = rclpy.create_node("camera")
+qos = QoSProfile(depth=20, reliability=ReliabilityPolicy[reliability], durability=DurabilityPolicy[durability])
+publisher = node.create_publisher(getattr(msg, kind), topic, qos)
+heard = lambda: {info.qos_profile.reliability.name for info in node.get_subscriptions_info_by_topic(topic)}
+while asked != "NOBODY" and asked not in heard():
+    time.sleep(0.02)
+time.sleep(0.5)  # the match follows the news of it
+message = getattr(msg, kind)()
+for number in range(int(count)):
+    message.header.stamp.sec = number
+    if kind != "CameraInfo":
+        message.data = bytes(int(size))
+    publisher.publish(message)
+    time.sleep(0.05)
+publisher.wait_for_all_acked(Duration(seconds=100))
+print("sent", flush=True)
+sys.stdin.read()
+"""
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Node]:
+    """A node with the shared memory that Fast DDS has by itself."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+    context = Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node("topics", context=context, use_global_arguments=False)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def publish(node: Node, domain: int) -> Iterator[Start]:
+    started: list[subprocess.Popen[str]] = []
+
+    def start(kind: str, topic: str, reliability: str, **more: Any) -> subprocess.Popen[str]:
+        options = {"durability": "VOLATILE", "asked": reliability, "count": 1, "size": 100} | more
+        arguments = [kind, topic, reliability, *map(str, options.values())]
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        process = subprocess.Popen(
+            [sys.executable, "-c", PUBLISHER, *arguments],
+            env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.communicate()
+
+
+def watch(node: Node, topics: list[SensorTopic], until: Callable[[list[str]], Any]) -> list[str]:
+    """Spin and check, as the node does, until what the topics say is as wanted."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    while not until(told := [topic.check() for topic in topics]):
+        executor.spin_once(timeout_sec=0.05)
+    executor.shutdown()
+    return told
+
+
+def test_large_clouds_of_a_reliable_publisher_all_come(node: Node, publish: Start):
+    heard: list[PointCloud2] = []
+    topic = SensorTopic(node, PointCloud2, "points", heard.append)
+    publish("PointCloud2", "/points", "RELIABLE", count=20, size=LARGE)
+    watch(node, [topic], lambda told: len(heard) == 20)
+    assert [cloud.header.stamp.sec for cloud in heard] == list(range(20))
+    assert all(len(cloud.data) == LARGE for cloud in heard)
+
+
+def test_a_camera_that_offers_less_is_heard_too_and_its_losses_are_told(
+    node: Node, publish: Start, capfd: pytest.CaptureFixture[str]
+):
+    heard: list[PointCloud2] = []
+    topic = SensorTopic(node, PointCloud2, "points", heard.append)
+    publish("PointCloud2", "/points", "BEST_EFFORT", count=3)
+    watch(node, [topic], lambda told: heard)
+    publish("PointCloud2", "/points", "BEST_EFFORT", count=40, size=8 * LARGE)
+    watch(node, [topic], lambda told: topic._lost)
+    written = "".join(capfd.readouterr())
+    assert "/points: " in written
+    assert "were lost on the way: large messages get lost" in written
+    assert "config/fastdds.xml" in written
+
+
+def test_what_was_published_before_is_heard_where_it_is_kept(node: Node, publish: Start):
+    camera = publish("CameraInfo", "/depth/camera_info", "RELIABLE", durability="TRANSIENT_LOCAL", asked="NOBODY")
+    assert camera.stdout is not None
+    assert camera.stdout.readline() == "sent\n"
+    heard: list[CameraInfo] = []
+    topic = SensorTopic(node, CameraInfo, "depth/camera_info", heard.append)
+    watch(node, [topic], lambda told: heard)
+    assert topic._qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
+
+
+def test_what_somebody_asks_for_by_a_parameter_stays(monkeypatch, domain: int, publish: Start):
+    context = Context()
+    key = "qos_overrides./points.subscription.reliability:=best_effort"
+    rclpy.init(args=["--ros-args", "-p", key], context=context, domain_id=domain)
+    node = rclpy.create_node("topics", context=context)
+    heard: list[PointCloud2] = []
+    topic = SensorTopic(node, PointCloud2, "points", heard.append)
+    publish("PointCloud2", "/points", "RELIABLE", asked="BEST_EFFORT", count=5)
+    watch(node, [topic], lambda told: heard)
+    assert topic._qos.reliability is ReliabilityPolicy.BEST_EFFORT
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_packed_images_are_heard_where_nobody_sends_plain_ones(node: Node, publish: Start):
+    heard: list[Any] = []
+    plain = SensorTopic(node, Image, "depth/image_rect", heard.append)
+    packed = SensorTopic(
+        node,
+        CompressedImage,
+        "depth/image_rect/compressedDepth",
+        heard.append,
+        instead_of=plain,
+        ending="/compressedDepth",
+    )
+    publish("CompressedImage", "/depth/image_rect/compressedDepth", "RELIABLE", count=3)
+    watch(node, [plain, packed], lambda told: len(heard) == 3)
+    assert all(isinstance(message, CompressedImage) for message in heard)
+    heard.clear()
+    publish("Image", "/depth/image_rect", "RELIABLE", count=3)
+    watch(node, [plain, packed], lambda told: len(heard) == 3)
+    publish("CompressedImage", "/depth/image_rect/compressedDepth", "RELIABLE", asked="NOBODY", count=3)
+    assert all(isinstance(message, Image) for message in heard)
+    assert packed._subscription is None
+
+
+def test_a_publisher_that_sends_nothing_or_another_type_is_told(
+    node: Node, publish: Start, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sensor_topics, "SILENCE", 0.3)
+    clouds, images = (
+        SensorTopic(node, kind, name, lambda message: None)
+        for kind, name in ((PointCloud2, "points"), (Image, "depth/image_rect"))
+    )
+    assert [clouds.check(), images.check()] == ["", ""]
+    publish("PointCloud2", "/points", "BEST_EFFORT", count=0)
+    publish("CompressedImage", "/depth/image_rect", "BEST_EFFORT", count=0, asked="NOBODY")
+    silent, other = watch(node, [clouds, images], all)
+    assert silent.startswith("/points: somebody publishes for ")
+    assert silent.endswith("and nothing has come")
+    assert other == "/depth/image_rect: somebody publishes sensor_msgs/msg/CompressedImage, this node hears Image"
