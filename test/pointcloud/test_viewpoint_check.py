@@ -95,8 +95,17 @@ def test_a_cloud_that_many_places_fit_is_doubted_unless_its_pixels_tell():
     rng = np.random.default_rng(0)
     plate = np.c_[rng.uniform(-0.06, 0.06, (4000, 2)), rng.normal(0.0, 0.0005, 4000)]
     cloud = PointCloud(plate, np.array([0.1, 0.0, 0.5]))
-    assert "of all places for the camera fit the cloud as well as (0.1, 0, 0.5)" in check_thing(cloud, cloud)
+    up = np.array([0.0, 0.0, 1.0])
+    assert "of all places for the camera fit the cloud as well as (0.1, 0, 0.5)" in check_thing(cloud, cloud, up)
     assert check_thing(cloud, replace(cloud, posed=True)) == ""
+
+
+def test_a_thing_without_its_table_is_doubted_from_right_behind():
+    _, points, place = seen("cylinder", 0.8)
+    thing = points[(np.abs(points[:, :2]) < 0.06).all(1) & (points[:, 2] > 0.008)]
+    assert check_thing(PointCloud(thing, place), PointCloud(thing, place)) == ""
+    mirrored = PointCloud(thing, 2 * thing.mean(0) - place)
+    assert "the object is hollow, or seen from the back of its surface" in check_thing(mirrored, mirrored)
 
 
 def test_numbers_of_32_and_of_64_bits_are_the_same_scene():

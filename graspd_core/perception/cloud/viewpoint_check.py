@@ -46,6 +46,8 @@ ABOUT_THING = 0.12  # [m]
 # Places on other sides of the thing are tried too. Nothing speaks for the one that is said where this share of them
 # fits as well: the true place has 0.2 in nine of ten clouds of scenes, and 0.34 of cut-out things.
 OTHER_SIDE, MOST_CHANCE = float(np.cos(np.pi / 4)), 0.3
+# A thing without its table looks the same from right behind it, but hollow. Few things bulge less than this.
+LEAST_BULGE = 0.05
 # A plane that holds this share of the points is a table; things on it are no farther from it than that [m].
 PLANE_SHARE, PLANE_TRIALS, PLANE_TOLERANCE, THING_HEIGHT = 0.25, 200, 0.01, 0.35
 # Root mean square of a table seen by a camera [m]; points all through the slab would have 0.0058.
@@ -129,6 +131,8 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
         raise _refusal(view.viewpoint, f"{100 * away:.0f} % of the object would be seen from behind")
     if hidden > MAX_HIDDEN_SHARE:
         raise _refusal(view.viewpoint, f"{100 * hidden:.1f} % of what is about the object is hidden from there")
+    if up is None and bulge(own, surfaces, view.viewpoint) < LEAST_BULGE:
+        return f"from {_said(view.viewpoint)} the object is hollow, or seen from the back of its surface"
     middle = own.mean(0)
     far = float(np.linalg.norm(view.viewpoint - middle))
     said = (view.viewpoint - middle) / far
@@ -194,6 +198,14 @@ def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
     sides = [np.bincount(surface[clear], one[clear].astype(float)) for one in (cosine > GRAZING, cosine < -GRAZING)]
     return float(np.minimum(*sides).sum() / max(int(clear.sum()), 1))
+
+
+def bulge(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
+    """Return how far a surface bulges towards the viewpoint, from -1 (a hollow) to 1."""
+    normal, _, clear = surfaces
+    offset = points[clear] - points[clear].mean(0)
+    facing = normal[clear] * np.sign((normal[clear] * (viewpoint - points[clear])).sum(1))[:, None]
+    return float((offset * facing).sum() / max(float(np.linalg.norm(offset, axis=1).sum()), 1e-12))
 
 
 def _surfaces(points: Points) -> Surfaces:
