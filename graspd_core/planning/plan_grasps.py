@@ -177,6 +177,8 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
     if told or result.outcome is not Outcome.TOO_FEW:
         return told
+    if bare := sum(not grasp.trials and not grasp.contacts for grasp in result.grasps):
+        return f"{bare} of {len(result.grasps)} untried candidates touch the object nowhere"
     told = why_trials_failed(scene, result.grasps)
     if found.good or found.context is None:
         return told

@@ -30,7 +30,7 @@ def tilted(normals: np.ndarray, angle: float, seed: int = 0) -> np.ndarray:
 
 
 def test_on_a_cylinder_normals_are_radial():
-    """Of a wall of 64 flat sides none is more than 2.8 degrees off, and within 0.3 mm of the next side that one counts."""
+    """Of a wall of 64 flat sides none is more than 2.8 degrees off. Within 0.3 mm of the next side that one counts."""
     solid = trimesh.creation.cylinder(radius=0.03, height=0.1, sections=64)
     surface = make_surface(TriangleMesh(np.asarray(solid.vertices), np.asarray(solid.faces)))
     angle = np.linspace(0, 6, 40)
