@@ -75,12 +75,13 @@ def run(options: argparse.Namespace) -> int:
 
 def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
     """The grasps of one object as a run gives back its own, verified ones first."""
+    from graspd_core.planning.plan_grasps import on_surface
     from graspd_core.verify.run_clock import result_of
     from graspd_core.verify.verification import verify_grasps
     from graspd_dataset.complete_grasps import complete_grasps
 
     completed = complete_grasps(scene, hand, imported, config)
-    grasps = completed.grasps
+    grasps = on_surface(scene, completed.grasps)
     if verify != "none":
         tried = verify_grasps(scene, hand, grasps, verify=verify)
         grasps = tuple(sorted(tried, key=lambda grasp: grasp.verdict is not Verdict.VERIFIED))

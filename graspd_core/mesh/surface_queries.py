@@ -162,6 +162,37 @@ def closest_points(
     return np.where(found[:, None], closest, np.nan), np.where(found[:, None], normals, np.nan)
 
 
+# How far about a point the faces lie that its normal may be of [m]: the two of an edge, the many of a rounding.
+_ABOUT = 3e-4
+# Directions in which they are looked for: to the corners and the middles of the faces of a cube.
+_AROUND = np.array(
+    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) != 2]
+)
+_AROUND = _AROUND[np.abs(_AROUND).any(1)] / np.linalg.norm(_AROUND[np.abs(_AROUND).any(1)], axis=1, keepdims=True)
+
+
+def pressed_points(
+    surface: Surface, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """The surface points next to `points` [m], and outward unit normals of the surface there, as near to `normals` as
+    can be.
+
+    On a face this is the face's own normal. On an edge or a corner every direction between those of its faces is one.
+    """
+    from scipy.optimize import nnls
+
+    closest, own = closest_points(surface, points)
+    around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]
+    found = np.array(own)
+    for row, faces in enumerate(around.reshape(len(points), -1, 3)):
+        between = np.vstack([own[row], faces]).T
+        nearest = between @ nnls(between, normals[row])[0]
+        length = np.linalg.norm(nearest)
+        if length > 1e-6:
+            found[row] = nearest / length
+    return closest, found
+
+
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:

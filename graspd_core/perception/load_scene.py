@@ -14,7 +14,13 @@ from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.perception.cloud.cloud_files import (
+    CLOUD_ENDINGS,
+    RECORDINGS,
+    is_cloud_file,
+    load_views,
+    recording_told,
+)
 from graspd_core.perception.cloud.depth_files import is_depth_image, load_depth_view
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import Scene, build_scene, refuse_numbers
@@ -101,6 +107,8 @@ def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[Triangl
         shape = make_shape(name.removeprefix(SHAPE_PREFIX))
         return TriangleMesh(shape.vertices * scale, shape.faces), ()
     endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
+    if Path(source).suffix.lower().lstrip(".") in RECORDINGS:
+        raise MeshError(f"{name}: {recording_told(Path(source))}")
     if Path(source).is_file() and Path(source).suffix.lower().lstrip(".") not in endings:
         raise MeshError(f"{name}: unknown ending {Path(source).suffix!r}; valid endings: {', '.join(endings)}")
     return read_mesh(source, scale=scale)

@@ -19,6 +19,7 @@ from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF, grid_layout
 from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.surface_queries import make_surface, pressed_points
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
 from graspd_core.perception.cloud.point_cloud import PointCloud
@@ -26,7 +27,18 @@ from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_
 from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.runtime.worker_process import start_planning_worker
-from graspd_core.types import Grasp, GraspResult, Outcome, ProgressHook, Stage, StopHook, Timing, Verdict, WatchHook
+from graspd_core.types import (
+    Contact,
+    Grasp,
+    GraspResult,
+    Outcome,
+    ProgressHook,
+    Stage,
+    StopHook,
+    Timing,
+    Verdict,
+    WatchHook,
+)
 from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
 from graspd_core.verify.verification import greatest_payload, rank_by_robustness, trials_ahead
@@ -108,7 +120,7 @@ def plan_grasps(
     ahead = trials_ahead(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
     found = run_rounds(run, scene, hand, rounds, ahead, bound.moved(run.origin), measure=measure, **request)
     result = result_of(
-        [moved_grasp(grasp, run.origin) for grasp in _ranked(run, found, config, seed)],
+        [moved_grasp(grasp, run.origin) for grasp in on_surface(scene, _ranked(run, found, config, seed))],
         count,
         method=config.method,
         seed=seed,
@@ -143,6 +155,17 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
     return rank_by_robustness(run, found.context, found.grasps, config.robust, seed)
 
 
+def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
+    """The grasps with contacts on the object's mesh: where they lie, and its normals there. A search has its grid's."""
+    contacts = [contact for grasp in grasps for contact in grasp.contacts]
+    if not contacts:
+        return tuple(grasps)
+    rows = (np.array([getattr(contact, key) for contact in contacts]) for key in ("position", "normal"))
+    places, normals = (part.tolist() for part in pressed_points(make_surface(scene.object.mesh), *rows))
+    exact = iter([Contact(c.link, tuple(p), tuple(n)) for c, p, n in zip(contacts, places, normals, strict=True)])
+    return tuple(replace(grasp, contacts=tuple(next(exact) for _ in grasp.contacts)) for grasp in grasps)
+
+
 def _lifted_less(scene: Scene, mass: float | None) -> tuple[str, ...]:
     if mass is None:
         return ()
@@ -154,6 +177,8 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
     if told or result.outcome is not Outcome.TOO_FEW:
         return told
+    if bare := sum(not grasp.trials and not grasp.contacts for grasp in result.grasps):
+        return f"{bare} of {len(result.grasps)} untried candidates touch the object nowhere"
     told = why_trials_failed(scene, result.grasps)
     if found.good or found.context is None:
         return told

@@ -321,3 +321,13 @@ def test_what_is_no_bag_is_named(tmp_path, make, culprit):
         bag_topics(tmp_path / "bag")
     assert culprit in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_bag_of_ros_1_is_named_by_every_command_with_what_converts_it(tmp_path, capsys):
+    from graspd_core.cli import main
+
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    for words in (["replay"], ["synthesize"], ["reconstruct", "--out", str(tmp_path / "m.ply")]):
+        assert main([words[0], str(tmp_path / "old.bag"), *words[1:]]) == 2
+        told = "old.bag: is a bag of ROS 1; convert it first: rosbags-convert --src old.bag --dst old"
+        assert told in capsys.readouterr().err

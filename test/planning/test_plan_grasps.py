@@ -11,13 +11,12 @@ import pytest
 
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
-from graspd_core.optimize.plan_config import load_preset
+from graspd_core.optimize.plan_config import load_preset, override
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 from graspd_core.verify import verification
-from graspd_core.verify.run_clock import result_of
 from graspd_core.verify.trial_registry import TRIALS
 
 # A search that nobody waits for.
@@ -247,11 +246,14 @@ def test_a_wrong_request_is_refused(scene, hand, wrong: dict, culprit: str):
     assert culprit in str(caught.value)
 
 
-def test_a_grasp_that_touches_nothing_is_none_where_no_trial_is_asked_for(scene, hand):
-    """Hands that stay where they are drawn, off the object: none is what was asked for."""
-    found = plan_grasps(scene, hand, count=4, preset="fast", verify="none", measure=False).grasps
-    assert all(grasp.usable and grasp.contacts for grasp in found)
-    off = replace(found[0], contacts=())
-    assert not off.usable
-    result = result_of([*found, off], len(found) + 1, method="closed_form")
-    assert result.outcome is Outcome.TOO_FEW
+def test_a_candidate_that_touches_nothing_is_no_grasp_where_no_trial_is_asked_for(scene, hand):
+    """A search of three steps leaves some hands off the object. They do not count, and the answer says so."""
+    steps = {f"closed_form.{stage}_steps": 1 for stage in ("explore", "refine", "polish")}
+    config = override(load_preset("fast"), {"rounds.most": 1, **steps})
+    result = plan_grasps(scene, hand, count=16, preset=config, verify="none", measure=False)
+    off = [grasp for grasp in result.grasps if not grasp.contacts]
+    assert off
+    assert not any(grasp.usable for grasp in off)
+    assert all(grasp.usable for grasp in result.grasps if grasp.contacts)
+    told = f"{len(off)} of {len(result.grasps)} untried candidates touch the object nowhere"
+    assert (result.outcome, result.message) == (Outcome.TOO_FEW, told)

@@ -28,6 +28,7 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
+RECORDINGS = ("mcap", "db3", "bag")
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
 _ROTATION_TOLERANCE = 1e-4
@@ -202,6 +203,8 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
         raise CloudError(f"{path}: is a directory; give a cloud file ({', '.join(CLOUD_ENDINGS)})")
     if not path.exists():
         raise CloudError(f"{path}: no such cloud file")
+    if ending in RECORDINGS:
+        raise CloudError(f"{path}: {recording_told(path)}")
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
     if ending not in ("npy", "npz"):
@@ -221,6 +224,13 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
         raise CloudError(f"{path}: {error}") from None
 
 
+def recording_told(path: Path) -> str:
+    """What a recording is, and the command that reads it."""
+    if path.suffix.lower() != ".bag":
+        return f"is a recording of ROS 2: graspd replay {path.name}"
+    return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"
+
+
 def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> PointCloud:
     if "points" not in arrays:
         raise CloudError(f"holds no array called 'points', 'depth' or 'depths'; it has: {', '.join(arrays) or 'none'}")
@@ -229,6 +239,9 @@ def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> Point
     viewpoint = viewpoint if said is None else said
     forward = _numbers(arrays, "forward") if "forward" in arrays else None
     pixels = points if points.ndim == 3 else points[None]
+    if points.ndim == 2 and points.shape[1] in (4, 6, 7):
+        told = "colours or normals" if points.shape[1] > 4 else "an intensity"
+        raise CloudError(f"shape {points.shape}: {told} beside x, y, z? save the coordinates alone: points[:, :3]")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or viewpoint.shape != (3,):
         raise CloudError(f"shape {points.shape}, viewpoint {viewpoint.shape}; points × 3 and 3 are needed")
     if not np.isfinite(viewpoint).all():
@@ -313,7 +326,12 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
     # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals;
     # one whose header promises more than there is as a lack of memory.
     except Exception as error:
-        raise CloudError(f"{path}: not readable as numbers ({_first_line(error)})") from error
+        told = _first_line(error)
+        if "allow_pickle" in told:
+            told = (
+                "it holds a pickled object of Python, a dictionary say, which is not run: np.savez(path, points=points)"
+            )
+        raise CloudError(f"{path}: not readable as numbers ({told})") from error
 
 
 def _ply_has_faces(path: Path) -> bool:
@@ -356,9 +374,16 @@ def _read_points(path: Path, ending: str) -> Points:
     except (ValueError, TypeError, OSError) as error:
         raise CloudError(f"{path}: not a readable {ending} cloud ({_first_line(error)})") from error
     points = _read_open3d(path) if points is None else points
+    if len(points) == 0 and ending == "xyz" and _has_commas(path):
+        raise CloudError(f"{path}: its numbers are separated by commas; an xyz file has blanks: tr , ' '")
     if len(points) == 0:
         raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
     return points
+
+
+def _has_commas(path: Path) -> bool:
+    with path.open("rb") as file:
+        return b"," in file.read(4096)
 
 
 def _read_open3d(path: Path) -> Points:
