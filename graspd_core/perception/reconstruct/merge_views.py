@@ -11,7 +11,6 @@ rendered views, Open3D's on a grid of 2 mm gave surfaces of Chamfer 0.82 mm inst
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,10 +31,11 @@ MIN_VIEW_COSINE = 0.1
 MAX_RISE_CELLS = 4.0
 LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
 
-# Neighbours for a normal, and for passing its sense on.
-NORMAL_NEIGHBOURS, ORIENTATION_NEIGHBOURS = 24, 16
-# Points that are too regular for that are moved by up to this many steps.
-JITTER_STEPS = 0.02
+# Of an all-round cloud: neighbours for a normal, the directions that it is looked at from, and how often that is done.
+NORMAL_NEIGHBOURS, UNPOSED_DIRECTIONS, UNPOSED_PASSES = 24, 150, 3
+# It is thinned to this share of the step. Points that face opposite ways count as twice so many steps apart. Points
+# this many steps off each other's plane may lie on two sides of a wall.
+UNPOSED_THINNING, UNPOSED_FACING, UNPOSED_DEPTH = 0.6, 4.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -173,30 +173,49 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:
-    """Points of an all-round cloud, `step` [m] apart, with normals that agree with their neighbours'.
+    """Points of an all-round cloud, about `step` [m] apart, with normals to the outside.
 
-    Raises:
-        CloudError: no surface passes through them.
+    Which side is outside is seen from all directions: what is nearest in each cell of an image faces that direction.
+    Both sides of a thin wall are so told apart, which no agreement with neighbours does.
     """
-    import open3d as o3d
+    from scipy.spatial import KDTree
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points)).voxel_down_sample(step)
-    points = np.asarray(cloud.points)
-    # The triangulation that passes the sense on fails on points exactly on a sphere, a plane or a line.
-    shaken = points + JITTER_STEPS * step * np.random.default_rng(0).uniform(-1, 1, points.shape)
-    for tried in (points, shaken):
-        with suppress(RuntimeError):
-            return Surfels(points, _normals(tried))
-    raise CloudError(f"cloud: no surface passes through its {len(points)} points; views with their cameras are needed")
+    points = view.thinned(step * UNPOSED_THINNING).points
+    seen_from, place, many = _seen_from(points), KDTree(points), min(NORMAL_NEIGHBOURS, len(points))
+    near = np.asarray(place.query(points, k=many)[1])
+    normals = _least_axes_of(points[near])
+    for _ in range(UNPOSED_PASSES):
+        # What lies as deep in the surface as noise faces the way that its neighbours are seen from.
+        deep = np.einsum("nkd,nd->nk", points[near] - points[:, None], normals)
+        ways = np.einsum("nk,nkd->nd", np.exp(-np.square(deep / (UNPOSED_DEPTH * step))), seen_from[near])
+        normals *= np.where((normals * ways).sum(1) < 0, -1.0, 1.0)[:, None]
+        tree = KDTree(np.hstack([points, UNPOSED_FACING * step * normals]))
+        alike = _least_axes_of(points[np.asarray(tree.query(tree.data, k=many)[1])])
+        normals = alike * np.where((alike * normals).sum(1) < 0, -1.0, 1.0)[:, None]
+    return thin(Surfels(points, normals), step)
 
 
-def _normals(points: Points) -> Points:
-    import open3d as o3d
+def _least_axes_of(groups: Float[np.ndarray, "n k 3"]) -> Points:
+    spread = groups - groups.mean(1, keepdims=True)
+    return least_axes(np.swapaxes(spread, 1, 2) @ spread)
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
-    cloud.orient_normals_consistent_tangent_plane(ORIENTATION_NEIGHBOURS)
-    return np.asarray(cloud.normals)
+
+def _seen_from(points: Points) -> Points:
+    """The sum of the directions, spread evenly, that each point is seen from, nearest in a cell of an image."""
+    from scipy.spatial import KDTree
+
+    width = 2 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
+    rng, total = np.random.default_rng(0), np.zeros_like(points)
+    turn = np.arange(UNPOSED_DIRECTIONS) + 0.5
+    height, angle = 1 - 2 * turn / UNPOSED_DIRECTIONS, np.pi * (1 + 5**0.5) * turn
+    flat = np.sqrt(1 - height**2)
+    for way in np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height]):
+        right = perpendicular(way)
+        image = np.column_stack([points @ right, points @ np.cross(way, right)]) + rng.uniform(0, width, 2)
+        order = np.argsort(-(points @ way))
+        first = order[np.unique(voxel_keys(image, width)[order], return_index=True)[1]]
+        total[first] += way
+    return total
 
 
 @dataclass(frozen=True, eq=False)
