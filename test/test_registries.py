@@ -16,7 +16,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.io.grasps_json import grasps_of, result_document
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
+from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
 from graspd_core.verify.metrics import METRICS, Metric, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
@@ -64,7 +64,8 @@ def test_a_metric_is_one_row(grasp, hand, target, monkeypatch: pytest.MonkeyPatc
     assert read.metrics is not None
     assert read.metrics["height"] == 0.25
     assert {metric.name: metric.value for metric in message(measured, hand).metrics}["height"] == 0.25
-    event = result_event(GraspResult(Outcome.SUCCEEDED, (measured,), Timing(), 0, "closed_form"))
+    touching = replace(measured, contacts=(Contact("link", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),))
+    event = result_event(GraspResult(Outcome.SUCCEEDED, (touching,), Timing(), 0, "closed_form"))
     assert event["best"]["metrics"]["height_mm"] == 250.0
     assert "| `height` | mm | z of the base link |" in tables.metrics_table()
 

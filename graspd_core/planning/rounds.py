@@ -140,8 +140,8 @@ def run_rounds(
     `ahead`, what trials need, none is.
     """
     state = RoundsResult(time.perf_counter())
-    doubts = () if scene.evidence is None else scene.evidence.doubts
-    rounds = rounds[:1] if doubts else rounds
+    hopeless = scene.evidence is not None and bool(scene.evidence.doubts)
+    rounds = rounds[:1] if hopeless else rounds
     early = [(config, _FIRST_BATCH) for config in rounds[:1] if ahead is not None and count >= _MANY]
     for attempt, (config, most) in enumerate([*early, *((config, count) for config in rounds)]):
         enough, good, began = min(most + state.good, count), state.good, time.perf_counter()
@@ -175,7 +175,7 @@ def run_rounds(
             break
         # A second round seeks stronger grasps, unless not even the likeliest shape was held in the first.
         doubted = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
-        too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed and not doubts
+        too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed
         if too_heavy and ahead is not None and state.mass is None:
             state = _tried_lighter(run, scene, ahead, state, config.certainty, count)
             if state.good >= count or run.over():
