@@ -140,8 +140,7 @@ def run_rounds(
     `ahead`, what trials need, none is.
     """
     state = RoundsResult(time.perf_counter())
-    hopeless = scene.evidence is not None and bool(scene.evidence.doubts)
-    rounds = rounds[:1] if hopeless else rounds
+    rounds = rounds[:1] if scene.evidence is not None and scene.evidence.doubts else rounds
     early = [(config, _FIRST_BATCH) for config in rounds[:1] if ahead is not None and count >= _MANY]
     for attempt, (config, most) in enumerate([*early, *((config, count) for config in rounds)]):
         enough, good, began = min(most + state.good, count), state.good, time.perf_counter()
