@@ -90,7 +90,7 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 24_980,
     "graspd_ros": 4_700,
-    "graspd_bench": 8_670,
+    "graspd_bench": 8_700,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
     "graspd_cell": 3_000,
