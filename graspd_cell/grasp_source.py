@@ -8,19 +8,22 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
+from graspd_cell.layout import Bin, CellLayout
 from graspd_cell.robot import DepthView
-from graspd_cell.workplace import Workplace, box_mesh
+from graspd_cell.simulated_robot import box_mesh
+from graspd_core.arms.arm import Arm
 from graspd_core.arms.reach import Reach
+from graspd_core.config import SceneConfig, SegmentationConfig
 from graspd_core.errors import CloudError
+from graspd_core.hands.model import HandModel
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.planning.any_thing import Failure, ThingPlan, plan_any_thing
 from graspd_core.planning.plan_grasps import warm_up
 from graspd_core.planning.steering import Steering
-from graspd_core.types import Grasp, TriangleMesh, Verdict
+from graspd_core.types import Grasp, Plane, TriangleMesh, Verdict
 
 __all__ = ["Failure", "GraspSource", "InProcessGrasps", "Offer", "cloud_of"]
 
@@ -68,6 +71,19 @@ def cloud_of(view: DepthView) -> PointCloud:
     return cloud_from_depth(view.depth, camera, view.T_base_camera)
 
 
+# Measured surfaces stray so far; things rise at most so far above the floor [m].
+_STRAY, _RISE = 0.006, 0.3
+# The table's top.
+TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def scene_config(source: Bin) -> SceneConfig:
+    """Return settings under which clouds are cut down to what lies in a bin."""
+    (x, y), half = source.center, source.half - _STRAY
+    cut = SegmentationConfig(roi_low=(x - half, y - half, -0.02), roi_high=(x + half, y + half, _RISE))
+    return SceneConfig(segmentation=cut)
+
+
 # A hand comes within so much of straight down [rad].
 _FROM_ABOVE = 1.2
 
@@ -76,33 +92,32 @@ class InProcessGrasps:
     """graspd as a library.
 
     Args:
-        place: the cell.
+        arm, hand, layout: of the cell.
         preset: speed or accuracy.
-        seconds: after which no further thing is looked at; one thing gets as many again.
-        certainty: seeds of the optimiser start here.
+        seconds: after which no further thing is looked at. One thing gets as many again.
+        seed: of the optimiser.
+        tries: grasps of a thing that may fail before it is given up.
     """
 
     def __init__(
-        self, place: Workplace, *, preset: str = "balanced", seconds: float = 3.0, seed: int = 0, tries: int = 3
-    ) -> None:
-        self._place, self._preset, self._seconds, self._seed, self._tries = place, preset, seconds, seed, tries
-        self._solids = {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(place.source.walls)}
+        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seconds: float = 3.0,
+        seed: int = 0, tries: int = 3,
+    ) -> None:  # fmt: skip
+        self._hand, self._source = hand, layout.pick
         down = Steering(approach_direction=(0.0, 0.0, -1.0), approach_angle=_FROM_ABOVE)
-        self._restrictions = (down, Reach(place.arm, (0.0, 0.0, 0.0)))
-        torch.set_num_threads(2)
-        warm_up(place.hand)
+        self._plan = {
+            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "seconds": seconds,
+            "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.pick.walls)},
+            "restrictions": (down, Reach(arm, (0.0, 0.0, 0.0))), "measure": False, "preset": preset, "seed": seed,
+            "deadline": 2 * seconds,
+        }  # fmt: skip
+        warm_up(hand)
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
         """Return the surest grasp of the things in the source bin. See `GraspSource`."""
         began = time.perf_counter()
-        source = self._place.source
         try:
-            found = plan_any_thing(
-                [cloud_of(view)], self._place.hand, settings=source.scene_config(), surface=source.surface,
-                solids=self._solids, failures=failures, tries=self._tries, seconds=self._seconds,
-                restrictions=self._restrictions, measure=False, preset=self._preset, seed=self._seed,
-                deadline=2 * self._seconds,
-            )  # fmt: skip
+            found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, **self._plan)
         except CloudError as error:
             return Offer(None, reason=str(error), seconds=time.perf_counter() - began)
         return _offer(found, time.perf_counter() - began)

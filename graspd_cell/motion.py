@@ -18,10 +18,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
+from graspd_cell.layout import Box
 from graspd_cell.robot import JointMotion
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.errors import GraspdError
@@ -39,14 +39,6 @@ class NoMotionError(GraspdError):
     """No way for the arm, or one of the ends hits something."""
 
 
-@dataclass(frozen=True)
-class Box:
-    """A solid that is known to stand in the cell: two opposite corners, base frame [m]."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-
 # Cells of the grid of distances, and how far it reaches beyond the points seen [m].
 _CELL, _AROUND = 0.01, 0.12
 
@@ -58,28 +50,29 @@ class SeenWorld:
     Attributes:
         floor: height of what all stands on; the arm's first link is not held against it.
         boxes: known solids.
+        points: that were seen, but for those of floor and boxes.
         origin: the grid's lowest corner.
-        field: distance of each cell to the nearest point seen.
+        distances: distance of each cell to the nearest point seen.
     """
 
     floor: float
     boxes: tuple[Box, ...] = ()
+    points: Points = field(default_factory=lambda: np.zeros((0, 3)))
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    field: Float[np.ndarray, "x y z"] | None = None
+    distances: Float[np.ndarray, "x y z"] | None = None
 
     def clearance(self, at: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Return the distance of places to the points seen and to the boxes. The floor is not among them."""
         away = np.full(at.shape[:-1], np.inf)
         for box in self.boxes:
-            low, high = np.asarray(box.low), np.asarray(box.high)
-            beyond = np.maximum(low - at, at - high)
+            beyond = np.abs(at - box.center) - box.half
             outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
             away = np.minimum(away, outside + np.minimum(beyond.max(-1), 0.0))
-        if self.field is not None:
+        if self.distances is not None:
             cell = np.floor((at - self.origin) / _CELL).astype(int)
-            inside = ((cell >= 0) & (cell < self.field.shape)).all(-1)
+            inside = ((cell >= 0) & (cell < self.distances.shape)).all(-1)
             cell = np.where(inside[..., None], cell, 0)
-            away = np.minimum(away, np.where(inside, self.field[tuple(np.moveaxis(cell, -1, 0))], _AROUND))
+            away = np.minimum(away, np.where(inside, self.distances[tuple(np.moveaxis(cell, -1, 0))], _AROUND))
         return away
 
 
@@ -101,7 +94,7 @@ def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: f
     free[tuple(cell.T)] = False
     away: Any = distance_transform_edt(free)
     # From the middle of a cell to a point somewhere in another.
-    return replace(known, origin=origin, field=(_CELL * (away - 0.5)).astype(np.float32))
+    return replace(known, points=points, origin=origin, distances=(_CELL * (away - 0.5)).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,6 +243,15 @@ class Mover:
         link, tip = self.shape.link, self.shape.arm.tip
         balls = np.einsum("bnij,nj->bni", rotation[:, link], self.shape.local) + place[:, link]
         return balls, carried.at @ rotation[:, tip].swapaxes(1, 2) + place[:, None, tip]
+
+    def placed(self, q: Joints) -> tuple[Points, Points]:
+        """Return the middles of the balls of the arm, and of what it carries, base frame [m]."""
+        balls, carried = self._placed(q[None], self.carried)
+        return balls[0], carried[0]
+
+    def height(self, q: Joints) -> float:
+        """Return how high the tip is, base frame [m]."""
+        return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
 
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
         """Return the distance of every ball of arm and hand, and of every pair of them, to what must not be touched."""

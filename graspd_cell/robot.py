@@ -60,7 +60,7 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """A timed trajectory for one controller: the joints of the arm, or those of the hand.
+    """A timed trajectory: of the joints of the arm, those of the hand, or both.
 
     A tolerance of None is the controller's own: an arm has one, a hand has none because fingers stop at what they hold.
 
@@ -94,6 +94,13 @@ class JointMotion:
     def duration(self) -> float:
         """Seconds from the start to the last waypoint."""
         return float(self.times[-1])
+
+    def of(self, names: tuple[str, ...]) -> JointMotion:
+        """Return the motion of some of its joints, in the order of `names`. Raises ConfigError: one is missing."""
+        rows = _rows(self.names, names)
+        velocities = None if self.velocities is None else self.velocities[:, rows]
+        tolerances = self.path_tolerance, self.goal_tolerance
+        return JointMotion(names, self.times, self.positions[:, rows], velocities, *tolerances)
 
     def at(self, time: float, start: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "joints"]:
         """Return the targets at `time` [s] of a motion that begins with the targets `start`.
@@ -147,10 +154,10 @@ class Robot(Protocol):
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end and return the reading there.
 
-        Joints of the other controller keep their targets. Once `stop` returns True the joints stay where they are.
+        Joints of another controller keep their targets. A motion of the joints of both starts both at once. Once `stop` returns True the joints stay where they are.
 
         Args:
-            motion: of the arm's joints, or of the hand's.
+            motion: of the arm's joints, the hand's, or both.
             timeout: for the whole motion, in seconds of the robot's clock.
             stop: polled while the robot moves.
 

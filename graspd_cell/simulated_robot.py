@@ -94,22 +94,32 @@ class SimulatedRobot:
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end; see `Robot.follow`."""
-        controller = self.controller_of(motion)
-        end = self.time + timeout
-        controller.begin(motion, self.time)
+        driven, end = self._begin(motion), self.time + timeout
         reason = ""
         while not reason:
             self.step(_LOOK_EVERY)
-            state, reason = self.state_of(controller)
-            if state is MotionState.REACHED:
+            states, reasons = zip(*map(self.state_of, driven), strict=True)
+            if all(state is MotionState.REACHED for state in states):
                 return self.joints()
+            reason = next(filter(None, reasons), "")
             if not reason and stop():
                 reason = "the motion was stopped"
             elif not reason and self.time >= end:
                 reason = f"the motion took more than its {timeout:g} s"
-        self.hold(controller)
+        for controller in driven:
+            self.hold(controller)
         self.wait(_BRAKING)
         raise MotionAborted(reason)
+
+    def _begin(self, motion: JointMotion) -> list[TrajectoryController]:
+        """Give each controller its part of a motion, and return those that have one."""
+        both = (*self.arm.limits.names, *self.hand.limits.names)
+        if sorted(motion.names) != sorted(both):
+            self.controller_of(motion).begin(motion, self.time)
+            return [self.controller_of(motion)]
+        for controller in (self.arm, self.hand):
+            controller.begin(motion.of(controller.limits.names), self.time)
+        return [self.arm, self.hand]
 
     def wait(self, seconds: float) -> None:
         """Simulate so long; joints hold their targets."""
