@@ -69,16 +69,18 @@ class JointMotion:
         times: of the waypoints from the start of the motion [s], increasing.
         positions: of the joints, a row a waypoint [rad] or [m].
         velocities: of the joints, likewise [rad/s] or [m/s]. None: straight lines from waypoint to waypoint.
-        path_tolerance: greatest distance of a joint from its target on the path [rad] or [m].
-        goal_tolerance: greatest distance of a joint from its last target at the end [rad] or [m].
+        path_tolerance: greatest distance of a joint from its target on the path, of all or of each [rad] or [m].
+        goal_tolerance: greatest distance of a joint from its last target at the end, likewise [rad] or [m].
+        goal_time: so long after the last waypoint the goal has to be reached [s].
     """
 
     names: tuple[str, ...]
     times: Float[np.ndarray, "waypoints"]
     positions: Float[np.ndarray, "waypoints joints"]
     velocities: Float[np.ndarray, "waypoints joints"] | None = None
-    path_tolerance: float | None = None
-    goal_tolerance: float | None = None
+    path_tolerance: float | Float[np.ndarray, "joints"] | None = None
+    goal_tolerance: float | Float[np.ndarray, "joints"] | None = None
+    goal_time: float | None = None
 
     def __post_init__(self) -> None:
         rows, times = len(self.times), np.asarray(self.times)

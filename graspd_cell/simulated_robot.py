@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from graspd_bench.rendering.depth_noise import DEFAULT, DepthNoise, add_noise
 from graspd_bench.rendering.render import render_depth
@@ -72,18 +72,19 @@ class SimulatedRobot:
 
     def view_now(self) -> DepthView:
         """Return an image of this moment, with noise. No time passes."""
-        layout = self.world.layout
-        camera, pose = layout.camera, layout.T_base_camera
+        return self.view_of(self.meshes(), self.time)
+
+    def view_of(self, meshes: Sequence[tuple[str, TriangleMesh]], time: float) -> DepthView:
+        """Return the image of surfaces as they were at some time, with noise."""
+        camera = self.world.layout.camera
         self._images += 1
-        depth = add_noise(self.true_depth(), camera, self._noise, 100_000 * self._seed + self._images)
+        depth = add_noise(self._depth(meshes), camera, self._noise, 100_000 * self._seed + self._images)
         matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        return DepthView(self.time, depth.astype(np.float32), matrix, pose)
+        return DepthView(time, depth.astype(np.float32), matrix, self.world.layout.T_base_camera)
 
     def true_depth(self) -> Float32[np.ndarray, "height width"]:
         """Return the depth image of this moment without noise [m], zero where nothing is."""
-        layout = self.world.layout
-        mesh = joined(*(mesh for _, mesh in self.meshes()))
-        return render_depth(mesh, layout.camera, layout.T_base_camera).astype(np.float32)
+        return self._depth(self.meshes()).astype(np.float32)
 
     def meshes(self) -> list[tuple[str, TriangleMesh]]:
         """Return the surfaces of everything as it is now, base frame [m], with the names of their parts or things."""
@@ -167,6 +168,10 @@ class SimulatedRobot:
             for name, body in zip(robot.link_names, bodies, strict=True):
                 found[f"{prefix}{name}"] = body_pose(self._data, int(body))
         return found
+
+    def _depth(self, meshes: Sequence[tuple[str, TriangleMesh]]) -> Float[np.ndarray, "height width"]:
+        layout = self.world.layout
+        return render_depth(joined(*(mesh for _, mesh in meshes)), layout.camera, layout.T_base_camera)
 
     def _positions(self, controller: TrajectoryController) -> np.ndarray:
         return self.joints().of(controller.limits.names).positions
