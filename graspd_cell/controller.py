@@ -120,13 +120,7 @@ class TrajectoryController:
             return motion
         if sorted(motion.names) != sorted(names):
             raise ConfigError(f"a motion of joints {', '.join(motion.names)}; valid: all of {', '.join(names)}")
-        rows = [motion.names.index(name) for name in names]
-        velocities = None if motion.velocities is None else motion.velocities[:, rows]
-        path, goal = (
-            allowed[rows] if isinstance(allowed, np.ndarray) else allowed
-            for allowed in (motion.path_tolerance, motion.goal_tolerance)
-        )
-        return JointMotion(names, motion.times, motion.positions[:, rows], velocities, path, goal, motion.goal_time)
+        return motion.part(names)
 
     def _refuse(self, motion: JointMotion) -> None:
         low, high, names = self.limits.lower, self.limits.upper, self.limits.names

@@ -60,7 +60,7 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """A timed trajectory for one controller: the joints of the arm, or those of the hand.
+    """A timed trajectory of the joints of the arm, of those of the hand, or of both.
 
     A tolerance of None is the controller's own: an arm has one, a hand has none because fingers stop at what they hold.
 
@@ -91,6 +91,16 @@ class JointMotion:
             if table is not None and (table.shape != (rows, len(self.names)) or not np.isfinite(table).all()):
                 shape = f"{rows} rows of {len(self.names)}"
                 raise ConfigError(f"a motion's {name} have shape {table.shape}; valid: {shape} finite numbers")
+
+    def part(self, names: tuple[str, ...]) -> JointMotion:
+        """Return the motion of some of the joints, in the order of `names`. Raises ConfigError: a joint is missing."""
+        rows = _rows(self.names, names)
+        path, goal = (
+            allowed[rows] if isinstance(allowed, np.ndarray) else allowed
+            for allowed in (self.path_tolerance, self.goal_tolerance)
+        )
+        velocities = None if self.velocities is None else self.velocities[:, rows]
+        return JointMotion(names, self.times, self.positions[:, rows], velocities, path, goal, self.goal_time)
 
     @property
     def duration(self) -> float:
@@ -149,10 +159,10 @@ class Robot(Protocol):
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end and return the reading there.
 
-        Joints of the other controller keep their targets. Once `stop` returns True the joints stay where they are.
+        Joints that are not part of it keep their targets. Once `stop` returns True the joints stay where they are.
 
         Args:
-            motion: of the arm's joints, or of the hand's.
+            motion: of the arm's joints, of the hand's, or of both.
             timeout: for the whole motion, in seconds of the robot's clock.
             stop: polled while the robot moves.
 
@@ -170,5 +180,5 @@ def _rows(names: tuple[str, ...], wanted: tuple[str, ...]) -> list[int]:
     places = {name: row for row, name in enumerate(names)}
     unknown = [name for name in wanted if name not in places]
     if unknown:
-        raise ConfigError(f"joint {unknown[0]!r} is not of this robot; valid: {', '.join(names)}")
+        raise ConfigError(f"no joint {unknown[0]!r}; valid: {', '.join(names)}")
     return [places[name] for name in wanted]

@@ -95,20 +95,22 @@ class SimulatedRobot:
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end; see `Robot.follow`."""
-        controller = self.controller_of(motion)
-        end = self.time + timeout
-        controller.begin(motion, self.time)
-        reason = ""
+        parts = self.parts_of(motion)
+        end, reason = self.time + timeout, ""
+        for controller, part in parts:
+            controller.begin(part, self.time)
         while not reason:
             self.step(_LOOK_EVERY)
-            state, reason = self.state_of(controller)
-            if state is MotionState.REACHED:
+            states = [self.state_of(controller) for controller, _ in parts]
+            if all(state is MotionState.REACHED for state, _ in states):
                 return self.joints()
+            reason = next((reason for _, reason in states if reason), "")
             if not reason and stop():
                 reason = "the motion was stopped"
             elif not reason and self.time >= end:
                 reason = f"the motion took more than its {timeout:g} s"
-        self.hold(controller)
+        for controller, _ in parts:
+            self.hold(controller)
         self.wait(_BRAKING)
         raise MotionAborted(reason)
 
@@ -118,9 +120,13 @@ class SimulatedRobot:
         for done in range(0, steps, _LOOK_EVERY):
             self.step(min(_LOOK_EVERY, steps - done))
 
-    def controller_of(self, motion: JointMotion) -> TrajectoryController:
-        """Return the controller that a motion is for: the one of its first joint."""
-        return self.hand if motion.names and motion.names[0] in self.hand.limits.names else self.arm
+    def parts_of(self, motion: JointMotion) -> list[tuple[TrajectoryController, JointMotion]]:
+        """Return the controllers that a motion is for, each with its part. Joints of neither stay with the first."""
+        hand = tuple(name for name in motion.names if name in self.hand.limits.names)
+        arm = tuple(name for name in motion.names if name not in hand)
+        if not hand or not arm:
+            return [(self.hand if hand else self.arm, motion)]
+        return [(self.arm, motion.part(arm)), (self.hand, motion.part(hand))]
 
     def state_of(self, controller: TrajectoryController) -> tuple[MotionState, str]:
         """Return how a controller's motion is getting on now, and of an abort why."""
