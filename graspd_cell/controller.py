@@ -106,13 +106,13 @@ class TrajectoryController:
         allowed = self.tolerances.goal if motion.goal_tolerance is None else motion.goal_tolerance
         if (error <= allowed).all():
             return MotionState.REACHED, ""
-        if over > self.tolerances.goal_time:
+        if over > (self.tolerances.goal_time if motion.goal_time is None else motion.goal_time):
             return MotionState.MISSED_GOAL, self._told(error, allowed, "missed its goal")
         return MotionState.RUNNING, ""
 
-    def _told(self, error: np.ndarray, allowed: float, what: str) -> str:
-        joint = int(error.argmax())
-        return f"joint {self.limits.names[joint]!r} {what} by {error[joint]:.3f}; its tolerance is {allowed:g}"
+    def _told(self, error: np.ndarray, allowed: float | np.ndarray, what: str) -> str:
+        joint, most = int((error - allowed).argmax()), np.broadcast_to(allowed, error.shape)
+        return f"joint {self.limits.names[joint]!r} {what} by {error[joint]:.3f}; its tolerance is {most[joint]:g}"
 
     def _ordered(self, motion: JointMotion) -> JointMotion:
         names = self.limits.names
@@ -120,10 +120,7 @@ class TrajectoryController:
             return motion
         if sorted(motion.names) != sorted(names):
             raise ConfigError(f"a motion of joints {', '.join(motion.names)}; valid: all of {', '.join(names)}")
-        rows = [motion.names.index(name) for name in names]
-        velocities = None if motion.velocities is None else motion.velocities[:, rows]
-        tolerances = motion.path_tolerance, motion.goal_tolerance
-        return JointMotion(names, motion.times, motion.positions[:, rows], velocities, *tolerances)
+        return motion.part(names)
 
     def _refuse(self, motion: JointMotion) -> None:
         low, high, names = self.limits.lower, self.limits.upper, self.limits.names

@@ -60,7 +60,7 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """A timed trajectory: of the joints of the arm, those of the hand, or both.
+    """A timed trajectory of the joints of the arm, of those of the hand, or of both.
 
     A tolerance of None is the controller's own: an arm has one, a hand has none because fingers stop at what they hold.
 
@@ -69,16 +69,18 @@ class JointMotion:
         times: of the waypoints from the start of the motion [s], increasing.
         positions: of the joints, a row a waypoint [rad] or [m].
         velocities: of the joints, likewise [rad/s] or [m/s]. None: straight lines from waypoint to waypoint.
-        path_tolerance: greatest distance of a joint from its target on the path [rad] or [m].
-        goal_tolerance: greatest distance of a joint from its last target at the end [rad] or [m].
+        path_tolerance: greatest distance of a joint from its target on the path, of all or of each [rad] or [m].
+        goal_tolerance: greatest distance of a joint from its last target at the end, likewise [rad] or [m].
+        goal_time: so long after the last waypoint the goal has to be reached [s].
     """
 
     names: tuple[str, ...]
     times: Float[np.ndarray, "waypoints"]
     positions: Float[np.ndarray, "waypoints joints"]
     velocities: Float[np.ndarray, "waypoints joints"] | None = None
-    path_tolerance: float | None = None
-    goal_tolerance: float | None = None
+    path_tolerance: float | Float[np.ndarray, "joints"] | None = None
+    goal_tolerance: float | Float[np.ndarray, "joints"] | None = None
+    goal_time: float | None = None
 
     def __post_init__(self) -> None:
         rows, times = len(self.times), np.asarray(self.times)
@@ -90,17 +92,20 @@ class JointMotion:
                 shape = f"{rows} rows of {len(self.names)}"
                 raise ConfigError(f"a motion's {name} have shape {table.shape}; valid: {shape} finite numbers")
 
+    def part(self, names: tuple[str, ...]) -> JointMotion:
+        """Return the motion of some of the joints, in the order of `names`. Raises ConfigError: a joint is missing."""
+        rows = _rows(self.names, names)
+        path, goal = (
+            allowed[rows] if isinstance(allowed, np.ndarray) else allowed
+            for allowed in (self.path_tolerance, self.goal_tolerance)
+        )
+        velocities = None if self.velocities is None else self.velocities[:, rows]
+        return JointMotion(names, self.times, self.positions[:, rows], velocities, path, goal, self.goal_time)
+
     @property
     def duration(self) -> float:
         """Seconds from the start to the last waypoint."""
         return float(self.times[-1])
-
-    def of(self, names: tuple[str, ...]) -> JointMotion:
-        """Return the motion of some of its joints, in the order of `names`. Raises ConfigError: one is missing."""
-        rows = _rows(self.names, names)
-        velocities = None if self.velocities is None else self.velocities[:, rows]
-        tolerances = self.path_tolerance, self.goal_tolerance
-        return JointMotion(names, self.times, self.positions[:, rows], velocities, *tolerances)
 
     def at(self, time: float, start: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "joints"]:
         """Return the targets at `time` [s] of a motion that begins with the targets `start`.
@@ -154,10 +159,10 @@ class Robot(Protocol):
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end and return the reading there.
 
-        Joints of another controller keep their targets. A motion of the joints of both starts both at once. Once `stop` returns True the joints stay where they are.
+        Joints that are not part of it keep their targets. Once `stop` returns True the joints stay where they are.
 
         Args:
-            motion: of the arm's joints, the hand's, or both.
+            motion: of the arm's joints, of the hand's, or of both.
             timeout: for the whole motion, in seconds of the robot's clock.
             stop: polled while the robot moves.
 
@@ -175,5 +180,5 @@ def _rows(names: tuple[str, ...], wanted: tuple[str, ...]) -> list[int]:
     places = {name: row for row, name in enumerate(names)}
     unknown = [name for name in wanted if name not in places]
     if unknown:
-        raise ConfigError(f"joint {unknown[0]!r} is not of this robot; valid: {', '.join(names)}")
+        raise ConfigError(f"no joint {unknown[0]!r}; valid: {', '.join(names)}")
     return [places[name] for name in wanted]

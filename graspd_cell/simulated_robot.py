@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from graspd_bench.rendering.depth_noise import DEFAULT, DepthNoise, add_noise
 from graspd_bench.rendering.render import render_depth
@@ -72,18 +72,19 @@ class SimulatedRobot:
 
     def view_now(self) -> DepthView:
         """Return an image of this moment, with noise. No time passes."""
-        layout = self.world.layout
-        camera, pose = layout.camera, layout.T_base_camera
+        return self.view_of(self.meshes(), self.time)
+
+    def view_of(self, meshes: Sequence[tuple[str, TriangleMesh]], time: float) -> DepthView:
+        """Return the image of surfaces as they were at some time, with noise."""
+        camera = self.world.layout.camera
         self._images += 1
-        depth = add_noise(self.true_depth(), camera, self._noise, 100_000 * self._seed + self._images)
+        depth = add_noise(self._depth(meshes), camera, self._noise, 100_000 * self._seed + self._images)
         matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        return DepthView(self.time, depth.astype(np.float32), matrix, pose)
+        return DepthView(time, depth.astype(np.float32), matrix, self.world.layout.T_base_camera)
 
     def true_depth(self) -> Float32[np.ndarray, "height width"]:
         """Return the depth image of this moment without noise [m], zero where nothing is."""
-        layout = self.world.layout
-        mesh = joined(*(mesh for _, mesh in self.meshes()))
-        return render_depth(mesh, layout.camera, layout.T_base_camera).astype(np.float32)
+        return self._depth(self.meshes()).astype(np.float32)
 
     def meshes(self) -> list[tuple[str, TriangleMesh]]:
         """Return the surfaces of everything as it is now, base frame [m], with the names of their parts or things."""
@@ -94,32 +95,24 @@ class SimulatedRobot:
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end; see `Robot.follow`."""
-        driven, end = self._begin(motion), self.time + timeout
-        reason = ""
+        parts = self.parts_of(motion)
+        end, reason = self.time + timeout, ""
+        for controller, part in parts:
+            controller.begin(part, self.time)
         while not reason:
             self.step(_LOOK_EVERY)
-            states, reasons = zip(*map(self.state_of, driven), strict=True)
-            if all(state is MotionState.REACHED for state in states):
+            states = [self.state_of(controller) for controller, _ in parts]
+            if all(state is MotionState.REACHED for state, _ in states):
                 return self.joints()
-            reason = next(filter(None, reasons), "")
+            reason = next((reason for _, reason in states if reason), "")
             if not reason and stop():
                 reason = "the motion was stopped"
             elif not reason and self.time >= end:
                 reason = f"the motion took more than its {timeout:g} s"
-        for controller in driven:
+        for controller, _ in parts:
             self.hold(controller)
         self.wait(_BRAKING)
         raise MotionAborted(reason)
-
-    def _begin(self, motion: JointMotion) -> list[TrajectoryController]:
-        """Give each controller its part of a motion, and return those that have one."""
-        both = (*self.arm.limits.names, *self.hand.limits.names)
-        if sorted(motion.names) != sorted(both):
-            self.controller_of(motion).begin(motion, self.time)
-            return [self.controller_of(motion)]
-        for controller in (self.arm, self.hand):
-            controller.begin(motion.of(controller.limits.names), self.time)
-        return [self.arm, self.hand]
 
     def wait(self, seconds: float) -> None:
         """Simulate so long; joints hold their targets."""
@@ -127,9 +120,13 @@ class SimulatedRobot:
         for done in range(0, steps, _LOOK_EVERY):
             self.step(min(_LOOK_EVERY, steps - done))
 
-    def controller_of(self, motion: JointMotion) -> TrajectoryController:
-        """Return the controller that a motion is for: the one of its first joint."""
-        return self.hand if motion.names and motion.names[0] in self.hand.limits.names else self.arm
+    def parts_of(self, motion: JointMotion) -> list[tuple[TrajectoryController, JointMotion]]:
+        """Return the controllers that a motion is for, each with its part. Joints of neither stay with the first."""
+        hand = tuple(name for name in motion.names if name in self.hand.limits.names)
+        arm = tuple(name for name in motion.names if name not in hand)
+        if not hand or not arm:
+            return [(self.hand if hand else self.arm, motion)]
+        return [(self.arm, motion.part(arm)), (self.hand, motion.part(hand))]
 
     def state_of(self, controller: TrajectoryController) -> tuple[MotionState, str]:
         """Return how a controller's motion is getting on now, and of an abort why."""
@@ -177,6 +174,10 @@ class SimulatedRobot:
             for name, body in zip(robot.link_names, bodies, strict=True):
                 found[f"{prefix}{name}"] = body_pose(self._data, int(body))
         return found
+
+    def _depth(self, meshes: Sequence[tuple[str, TriangleMesh]]) -> Float[np.ndarray, "height width"]:
+        layout = self.world.layout
+        return render_depth(joined(*(mesh for _, mesh in meshes)), layout.camera, layout.T_base_camera)
 
     def _positions(self, controller: TrajectoryController) -> np.ndarray:
         return self.joints().of(controller.limits.names).positions

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from graspd_cell.layout import CellLayout
-from graspd_cell.things import Thing
+from graspd_bench.trials import dropped
+from graspd_cell.layout import CellLayout, layout_of
+from graspd_cell.things import Thing, ThingSource, load_thing
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
@@ -32,6 +33,8 @@ FLOOR = -0.5
 # rotors weigh this much [kg·m²].
 _FULL_EFFORT_AT, DAMPING_TIME, _ARMATURE = 0.02, 0.04, 0.1
 _HAND = "hand/"
+# What is dropped into a bin keeps so far from its walls [m].
+_GAP = 0.005
 # Whose a geom is. Things have the numbers from THING on.
 NOTHING, ARM, HAND, TABLE, PICK_BIN, PLACE_BIN, THING = range(7)
 PARTS = {ARM: "arm", HAND: "hand", TABLE: "table", PICK_BIN: "pick bin", PLACE_BIN: "place bin"}
@@ -207,6 +210,19 @@ def _world_of(model: Any, arm: Arm, hand: HandModel, layout: CellLayout, things:
         lower=np.concatenate([arm.lower, hand.lower]),
         upper=np.concatenate([arm.upper, hand.upper]),
     )  # fmt: skip
+
+
+def pile_cell(
+    arm: Arm, hand: HandModel, sources: Sequence[ThingSource], seed: int, *, friction: float | None = None
+) -> CellWorld:
+    """Compile a cell with things that were dropped into the first bin. The same seed drops them the same way."""
+    layout, things = layout_of(arm), [load_thing(source) for source in sources]
+    poses = []
+    for body in dropped([thing.model for thing in things], seed, layout.pick.half - _GAP):
+        pose = body.pose.copy()
+        pose[:2, 3] += layout.pick.center
+        poses.append(pose)
+    return build_cell(arm, hand, layout, things, poses, friction=friction)
 
 
 def put_robot(world: CellWorld, data: Any, values: Float[np.ndarray, "joints"]) -> None:

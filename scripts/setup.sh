@@ -86,9 +86,9 @@ pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
 echo "setup: compiling the messages of graspd_msgs (20 seconds)"
 # Against the very libraries that it will be loaded with; what it needs is installed by now.
 "${pip[@]}" --no-build-isolation --no-deps ./msg_defs
-# What comes with ROS and is not on PyPI: the type of /tf, MoveIt's grasp and collision object, the action GraspPlanning.
+# What comes with ROS and is not on PyPI: the type of /tf, MoveIt's grasp and collision object, two actions.
 for needed in tf2_msgs.msg:TFMessage object_recognition_msgs.msg:ObjectType moveit_msgs.msg:CollisionObject \
-    grasping_msgs.action:GraspPlanning; do
+    grasping_msgs.action:GraspPlanning control_msgs.action:FollowJointTrajectory; do
     package=${needed%%.*}
     if ! "$venv/bin/python" -c "from ${needed%%:*} import ${needed##*:}" 2>/dev/null; then
         rm -rf "$build" && mkdir "$build"

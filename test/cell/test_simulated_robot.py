@@ -44,6 +44,24 @@ def test_a_hand_closes_and_says_how_hard_its_motors_work(pair: tuple[str, str], 
     assert np.abs(reading.of(robot.world.arm.joint_names).positions - robot.world.layout.start).max() < 2e-3
 
 
+def test_arm_and_hand_move_together(robot_of: RobotOf):
+    robot = robot_of("ur5e_like", "allegro_right")
+    world = robot.world
+    goal = np.concatenate([world.layout.start + 0.1, world.hand.closed_posture])
+    reading = robot.follow(JointMotion(world.joint_names, np.array([1.5]), goal[None], 0 * goal[None]), 3.0)
+    off = np.abs(reading.positions - goal)
+    assert off[:6].max() < ARM_TOLERANCES.goal
+    assert off[6:].max() < 0.06
+    # One controller's abort stops both.
+    tight = JointMotion(
+        world.joint_names, np.array([1.5]), world.start[None], path_tolerance=np.array([1e-6] + [9.0] * 21)
+    )
+    with pytest.raises(MotionAborted, match="joint 'shoulder_pan' left its path"):
+        robot.follow(tight, 3.0)
+    robot.wait(1.0)
+    assert np.abs(robot.joints().positions - goal).max() < 0.1
+
+
 def test_a_dropped_thing_settles_in_the_bin(robot_of: RobotOf):
     robot = robot_of("ur5e_like", "allegro_right", "family:pear:0", "shape:box")
     before = robot.thing_poses()
