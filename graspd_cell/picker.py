@@ -20,11 +20,13 @@ from graspd_cell.grasp_held import Hold, after_squeeze, grips, still_holds
 from graspd_cell.grasp_source import Failure, GraspSource, Offer, cloud_of
 from graspd_cell.layout import CellLayout
 from graspd_cell.motion import (
+    ARM_DEEPEST,
     Mover,
     NoMotionError,
     SeenWorld,
     Speeds,
     arm_shape,
+    dense,
     find_path,
     hand_balls,
     seen_world,
@@ -95,7 +97,6 @@ class Pace:
         patience: seconds beyond a motion's own until it has to be over.
         settle: seconds that the fingers get to press.
         least_probability: of a grasp that is not verified, to be tried when nothing is.
-        barren: looks in a row without any grasp after which the bin is given up.
     """
 
     free: Speeds = Speeds(0.7, 5.0)
@@ -104,7 +105,6 @@ class Pace:
     patience: float = 3.0
     settle: float = 0.4
     least_probability: float = 0.4
-    barren: int = 3
 
 
 @dataclass(eq=False)
@@ -149,7 +149,7 @@ class Picker:
             Cancelled: somebody cancelled.
             MotionAborted: the arm does not come home, so that nothing can be seen any more.
         """
-        barren = attempts = 0
+        attempts = 0
         while attempts < most:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
@@ -157,14 +157,13 @@ class Picker:
             self._failures += offer.failures
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
             if offer.grasp is None or not (offer.verified or likely):
-                barren += 1
                 self.why_ended = offer.reason
-                if not offer.things or barren >= self._pace.barren:
+                if offer.exhausted:
                     return
                 if offer.grasp is not None:
                     self._failures.append(Failure(offer.place, offer.grasp.grasp))
                 continue
-            barren, attempts = 0, attempts + 1
+            attempts += 1
             attempt = self.attempt(offer, self.world_of(view), began, attempts)
             self._learn(attempt, offer)
             yield attempt
@@ -235,6 +234,10 @@ class Picker:
         start = taking.execution.hand[0]
         self._move_hand(start)
         mover = self._mover(taking.world, start)
+        depth = -mover.arm_clearances(dense(taking.execution.arm)).min()
+        if depth > -ARM_DEEPEST:
+            told = f"{1e3 * depth:.0f} mm deep in something; valid: clear of all"
+            raise NoMotionError(f"motion: on its way through the grasp {self._arm.name} is {told}")
         goal = taking.execution.arm[0]
         # From above, where the way down is straight, else as the planner finds.
         above = straight(mover, goal, np.array([0.0, 0.0, 0.12]))[::-1]
@@ -271,7 +274,9 @@ class Picker:
         risen = thing + [0.0, 0.0, mover.height(up[-1]) - mover.height(here)]
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
-            raise NoMotionError(f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}")
+            raise NoMotionError(
+                f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}"
+            )
         path = find_path(mover, up[-1], goal)
         lost = ""
 

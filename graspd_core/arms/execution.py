@@ -150,9 +150,7 @@ def squeeze_efforts(
     """Return what the joints press with when the object stops them at the grasp, within their limits [N·m] or [N]."""
     stages = stages or GraspStagesConfig()
     gain = np.where(hand.slides, stages.slide_stiffness, stages.stiffness)
-    return np.clip(
-        gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort
-    )
+    return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
 
 
 def _finger_speeds(hand: HandModel, pace: ExecutionPace) -> Float[np.ndarray, "joints"]:
