@@ -1,7 +1,7 @@
 """Whether a hand holds something, from what real hands tell: joint positions and efforts.
 
-Joints whose squeeze target lies beyond the grasp press. What is in the hand stops them short of it. A joint that arrived
-at its target presses on nothing. What slips out lets the joints go on from where they stood when they squeezed.
+Joints whose squeeze target lies beyond the grasp press. What is in the hand stops them short of it. A joint that
+arrived at its target presses on nothing. What slips out lets the joints go on from where they stood when they squeezed.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
         return Held(True)
     toward = np.sign(hold.target - hold.touch)
     on = (toward * (own.positions - hold.positions) * hold.scale)[hold.presses]
-    pressed = np.maximum((toward * hold.efforts * 1.0)[hold.presses], 0.0).sum()
+    pressed = np.maximum((toward * hold.efforts)[hold.presses], 0.0).sum()
     pressing = np.maximum((toward * own.efforts)[hold.presses], 0.0).sum()
     if pressed > 0 and pressing < _EFFORT_LEFT * pressed:
         return Held(False, f"the joints press with {100 * pressing / pressed:.0f} % of what they did")

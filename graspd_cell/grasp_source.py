@@ -126,7 +126,9 @@ def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
         told, over = reasons or "nothing is seen in the bin", all(thing.reason == OUT_OF_TRIES for thing in found)
         return Offer(None, things=len(found), reason=told, failures=failed, exhausted=over, seconds=seconds)
     best = found[0]
-    assert best.grasp is not None and best.scene is not None and best.result is not None
+    assert best.grasp is not None
+    assert best.scene is not None
+    assert best.result is not None
     return Offer(
         best.grasp,
         best.place,

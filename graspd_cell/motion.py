@@ -1,9 +1,9 @@
 """Motions of the arm between postures, clear of all that the camera saw and of what is known to stand in the cell.
 
 Arm, hand and the thing in the hand are balls: the arm's from its capsules (docs/arms.md), the others from points of
-their surfaces, which are fixed to the tip while a motion lasts. What must not be touched is a grid of distances from the
-points seen, a floor, and boxes. Paths are found by OMPL's RRTConnect, which asks about whole edges at once, and timed by
-toppra within the arm's limits.
+their surfaces, which are fixed to the tip while a motion lasts. What must not be touched is a grid of distances from
+the points seen, a floor, and boxes. Paths are found by OMPL's RRTConnect, which asks about whole edges at once, and
+timed by toppra within the arm's limits.
 
 OMPL's wheel stands alone, where roboplan's brings 25 others and asks for a model of its own of arm and scene. Ruckig's
 wheel goes from state to state only: waypoints in between are sent to a server.

@@ -32,7 +32,7 @@ from graspd_cell.motion import (
     seen_world,
     timed,
 )
-from graspd_cell.robot import JointMotion, JointReading, MotionAborted, Robot, never
+from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
 from graspd_core.arms.arm import Arm
 from graspd_core.arms.execution import Execution, ExecutionPace, execution_of
 from graspd_core.errors import GraspdError
@@ -99,8 +99,8 @@ class Pace:
         least_probability: of a grasp that is not verified, to be tried when nothing is.
     """
 
-    free: Speeds = Speeds(0.7, 5.0)
-    loaded: Speeds = Speeds(0.4, 2.5)
+    free: Speeds = field(default_factory=lambda: Speeds(0.7, 5.0))
+    loaded: Speeds = field(default_factory=lambda: Speeds(0.4, 2.5))
     grasp: ExecutionPace = field(default_factory=ExecutionPace)
     patience: float = 3.0
     settle: float = 0.4
@@ -174,9 +174,8 @@ class Picker:
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
-            execution = execution_of(
-                offer.grasp, self._arm, self._hand, mass=max(offer.mass, 1e-3), pace=self._pace.grasp
-            )
+            speeds = self._pace.free.share * np.asarray(self._arm.chain.velocity)
+            execution = execution_of(offer.grasp, self._hand, arm_speeds=speeds, mass=offer.mass, pace=self._pace.grasp)
             taking = _Taking(offer, execution, world, began)
             ending, reason = self._steps(taking)
         except NoMotionError as error:
@@ -210,8 +209,8 @@ class Picker:
         self.let_go(taking)
         return Ending.PICKED, ""
 
-    def world_of(self, view) -> SeenWorld:
-        """Return what must not be touched: what a view shows but for the robot itself, and what is known of the cell."""
+    def world_of(self, view: DepthView) -> SeenWorld:
+        """Return what must not be touched: what a view shows without the robot, and what is known of the cell."""
         points = cloud_of(view).points
         mover = self._mover(SeenWorld(0.0))
         balls, carried = mover.placed(self._arm_now())
@@ -271,7 +270,7 @@ class Picker:
         mover = self._mover(world, self._hand_now())
         mover = replace(mover, carried=held_balls(mover, here, thing))
         up = straight(mover, here, np.array([0.0, 0.0, 0.1]))
-        risen = thing + [0.0, 0.0, mover.height(up[-1]) - mover.height(here)]
+        risen = thing + np.array([0.0, 0.0, mover.height(up[-1]) - mover.height(here)])
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
             raise NoMotionError(
@@ -328,7 +327,7 @@ class Picker:
         mover = self._mover(taking.world)
         points = surface_samples(taking.offer.surface, 1500, 0)[0]
         at = taking.execution.arm[taking.execution.gates[1]]
-        return points + [0.0, 0.0, mover.height(here) - mover.height(at)]
+        return points + np.array([0.0, 0.0, mover.height(here) - mover.height(at)])
 
     def _without_thing(self, taking: _Taking) -> SeenWorld:
         """The world without the points of the thing that is in the hand now."""

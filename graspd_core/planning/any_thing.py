@@ -102,7 +102,7 @@ def plan_any_thing(
         settings: of the way from clouds to scenes.
         surface: what all things stand on, where it is known.
         solids: what else is known to stand there, by name, frame of the views [m].
-        failures: of before. A thing is not looked at again after `tries` of them, nor is a grasp given that is like one.
+        failures: of before. A thing is not looked at again after `tries` of them. No grasp is given that is like one.
         tries: of a thing at most.
         seconds: after which no further thing is begun.
         on_thing: called with each thing that was looked at.
