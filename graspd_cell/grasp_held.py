@@ -22,9 +22,9 @@ _PRESSES = 0.03
 # Of the way from the grasp to the target, joints that press on nothing cover more than this share.
 _ARRIVED = 0.8
 # Of what the joints pressed with after the squeeze, less than this share is left of what slipped out.
-_EFFORT_LEFT = 0.4
+_EFFORT_LEFT = 0.2
 # Joints of a held thing creep less than this beyond where they stood after the squeeze [rad].
-_WENT_ON = 0.12
+_WENT_ON = 0.2
 
 
 @dataclass(frozen=True, eq=False)

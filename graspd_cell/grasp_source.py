@@ -81,7 +81,7 @@ TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 def scene_config(source: Bin) -> SceneConfig:
     """Return settings under which clouds are cut down to what lies in a bin."""
     (x, y), half = source.center, source.half - _STRAY
-    cut = SegmentationConfig(roi_low=(x - half, y - half, -0.02), roi_high=(x + half, y + half, _RISE))
+    cut = SegmentationConfig(roi_low=(x - half, y - half, -0.02), roi_high=(x + half, y + half, _RISE), piled=True)
     return SceneConfig(segmentation=cut)
 
 
@@ -98,7 +98,7 @@ class InProcessGrasps:
 
     def __init__(
         self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seconds: float = 3.0,
-        seed: int = 0, tries: int = 3,
+        seed: int = 0, tries: int = 4,
     ) -> None:  # fmt: skip
         self._hand, self._source = hand, layout.pick
         self._plan = {

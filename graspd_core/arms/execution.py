@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicHermiteSpline
 
 from graspd_core.arms.arm_paths import LIFT
 from graspd_core.config.planning_config import GraspStagesConfig
@@ -26,6 +27,8 @@ GATES = ("pregrasp", "closed", "squeezed", "lifted")
 PEAK_SPEED, PEAK_ACCELERATION = 1.5, 6.0
 # Rows of a squeeze.
 _SQUEEZE_ROWS = 4
+# Times at which a stage's speed is looked at.
+_SAMPLES = 200
 _GRAVITY = 9.81
 
 
@@ -167,12 +170,11 @@ def _from_rest_to_rest(
     rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
     """Return times of rows [s] that are evenly spaced along their path, and speeds, zero at both ends."""
-    last = len(rows) - 1
-    share = np.arange(last + 1) / last
-    slope = np.gradient(rows, share, axis=0)
-    # Between two rows joints are no faster than the difference says.
-    fastest = np.abs(np.diff(rows, axis=0)).max(0) * last
-    span = max(shortest, least, PEAK_SPEED * float((np.maximum(fastest, np.abs(slope).max(0)) / limits).max()))
+    share = np.linspace(0.0, 1.0, len(rows))
     # The share that a cubic covers, 3t² − 2t³, solved for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)
-    return span * time, slope * (6.0 * time * (1.0 - time) / span)[:, None]
+    speed = np.gradient(rows, share, axis=0) * (6.0 * time * (1.0 - time))[:, None]
+    # Between rows a controller's cubic may be faster than at them.
+    fastest = np.abs(CubicHermiteSpline(time, rows, speed)(np.linspace(0.0, 1.0, _SAMPLES), 1)).max(0)
+    span = max(shortest, least, float((fastest / limits).max()))
+    return span * time, speed / span

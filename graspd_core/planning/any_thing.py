@@ -89,7 +89,7 @@ def plan_any_thing(
     surface: Plane | None = None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None = None,
     failures: Sequence[Failure] = (),
-    tries: int = 3,
+    tries: int = 4,
     seconds: float | None = None,
     on_thing: Callable[[ThingPlan], None] | None = None,
     **plan: Any,
@@ -147,7 +147,7 @@ def _plan_thing(views, hand, points, failed, settings, surface, solids, plan) ->
     if solids:
         scene = with_neighbours(scene, solids, settings)
     lost = [failure.grasp for failure in failed if failure.grasp is not None]
-    plan = {**plan, "count": plan.get("count", 1) + len(lost), "seed": plan.get("seed", 0) + len(failed)}
+    plan = {**plan, "count": plan.get("count", 1) + 2 * len(lost), "seed": plan.get("seed", 0) + len(failed)}
     result = plan_grasps(scene, hand, **plan)
     left = [grasp for grasp in unlike(result.grasps, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
