@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +61,8 @@ def run(options: argparse.Namespace) -> int:
 
     _refuse(options)
     torch.set_num_threads(1)
+    # What is frozen at the end is never freed, and OMPL's library complains of that on many lines.
+    atexit.register(gc.unfreeze)
     found = () if options.things == ["families"] else find_sources(options.things)
     things = tuple((source.source, source.mass) for source in found)
     case = CellCase(f"{options.arm}+{options.hand}", options.count, options.seed, options.preset, things)

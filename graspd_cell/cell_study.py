@@ -39,6 +39,8 @@ DEVELOPED_ON, _FIRST_SEED = 99, 100
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
 # Attempts at a bin: so many a thing, and some more.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
+# After so long graspd looks at no further thing: longer than a robot waits, or a busy machine would spoil the figures [s].
+_SECONDS = 20.0
 # Upper bounds of probabilities that the curve is told for.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
@@ -102,7 +104,9 @@ def run_cell(case: CellCase) -> Record:
     robot.wait(1.0)
     began = robot.referee()
     watch = AttemptWatch(robot)
-    source = _TimedSource(InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed))
+    source = _TimedSource(
+        InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed, seconds=_SECONDS)
+    )
     picker = Picker(robot, source, arm, hand, world.layout)
     most, error = _TRIES_A_THING * case.size + _MORE_TRIES, ""
     try:

@@ -56,7 +56,7 @@ def view_point(robot: SimulatedRobot) -> tuple[np.ndarray, np.ndarray]:
     middle = 0.4 * (pick + place)
     ahead = middle / np.linalg.norm(middle)
     side = (pick - place) / np.linalg.norm(pick - place)
-    return middle + 1.05 * ahead + 0.75 * side + np.array([0.0, 0.0, 0.85]), middle + np.array([0.0, 0.0, 0.12])
+    return middle + 1.35 * ahead + 0.9 * side + np.array([0.0, 0.0, 1.0]), middle + np.array([0.0, 0.0, 0.25])
 
 
 def cell_picture(
