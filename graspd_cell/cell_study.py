@@ -39,7 +39,7 @@ DEVELOPED_ON, _FIRST_SEED = 99, 100
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
 # Attempts at a bin: so many a thing, and some more.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
-# After so long graspd looks at no further thing: longer than a robot waits, or a busy machine would spoil the figures [s].
+# After so long graspd looks at no further thing [s]: longer than a robot waits, or a busy machine would spoil figures.
 _SECONDS = 20.0
 # Upper bounds of probabilities that the curve is told for.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
