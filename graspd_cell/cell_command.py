@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_cell.cell_view import Film, LiveCell, ToldSource
     from graspd_cell.grasp_source import InProcessGrasps
     from graspd_cell.picker import Cancelled, Ending, Picker, summary
-    from graspd_cell.simulated_robot import SimulatedRobot
+    from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
     from graspd_cell.things import find_sources
     from graspd_cell.world import pile_cell
     from graspd_core.arms.arm import load_arm
@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     arm, hand = load_arm(options.arm), load_hand(options.hand)
     world = pile_cell(arm, hand, case.sources(), options.seed)
     robot = SimulatedRobot(world, seed=options.seed)
-    robot.wait(1.0)
+    robot.wait(SETTLING)
     live = LiveCell(robot, host=options.host, port=options.port, speed=options.speed) if options.view else None
     film = Film(robot) if options.film else None
     source = ToldSource(

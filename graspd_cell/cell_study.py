@@ -20,7 +20,7 @@ from graspd_bench.study import Case, Record, Request, Sections, Study
 from graspd_cell.grasp_source import InProcessGrasps, Offer
 from graspd_cell.picker import Attempt, Ending, Picker
 from graspd_cell.referee import Report
-from graspd_cell.simulated_robot import SimulatedRobot
+from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
 from graspd_cell.things import Thing, ThingSource, family_sources, find_sources
 from graspd_cell.world import pile_cell
 from graspd_core.arms.arm import load_arm
@@ -101,7 +101,7 @@ def run_cell(case: CellCase) -> Record:
     arm, hand = load_arm(arm_name), load_hand(hand_name)
     world = pile_cell(arm, hand, case.sources(), case.seed)
     robot = SimulatedRobot(world, seed=case.seed)
-    robot.wait(1.0)
+    robot.wait(SETTLING)
     began = robot.referee()
     watch = AttemptWatch(robot)
     source = _TimedSource(

@@ -25,6 +25,8 @@ from graspd_core.types import TriangleMesh, joined
 
 # Of the arm's controller [rad], [s]; the hand's has none.
 ARM_TOLERANCES = Tolerances(path=0.1, goal=0.02, goal_time=1.0)
+# What was dropped into a bin comes to rest within this [s].
+SETTLING = 2.0
 # Steps between two looks at tolerances and forces. So long an arm brakes, and a camera takes for an image [s].
 _LOOK_EVERY, _BRAKING, CAMERA_PERIOD = 2, 0.3, 0.1
 
