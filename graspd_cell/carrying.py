@@ -30,7 +30,7 @@ def tip_pose(mover: Mover, q: Joints) -> Pose:
 
 
 def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows joints"]:
-    """Return joint values along a straight way of the tip [m], as far as it is reached and nothing is nearer than before.
+    """Return joint values along a straight way of the tip [m], as far as it is reached and clear.
 
     The first row is `q`.
     """

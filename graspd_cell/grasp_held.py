@@ -1,7 +1,7 @@
 """Whether a hand holds something, from what real hands tell: joint positions and efforts.
 
-Joints whose squeeze target lies beyond the grasp press. What is in the hand stops them short of it. A joint that arrived
-at its target presses on nothing. What slips out lets the joints go on from where they stood when they squeezed.
+Joints whose squeeze target lies beyond the grasp press. What is in the hand stops them short of it. A joint that
+arrived at its target presses on nothing. What slips out lets the joints go on from where they stood when they squeezed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_cell.robot import JointReading
-from graspd_core.hands.fingers import find_fingers
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
 from graspd_core.types import Grasp
 
@@ -64,9 +63,7 @@ def after_squeeze(hand: HandModel, grasp: Grasp, reading: JointReading) -> Hold:
     """Return what later readings are compared with; `reading` is that of the hand after the squeeze."""
     own = reading.of(hand.joint_names)
     scale = np.where(hand.slides, 1.0 / METRES_PER_RADIAN, 1.0)
-    touch, target = (
-        np.clip(p.joint_positions, hand.lower, hand.upper) for p in (grasp.grasp, grasp.squeeze)
-    )
+    touch, target = (np.clip(p.joint_positions, hand.lower, hand.upper) for p in (grasp.grasp, grasp.squeeze))
     return Hold(np.abs(target - touch) * scale > _PRESSES, scale, touch, target, own.positions, own.efforts)
 
 
@@ -77,7 +74,9 @@ def grips(hold: Hold) -> Held:
     way = (hold.target - hold.touch)[hold.presses]
     covered = (hold.positions - hold.touch)[hold.presses] / way
     if np.median(covered) > _ARRIVED:
-        return Held(False, f"the fingers closed on nothing: they covered {100 * np.median(covered):.0f} % of the squeeze")
+        return Held(
+            False, f"the fingers closed on nothing: they covered {100 * np.median(covered):.0f} % of the squeeze"
+        )
     return Held(True)
 
 
@@ -88,7 +87,7 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
         return Held(True)
     toward = np.sign(hold.target - hold.touch)
     on = (toward * (own.positions - hold.positions) * hold.scale)[hold.presses]
-    pressed = np.maximum((toward * hold.efforts * 1.0)[hold.presses], 0.0).sum()
+    pressed = np.maximum((toward * hold.efforts)[hold.presses], 0.0).sum()
     pressing = np.maximum((toward * own.efforts)[hold.presses], 0.0).sum()
     if pressed > 0 and pressing < _EFFORT_LEFT * pressed:
         return Held(False, f"the joints press with {100 * pressing / pressed:.0f} % of what they did")

@@ -20,9 +20,8 @@ from graspd_core.errors import CloudError
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.planning.any_thing import Failure, ThingPlan, plan_any_thing
+from graspd_core.planning.any_thing import OUT_OF_TRIES, Failure, ThingPlan, plan_any_thing
 from graspd_core.planning.plan_grasps import warm_up
-from graspd_core.planning.steering import Steering
 from graspd_core.types import Grasp, Plane, TriangleMesh, Verdict
 
 __all__ = ["Failure", "GraspSource", "InProcessGrasps", "Offer", "cloud_of"]
@@ -41,6 +40,7 @@ class Offer:
         things: how many were seen.
         reason: why there is no verified grasp.
         failures: things that were looked at and have no grasp at all.
+        exhausted: whether each thing seen has been tried in vain too often.
         seconds: graspd's time, wall clock.
     """
 
@@ -52,6 +52,7 @@ class Offer:
     things: int = 0
     reason: str = ""
     failures: tuple[Failure, ...] = ()
+    exhausted: bool = False
     seconds: float = 0.0
 
 
@@ -84,10 +85,6 @@ def scene_config(source: Bin) -> SceneConfig:
     return SceneConfig(segmentation=cut)
 
 
-# A hand comes within so much of straight down [rad].
-_FROM_ABOVE = 1.2
-
-
 class InProcessGrasps:
     """graspd as a library.
 
@@ -104,12 +101,11 @@ class InProcessGrasps:
         seed: int = 0, tries: int = 3,
     ) -> None:  # fmt: skip
         self._hand, self._source = hand, layout.pick
-        down = Steering(approach_direction=(0.0, 0.0, -1.0), approach_angle=_FROM_ABOVE)
         self._plan = {
             "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "seconds": seconds,
-            "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.pick.walls)},
-            "restrictions": (down, Reach(arm, (0.0, 0.0, 0.0))), "measure": False, "preset": preset, "seed": seed,
-            "deadline": 2 * seconds,
+            "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
+            "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
+            "deadline": seconds,
         }  # fmt: skip
         warm_up(hand)
 
@@ -119,18 +115,20 @@ class InProcessGrasps:
         try:
             found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, **self._plan)
         except CloudError as error:
-            return Offer(None, reason=str(error), seconds=time.perf_counter() - began)
+            return Offer(None, reason=str(error), exhausted=True, seconds=time.perf_counter() - began)
         return _offer(found, time.perf_counter() - began)
 
 
 def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
-    failed = tuple(Failure(thing.place) for thing in found if thing.grasp is None and thing.scene is not None)
+    failed = tuple(Failure(thing.place) for thing in found if thing.grasp is None and thing.looked_at)
     reasons = "; ".join(dict.fromkeys(thing.reason for thing in found if thing.reason))
     if not found or found[0].grasp is None:
-        told = reasons or "nothing is seen in the bin"
-        return Offer(None, things=len(found), reason=told, failures=failed, seconds=seconds)
+        told, over = reasons or "nothing is seen in the bin", all(thing.reason == OUT_OF_TRIES for thing in found)
+        return Offer(None, things=len(found), reason=told, failures=failed, exhausted=over, seconds=seconds)
     best = found[0]
-    assert best.grasp is not None and best.scene is not None and best.result is not None
+    assert best.grasp is not None
+    assert best.scene is not None
+    assert best.result is not None
     return Offer(
         best.grasp,
         best.place,
@@ -140,5 +138,5 @@ def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
         len(found),
         best.reason,
         failed,
-        seconds,
+        seconds=seconds,
     )

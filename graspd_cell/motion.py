@@ -1,9 +1,9 @@
 """Motions of the arm between postures, clear of all that the camera saw and of what is known to stand in the cell.
 
 Arm, hand and the thing in the hand are balls: the arm's from its capsules (docs/arms.md), the others from points of
-their surfaces, which are fixed to the tip while a motion lasts. What must not be touched is a grid of distances from the
-points seen, a floor, and boxes. Paths are found by OMPL's RRTConnect, which asks about whole edges at once, and timed by
-toppra within the arm's limits.
+their surfaces, which are fixed to the tip while a motion lasts. What must not be touched is a grid of distances from
+the points seen, a floor, and boxes. Paths are found by OMPL's RRTConnect, which asks about whole edges at once, and
+timed by toppra within the arm's limits.
 
 OMPL's wheel stands alone, where roboplan's brings 25 others and asks for a model of its own of arm and scene. Ruckig's
 wheel goes from state to state only: waypoints in between are sent to a server.
@@ -271,6 +271,10 @@ class Mover:
             parts.append(gap + self.margin)
         return np.concatenate(parts, 1)
 
+    def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
+        """Return the distance of the arm's balls, without the hand's, to floor, boxes and points seen."""
+        return self.clearances(q)[:, : int(self.shape.beyond_shoulder.sum())]
+
     def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
         """Return how near each ball may come: the margin, or as near as it is at one of the ends."""
         return np.minimum(self.margin, self.clearances(ends).min(0) - 1e-3)
@@ -293,8 +297,9 @@ def dense(path: Path, step: float = _STEP) -> Path:
     return np.concatenate([*parts, path[-1:]])
 
 
-# A motion may begin and end this deep in what was seen, whose surface is known to a cell [m].
-_DEEPEST = -0.02
+# A motion may begin and end with the hand this deep in what was seen, whose surface is known to a cell, and with the
+# arm, whose capsules are larger than its links, this deep in anything [m].
+_DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
 
 def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 1.5) -> Path:
@@ -304,9 +309,13 @@ def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 1.5) -
         NoMotionError: an end is in something, or no way was found in `seconds`.
     """
     ends = np.stack([start, goal])
-    for name, depth in zip(("start", "goal"), mover.clearances(ends).min(1), strict=True):
-        if depth < _DEEPEST:
-            raise NoMotionError(f"motion: its {name} is {-1e3 * depth:.0f} mm deep in something; valid: clear of all")
+    depths = mover.clearances(ends).min(1), mover.arm_clearances(ends).min(1)
+    for name, whole, own in zip(("start", "goal"), *depths, strict=True):
+        if whole < _DEEPEST or (own < ARM_DEEPEST and name == "goal"):
+            depth = f"{-1e3 * min(whole, own):.0f} mm"
+            raise NoMotionError(
+                f"motion: {mover.shape.arm.name} is {depth} deep in something at its {name}; valid: clear of all"
+            )
     allowed = mover.allowed(ends)
     if mover.clear(ends, allowed):
         return ends
@@ -398,7 +407,10 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1))]
     most = speeds.share * np.asarray(arm.chain.velocity)
     push = np.full(len(most), speeds.acceleration)
-    limits = [JointVelocityConstraint(np.stack([-most, most], 1)), JointAccelerationConstraint(np.stack([-push, push], 1))]
+    limits = [
+        JointVelocityConstraint(np.stack([-most, most], 1)),
+        JointAccelerationConstraint(np.stack([-push, push], 1)),
+    ]
     trajectory = TOPPRA(
         limits, toppra.SplineInterpolator(along, rows), parametrizer="ParametrizeConstAccel"
     ).compute_trajectory()

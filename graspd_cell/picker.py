@@ -20,17 +20,19 @@ from graspd_cell.grasp_held import Hold, after_squeeze, grips, still_holds
 from graspd_cell.grasp_source import Failure, GraspSource, Offer, cloud_of
 from graspd_cell.layout import CellLayout
 from graspd_cell.motion import (
+    ARM_DEEPEST,
     Mover,
     NoMotionError,
     SeenWorld,
     Speeds,
     arm_shape,
+    dense,
     find_path,
     hand_balls,
     seen_world,
     timed,
 )
-from graspd_cell.robot import JointMotion, JointReading, MotionAborted, Robot, never
+from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
 from graspd_core.arms.arm import Arm
 from graspd_core.arms.execution import Execution, ExecutionPace, execution_of
 from graspd_core.errors import GraspdError
@@ -95,16 +97,14 @@ class Pace:
         patience: seconds beyond a motion's own until it has to be over.
         settle: seconds that the fingers get to press.
         least_probability: of a grasp that is not verified, to be tried when nothing is.
-        barren: looks in a row without any grasp after which the bin is given up.
     """
 
-    free: Speeds = Speeds(0.7, 5.0)
-    loaded: Speeds = Speeds(0.4, 2.5)
+    free: Speeds = field(default_factory=lambda: Speeds(0.7, 5.0))
+    loaded: Speeds = field(default_factory=lambda: Speeds(0.4, 2.5))
     grasp: ExecutionPace = field(default_factory=ExecutionPace)
     patience: float = 3.0
     settle: float = 0.4
     least_probability: float = 0.4
-    barren: int = 3
 
 
 @dataclass(eq=False)
@@ -149,7 +149,7 @@ class Picker:
             Cancelled: somebody cancelled.
             MotionAborted: the arm does not come home, so that nothing can be seen any more.
         """
-        barren = attempts = 0
+        attempts = 0
         while attempts < most:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
@@ -157,14 +157,13 @@ class Picker:
             self._failures += offer.failures
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
             if offer.grasp is None or not (offer.verified or likely):
-                barren += 1
                 self.why_ended = offer.reason
-                if not offer.things or barren >= self._pace.barren:
+                if offer.exhausted:
                     return
                 if offer.grasp is not None:
                     self._failures.append(Failure(offer.place, offer.grasp.grasp))
                 continue
-            barren, attempts = 0, attempts + 1
+            attempts += 1
             attempt = self.attempt(offer, self.world_of(view), began, attempts)
             self._learn(attempt, offer)
             yield attempt
@@ -175,9 +174,8 @@ class Picker:
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
-            execution = execution_of(
-                offer.grasp, self._arm, self._hand, mass=max(offer.mass, 1e-3), pace=self._pace.grasp
-            )
+            speeds = self._pace.free.share * np.asarray(self._arm.chain.velocity)
+            execution = execution_of(offer.grasp, self._hand, arm_speeds=speeds, mass=offer.mass, pace=self._pace.grasp)
             taking = _Taking(offer, execution, world, began)
             ending, reason = self._steps(taking)
         except NoMotionError as error:
@@ -211,8 +209,8 @@ class Picker:
         self.let_go(taking)
         return Ending.PICKED, ""
 
-    def world_of(self, view) -> SeenWorld:
-        """Return what must not be touched: what a view shows but for the robot itself, and what is known of the cell."""
+    def world_of(self, view: DepthView) -> SeenWorld:
+        """Return what must not be touched: what a view shows without the robot, and what is known of the cell."""
         points = cloud_of(view).points
         mover = self._mover(SeenWorld(0.0))
         balls, carried = mover.placed(self._arm_now())
@@ -235,6 +233,10 @@ class Picker:
         start = taking.execution.hand[0]
         self._move_hand(start)
         mover = self._mover(taking.world, start)
+        depth = -mover.arm_clearances(dense(taking.execution.arm)).min()
+        if depth > -ARM_DEEPEST:
+            told = f"{1e3 * depth:.0f} mm deep in something; valid: clear of all"
+            raise NoMotionError(f"motion: on its way through the grasp {self._arm.name} is {told}")
         goal = taking.execution.arm[0]
         # From above, where the way down is straight, else as the planner finds.
         above = straight(mover, goal, np.array([0.0, 0.0, 0.12]))[::-1]
@@ -268,10 +270,12 @@ class Picker:
         mover = self._mover(world, self._hand_now())
         mover = replace(mover, carried=held_balls(mover, here, thing))
         up = straight(mover, here, np.array([0.0, 0.0, 0.1]))
-        risen = thing + [0.0, 0.0, mover.height(up[-1]) - mover.height(here)]
+        risen = thing + np.array([0.0, 0.0, mover.height(up[-1]) - mover.height(here)])
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
-            raise NoMotionError(f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}")
+            raise NoMotionError(
+                f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}"
+            )
         path = find_path(mover, up[-1], goal)
         lost = ""
 
@@ -323,7 +327,7 @@ class Picker:
         mover = self._mover(taking.world)
         points = surface_samples(taking.offer.surface, 1500, 0)[0]
         at = taking.execution.arm[taking.execution.gates[1]]
-        return points + [0.0, 0.0, mover.height(here) - mover.height(at)]
+        return points + np.array([0.0, 0.0, mover.height(here) - mover.height(at)])
 
     def _without_thing(self, taking: _Taking) -> SeenWorld:
         """The world without the points of the thing that is in the hand now."""

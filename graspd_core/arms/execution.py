@@ -1,8 +1,8 @@
 """A grasp as an executor needs it: one timed trajectory of arm and hand, with gates, so that it needs no geometry.
 
-At every gate all joints are at rest: an executor sends the rows up to a gate, looks whether it is reached, and sends the
-next ones. Between two gates the joints run along the grasp's own path by a cubic from rest to rest, whose greatest speed
-is 1.5 times the mean one.
+At every gate all joints are at rest: an executor sends the rows up to a gate, looks whether it is reached, and sends
+the next ones. Between two gates the joints run along the grasp's own path by a cubic from rest to rest, whose greatest
+speed is 1.5 times the mean one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.arms.arm import Arm
 from graspd_core.arms.arm_paths import LIFT
 from graspd_core.config.planning_config import GraspStagesConfig
 from graspd_core.errors import ConfigError
@@ -35,7 +34,6 @@ class ExecutionPace:
     """How fast a grasp is executed.
 
     Attributes:
-        joint_share: of the greatest speeds of the arm's joints.
         finger_speed: greatest of the hand's turning joints [rad/s].
         base_speed: greatest of the hand on its way to the object and up, and of its sliding joints [m/s].
         closing_speed: greatest of the hand from the pregrasp to the grasp [m/s].
@@ -44,7 +42,6 @@ class ExecutionPace:
         gentlest, strongest: bounds of the lift's acceleration [m/s²].
     """
 
-    joint_share: float = 0.5
     finger_speed: float = 1.0
     base_speed: float = 0.15
     closing_speed: float = 0.05
@@ -91,16 +88,21 @@ class Execution:
 
 
 def execution_of(
-    grasp: Grasp, arm: Arm, hand: HandModel, *, mass: float, pace: ExecutionPace | None = None
+    grasp: Grasp,
+    hand: HandModel,
+    *,
+    arm_speeds: Float[np.ndarray, "joints"],
+    mass: float | None = None,
+    pace: ExecutionPace | None = None,
 ) -> Execution:
     """Return the timed trajectory of a grasp that an arm reaches.
 
     Args:
         grasp: with `Grasp.arm`.
-        arm: that its path was found for.
         hand: that it was planned for.
-        mass: of the object [kg].
-        pace: how fast.
+        arm_speeds: greatest of the arm's joints [rad/s] or [m/s].
+        mass: of the object [kg]. None: nobody knows, so that the lift is gentle.
+        pace: how fast all else moves.
 
     Raises:
         ConfigError: the grasp has no path of the arm.
@@ -108,7 +110,7 @@ def execution_of(
     if grasp.arm is None:
         raise ConfigError("execution: the grasp has no path of an arm; plan it with the restriction Reach")
     pace, path, (retreat, before, closed, lifted) = pace or ExecutionPace(), grasp.arm.positions, grasp.arm.stages
-    limits = np.concatenate([pace.joint_share * arm.chain.velocity, _finger_speeds(hand, pace)])
+    limits = np.concatenate([arm_speeds, _finger_speeds(hand, pace)])
     low, high = hand.lower, hand.upper
     open_, touch, press = (np.clip(p.joint_positions, low, high) for p in (grasp.pregrasp, grasp.grasp, grasp.squeeze))
     shares = np.linspace(0.0, 1.0, closed - before + 1)[:, None]
@@ -127,20 +129,20 @@ def execution_of(
         rows.append(stage[1:])
         speeds.append(speed[1:])
         gates.append(gates[-1] + len(stage) - 1)
-    rows, speeds, count = np.concatenate(rows), np.concatenate(speeds), len(arm.joint_names)
+    rows, speeds, count = np.concatenate(rows), np.concatenate(speeds), len(grasp.arm.joint_names)
     efforts = np.zeros((len(rows), hand.num_joints))
     efforts[gates[3] :] = squeeze_efforts(grasp, hand)
     efforts[gates[2] : gates[3] + 1] = steps * efforts[gates[3]]
     return Execution(
-        arm.joint_names, hand.joint_names, np.concatenate(times), rows[:, :count], speeds[:, :count],
+        grasp.arm.joint_names, hand.joint_names, np.concatenate(times), rows[:, :count], speeds[:, :count],
         rows[:, count:], speeds[:, count:], efforts, tuple(gates[1:]),
     )  # fmt: skip
 
 
-def lift_time(grasp: Grasp, mass: float, pace: ExecutionPace) -> float:
+def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
     """Return how long the lift takes [s]: the faster, the more than its mass the grasp would hold."""
     payload = (grasp.metrics or {}).get("payload")
-    spare = 0.0 if payload is None else _GRAVITY * (pace.payload_share * payload / mass - 1.0)
+    spare = 0.0 if not payload or not mass else _GRAVITY * (pace.payload_share * payload / mass - 1.0)
     return math.sqrt(PEAK_ACCELERATION * LIFT / min(max(spare, pace.gentlest), pace.strongest))
 
 
@@ -150,9 +152,7 @@ def squeeze_efforts(
     """Return what the joints press with when the object stops them at the grasp, within their limits [N·m] or [N]."""
     stages = stages or GraspStagesConfig()
     gain = np.where(hand.slides, stages.slide_stiffness, stages.stiffness)
-    return np.clip(
-        gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort
-    )
+    return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
 
 
 def _finger_speeds(hand: HandModel, pace: ExecutionPace) -> Float[np.ndarray, "joints"]:

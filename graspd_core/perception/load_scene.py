@@ -45,7 +45,7 @@ def load_scene(
         settings: how a cloud becomes a scene.
 
     Raises:
-        MeshError: the mesh cannot be read or used, or a number is out of range.
+        MeshError: the mesh cannot be read or used, has a target, or a number is out of range.
         CloudError: the cloud cannot be read or shows no object.
     """
     started = time.perf_counter()
@@ -63,6 +63,8 @@ def load_scene(
             views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
         )
         return replace(scene, object=replace(scene.object, scale=scale))
+    if target is not None:
+        raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which thing is meant")
     mesh, warnings = _read_mesh(source, scale)
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 

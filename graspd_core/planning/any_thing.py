@@ -29,6 +29,8 @@ from graspd_core.types import Grasp, GraspResult, Plane, Posture, TriangleMesh, 
 
 # A grasp is like one that was lost where its base is this near to it and turned by less [m], [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
+# Why a thing is not looked at any more.
+OUT_OF_TRIES = "tried in vain too often"
 # What is seen within this of a place where something failed is that thing [m].
 _SAME_PLACE = 0.04
 
@@ -56,6 +58,7 @@ class ThingPlan:
         result: of planning; None without a scene.
         grasp: the best one, verified or not; None where there is none.
         reason: why there is no verified grasp; empty where there is.
+        looked_at: whether a grasp was looked for in this request.
     """
 
     points: Float[np.ndarray, "_ 3"]
@@ -63,6 +66,7 @@ class ThingPlan:
     result: GraspResult | None = None
     grasp: Grasp | None = None
     reason: str = ""
+    looked_at: bool = True
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
@@ -90,7 +94,7 @@ def plan_any_thing(
     on_thing: Callable[[ThingPlan], None] | None = None,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
-    """Plan for the things seen until one has a verified grasp; the surest thing comes first. Empty: nothing is seen.
+    """Plan for the things seen until one has a verified grasp, and return all of them, the surest first.
 
     Args:
         views: what each camera saw [m].
@@ -98,7 +102,7 @@ def plan_any_thing(
         settings: of the way from clouds to scenes.
         surface: what all things stand on, where it is known.
         solids: what else is known to stand there, by name, frame of the views [m].
-        failures: of before. A thing is not looked at again after `tries` of them, nor is a grasp given that is like one.
+        failures: of before. A thing is not looked at again after `tries` of them. No grasp is given that is like one.
         tries: of a thing at most.
         seconds: after which no further thing is begun.
         on_thing: called with each thing that was looked at.
@@ -108,19 +112,17 @@ def plan_any_thing(
         CloudError: empty, all NaN, or too few points.
         ConfigError: see `plan_grasps`.
     """
-    began, looked = time.perf_counter(), list[ThingPlan]()
+    began, things, over = time.perf_counter(), list[ThingPlan](), False
     for points, failed in _in_order(find_things(views, settings and settings.segmentation), failures):
-        if looked and seconds is not None and time.perf_counter() - began > seconds:
-            break
-        if len(failed) >= tries:
-            looked.append(ThingPlan(points, reason=f"tried {len(failed)} times in vain"))
+        if over or len(failed) >= tries:
+            told = OUT_OF_TRIES if len(failed) >= tries else "not looked at"
+            things.append(ThingPlan(points, reason=told, looked_at=False))
             continue
-        looked.append(_plan_thing(views, hand, points, failed, settings, surface, solids, plan))
+        things.append(_plan_thing(views, hand, points, failed, settings, surface, solids, plan))
         if on_thing is not None:
-            on_thing(looked[-1])
-        if looked[-1].surety > 1.0:
-            break
-    return tuple(sorted(looked, key=lambda thing: -thing.surety))
+            on_thing(things[-1])
+        over = things[-1].surety > 1.0 or (seconds is not None and time.perf_counter() - began > seconds)
+    return tuple(sorted(things, key=lambda thing: -thing.surety))
 
 
 def _in_order(

@@ -167,6 +167,9 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise bad_request(f"cloud: {len(message.cloud.data)} bytes; at most {seen.MOST_CLOUD_BYTES} are taken")
     if message.use_target_point:
         near(message.target_point, "target_point")
+        if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
+            told = f"with source {message.source}, one object; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
+            raise bad_request(f"target_point: {told}")
     _check_camera_and_mask(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
         raise bad_request(f"surface: with source {message.source}, whose cloud shows it; valid with MESH=1 and KNOWN=4")

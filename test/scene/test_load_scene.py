@@ -41,6 +41,11 @@ def test_file_scale_and_value_agree(tmp_path):
     assert torch.allclose(from_file.sdf.field[0], from_value.sdf.field[0], atol=1e-6)
 
 
+def test_a_target_on_a_mesh_is_refused_by_name():
+    with pytest.raises(MeshError, match="target: given with shape:box, a mesh; valid with clouds"):
+        load_scene("shape:box", target=Target(point=np.zeros(3)))
+
+
 def test_a_cloud_becomes_a_scene_in_its_own_frame():
     """The side of a sphere that a camera at the origin sees, a third of a metre ahead."""
     ball, normals = surface_samples(make_shape("sphere"), 6000, 0)

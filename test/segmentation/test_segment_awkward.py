@@ -11,6 +11,7 @@ from graspd_bench.rendering.tabletop import TabletopScene, ring_poses, tabletop,
 from graspd_bench.stress.broken_clouds import beside_a_step, half_out_of_view, zero_filled
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.point_cloud import PointCloud, measured
@@ -18,6 +19,7 @@ from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.segment.clusters import merge_occluded
 from graspd_core.perception.segment.segment import Segmentation, segment
 from graspd_core.perception.segment.target_selection import Target
+from graspd_core.types import TriangleMesh
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 STAGE = tabletop("box", yaw=0.3)
@@ -151,3 +153,19 @@ def test_a_thing_whose_foot_another_hides_is_a_thing_of_its_own(front, behind, a
     found = segment([view], target=Target(point=np.array([0.03, 0.0, 0.04])))
     assert share_of_truth(found, scene) > 0.99
     assert found.obstacles
+
+
+@pytest.mark.parametrize("elevation", [0.4, 0.9])
+def test_a_point_inside_a_large_thing_means_that_thing(elevation):
+    """Pose estimators give the middle, which is farther from what is seen than a point on the surface ever is."""
+    pitcher = make_shape("cylinder")
+    pitcher = TriangleMesh(pitcher.vertices * [2.2, 2.2, 2.0], pitcher.faces)
+    stage = tabletop(pitcher, obstacles=[("sphere", 0.13, 0.05)])
+    low, high = stage.truth.vertices.min(0), stage.truth.vertices.max(0)
+    seen = segment(
+        views_of(stage, CAMERA, ring_poses(1, elevation=elevation, distance=0.7)),
+        target=Target(point=0.5 * (low + high)),
+    )
+    points = seen.views[0].points
+    assert ((points > low - 0.01) & (points < high + 0.01)).all()
+    assert np.ptp(points, axis=0).max() > 0.1

@@ -39,6 +39,31 @@ def test_two_that_touch_are_told_where_the_seam_is_seen(azimuth):
     assert segment([view], target=Target(box=bounds)).warnings == ()
 
 
+@pytest.mark.parametrize("azimuth", [-2.2, -1.2, -0.9])
+def test_a_target_on_one_side_of_the_seam_means_that_side(azimuth):
+    view = view_of(CYLINDER_BESIDE, azimuth)
+    border = CYLINDER_BESIDE.truth.vertices[:, 0].max()
+    for mesh, side in ((CYLINDER_BESIDE.truth, -1.0), (CYLINDER_BESIDE.obstacles[0], 1.0)):
+        # As pose estimators give it: the middle of the thing, which no camera sees.
+        middle = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
+        seen = segment([view], target=Target(point=middle))
+        beyond = side * (seen.views[0].points[:, 0] - border)
+        assert np.mean(beyond > -0.004) > 0.98
+        assert len(seen.views[0].points) > 500
+        # What is on the other side of the seam is in the way.
+        assert any(np.mean(side * (thing[:, 0] - border) < 0.004) > 0.95 for thing in seen.obstacles)
+        assert any("without what touches it" in doubt for doubt in seen.warnings)
+        box = (mesh.vertices.min(0) - 0.002, mesh.vertices.max(0) + 0.002)
+        assert np.mean(side * (segment([view], target=Target(box=box)).views[0].points[:, 0] - border) > -0.006) > 0.97
+
+
+def test_two_that_are_too_large_together_are_parted_by_the_target():
+    stage = tabletop("hammer", obstacles=[("hammer", 0.0, 0.112), ("bottle", 0.11, 0.02)])
+    view = view_of(stage, -1.2, 0.9, 0.7)
+    seen = segment([view], target=Target(point=np.array([0.11, 0.02, 0.08])))
+    assert np.abs(seen.views[0].points[:, :2] - [0.11, 0.02]).max() < 0.06
+
+
 def side_by_side(one: str, other: str) -> TabletopScene:
     """Two shapes that touch where both are widest along x."""
     widths = [tabletop(name).truth.vertices[:, 0] for name in (one, other)]

@@ -130,8 +130,8 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     return answer
 
 
-def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], spacing: float) -> tuple[Vector, ...]:
-    """Middles of the parts of a cluster that seams and waists set apart and that stand on their own; empty where there
+def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], spacing: float) -> Int[np.ndarray, "n"]:
+    """Number the parts of a cluster that seams and waists set apart and that stand on their own; all 0 where there
     is one.
 
     Args:
@@ -140,8 +140,9 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
         height: of the points above the support [m].
         spacing: of the points [m].
     """
+    one = np.zeros(len(points), dtype=int)
     if len(points) < 2 * _NEIGHBOURS:
-        return ()
+        return one
     tree = KDTree(points)
     distance, near = map(np.asarray, tree.query(points, k=_NEIGHBOURS))
     normals = _normals(points, near, eyes)
@@ -161,8 +162,9 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
             and waist <= _WAIST * depth[mine].max()
         ]
         if len(things) > 1:
-            return tuple(points[mine].mean(0) for mine in things)
-    return ()
+            # The seam itself, and pieces that occlusion set apart, belong to the part that is nearest.
+            return np.argmin([KDTree(points[mine]).query(points)[0] for mine in things], axis=0)
+    return one
 
 
 def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Points:

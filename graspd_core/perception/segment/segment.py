@@ -23,7 +23,7 @@ from graspd_core.perception.segment.clusters import (
 )
 from graspd_core.perception.segment.planes import find_planes
 from graspd_core.perception.segment.support_plane import Ground, find_ground, stands_on
-from graspd_core.perception.segment.target_selection import Target, check_target, seen, select_target
+from graspd_core.perception.segment.target_selection import Target, check_target, seen, select_part, select_target
 from graspd_core.types import Plane
 
 # Scenes nearer than this to their cameras are in another unit than metres [m].
@@ -67,9 +67,15 @@ def segment(
     scene, ground, label = parted.scene, parted.ground, parted.label
     free = _candidates(parted)
     marked = target.box is not None or target.mask is not None
-    if not free and not (marked and label.max(initial=-1) >= 0):
+    named = marked or target.point is not None
+    if not free and not (named and label.max(initial=-1) >= 0):
         raise NoObjectError(_nothing(parted))
     chosen = select_target(scene, label, free, target, views, settings)
+    parts = _parts(parted, chosen)
+    if named:
+        chosen = select_part(scene, parts, target, views, settings)
+    if not free and not marked and extent(scene.mean[chosen]) > settings.largest_object:
+        raise NoObjectError(_nothing(parted))
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found)
     if total < MIN_POINTS:
@@ -77,7 +83,7 @@ def segment(
     obstacles = _obstacles(parted, chosen)
     doubts = _doubts(parted, chosen, bool(obstacles))
     support = None if ground.support is None else ground.support.plane
-    return Segmentation(found, support, obstacles, doubts if marked else (*doubts, *_touching(parted, chosen)))
+    return Segmentation(found, support, obstacles, (*doubts, *(() if marked else _touching(scene, chosen, parts))))
 
 
 def find_things(
@@ -197,19 +203,28 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
     return tuple(doubts)
 
 
-def _touching(parted: _Parted, chosen: Mask) -> tuple[str, ...]:
-    """That what was taken for one thing on a support may be several, if a seam parts it."""
+def _parts(parted: _Parted, chosen: Mask) -> Labels:
+    """Which of several things that touch each voxel is of, if a seam parts what was taken for one on a support."""
     scene, support = parted.scene, parted.ground.support
-    if support is None:
+    part = np.where(chosen, 0, -1)
+    if support is not None:
+        points = scene.mean[chosen]
+        part[chosen] = touching_things(points, parted.eyes, support.height(points), scene.size)
+    return part
+
+
+def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
+    """That what was taken for one thing may be several, or what a seam set apart from the one that is meant."""
+    parts = [part == k for k in range(int(part.max(initial=-1)) + 1)]
+    apart = [mine for mine in parts if not (mine & chosen).any()]
+    if len(parts) < 2:
         return ()
-    points = scene.mean[chosen]
-    middles = touching_things(points, parted.eyes, support.height(points), scene.size)
-    if not middles:
-        return ()
-    places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*middle) for middle in middles)
+    places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*scene.mean[mine].mean(0)) for mine in apart or parts)
+    if apart:
+        return (f"cloud: the target is taken without what touches it, about {places} m, up to the seam between them",)
     return (
-        f"cloud: the object may be {len(middles)} things that touch, about {places} m; "
-        "a box or a mask as target says which is meant",
+        f"cloud: the object may be {len(parts)} things that touch, about {places} m; "
+        "a point, a box or a mask as target says which is meant",
     )
 
 

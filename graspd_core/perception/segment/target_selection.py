@@ -10,11 +10,15 @@ from jaxtyping import Bool, Float
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, convex_hull
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene
+from graspd_core.perception.segment.clusters import extent
 
 # Errors list so many things.
 MAX_LISTED_THINGS = 4
+# A point so near to a voxel is on its thing. Voxels so near to a line of sight are on it.
+SURFACE_VOXELS, RAY_VOXELS = 3.0, 1.5
+MIDDLE_SHARE = 0.4
 
 
 @dataclass(frozen=True)
@@ -80,20 +84,50 @@ def select_target(
     """
     many = int(label.max(initial=-1)) + 1
     if target.point is not None:
-        return label == _nearest(scene, label, many, target.point, settings.target_reach)
+        return label == _thing_of(target.point, scene, label, views, settings)
     if target.box is not None:
-        low, high = np.minimum(*target.box) - scene.size, np.maximum(*target.box) + scene.size
-        meant = np.asarray(((scene.mean >= low) & (scene.mean <= high)).all(1))
+        meant = _meant(scene, target)
         inside = np.bincount(label[(label >= 0) & meant], minlength=many)
         if not inside.any():
-            raise NoObjectError(
-                f"target: nothing in the box from {_place(low)} to {_place(high)}; {seen(scene, label)}"
-            )
+            low, high = (_place(corner) for corner in target.box)
+            raise NoObjectError(f"target: nothing in the box from {low} to {high}; {seen(scene, label)}")
         share = inside / np.bincount(label[label >= 0], minlength=many)
         return _covered(label, meant, [int(inside.argmax())], share, settings.target_share)
     if target.mask is not None:
-        return _masked(scene, label, many, target.mask, settings.target_share)
+        return _masked(scene, label, many, _meant(scene, target), settings.target_share)
     return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
+
+
+def select_part(
+    scene: VoxelScene, part: Labels, target: Target, views: Sequence[PointCloud], settings: SegmentationConfig
+) -> Mask:
+    """The voxels of the parts that the target means, of a thing that it chose.
+
+    Args:
+        part: of things that touch, the one that each voxel is of, -1 for none.
+        target: a point, a box or a mask.
+    """
+    if part.max(initial=-1) < 1:
+        return part >= 0
+    if target.point is not None:
+        return part == _thing_of(target.point, scene, part, views, settings)
+    meant, shown = _meant(scene, target), part >= 0
+    if target.mask is not None:
+        shown &= np.isin(np.arange(len(part)), scene.voxel[scene.of_view(0)])
+    many = int(part.max()) + 1
+    count = np.bincount(part[shown], minlength=many)
+    share = np.bincount(part[shown & meant], minlength=many) / np.maximum(count, 1)
+    return _covered(part, meant, list(range(many)), share, settings.target_share)
+
+
+def _meant(scene: VoxelScene, target: Target) -> Mask:
+    """The voxels in the box or under the mask."""
+    if target.box is not None:
+        low, high = np.minimum(*target.box) - scene.size, np.maximum(*target.box) + scene.size
+        return np.asarray(((scene.mean >= low) & (scene.mean <= high)).all(1))
+    meant = np.zeros(len(scene.mean), dtype=bool)
+    meant[scene.voxel[scene.of_view(0)][np.asarray(target.mask)[scene.rows[0]]]] = True
+    return meant
 
 
 def seen(scene: VoxelScene, label: Labels) -> str:
@@ -106,25 +140,65 @@ def seen(scene: VoxelScene, label: Labels) -> str:
     return f"{told} about {', '.join(places)} m"
 
 
-def _nearest(scene: VoxelScene, label: Labels, many: int, point: Vector, reach: float) -> int:
+def _thing_of(
+    point: Vector, scene: VoxelScene, label: Labels, views: Sequence[PointCloud], settings: SegmentationConfig
+) -> int:
+    """The thing that a point means: one it lies on or in, else the nearest within reach.
+
+    A point is in a thing if the thing's hull holds it, or if the thing hides it from a camera, not deeper than half the
+    thing's length. Deeper than `MIDDLE_SHARE` of the length, it may as well mean a nearer thing.
+    """
     away = np.linalg.norm(scene.mean - point, axis=1)
-    away[label < 0] = np.inf
-    nearest = int(away.argmin())
-    if many == 0 or away[nearest] > reach:
-        raise NoObjectError(f"target: nothing within {reach:g} m of the point {_place(point)}; {seen(scene, label)}")
-    return int(label[nearest])
+    things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
+    depth = [float(away[rows].min()) for rows in things]
+    order = sorted(range(len(things)), key=depth.__getitem__)
+    if order and depth[order[0]] <= SURFACE_VOXELS * scene.size:
+        return order[0]
+    hiding = _hiding(point, scene, views)
+    length = [extent(scene.mean[rows]) for rows in things]
+    inside = [
+        k
+        for k, rows in enumerate(things)
+        if depth[k] <= 0.5 * length[k] and (hiding[rows].any() or _holds(scene.mean[rows], point))
+    ]
+    near = [k for k in order[:1] if depth[k] <= settings.target_reach]
+    if not inside + near:
+        reach = f"within {settings.target_reach:g} m of the point {_place(point)}"
+        raise NoObjectError(f"target: nothing {reach}, or around it; {seen(scene, label)}")
+    middle = [k for k in inside if depth[k] <= MIDDLE_SHARE * length[k]]
+    return min(middle or near or inside, key=lambda k: depth[k] / length[k])
 
 
-def _masked(scene: VoxelScene, label: Labels, many: int, mask: Bool[np.ndarray, "points"], least: float) -> Mask:
+def _hiding(point: Vector, scene: VoxelScene, views: Sequence[PointCloud]) -> Mask:
+    """The voxels that hide a point from a camera; none if a camera sees through the point to what is behind it."""
+    hiding = np.zeros(len(scene.mean), dtype=bool)
+    for view in views:
+        ray = point - view.viewpoint
+        distance = max(float(np.linalg.norm(ray)), 1e-6)
+        way = scene.mean - view.viewpoint
+        along = way @ ray / distance
+        on = np.linalg.norm(way - along[:, None] * ray / distance, axis=1) < RAY_VOXELS * scene.size
+        before = on & (along > 0) & (along < distance)
+        if not before.any() and on.any():
+            return np.zeros(len(scene.mean), dtype=bool)
+        hiding |= before
+    return hiding
+
+
+def _holds(points: Points, point: Vector) -> bool:
+    hull = convex_hull(points)
+    return hull is not None and bool((hull.equations[:, :3] @ point + hull.equations[:, 3] <= 0).all())
+
+
+def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
     """A mask may cover several things, pieces of one that others hide in part; a few points of it may miss."""
     of_first = scene.voxel[scene.of_view(0)]
-    masked = of_first[mask[scene.rows[0]]]
-    shown, covered = (np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, masked))
+    shown, covered = (
+        np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
+    )
     if not covered.any():
         raise NoObjectError(f"target: nothing but background under the mask; {seen(scene, label)}")
     share = covered / np.maximum(shown, 1)
-    meant = np.zeros(len(label), dtype=bool)
-    meant[masked] = True
     main = int(covered.argmax())
     return _covered(label, meant, [main, *(k for k in range(many) if k != main and share[k] >= 0.5)], share, least)
 
