@@ -271,13 +271,14 @@ def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
         model.dof_damping[first + 3 : first + 6] = turn * model.body_inertia[body].max()
 
 
-def dropped(models: Sequence[ObjectModel], seed: int, wall: float) -> tuple[FreeBody, ...]:
+def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: bool = False) -> tuple[FreeBody, ...]:
     """Return things at rest on the table z = 0 that fell one above the other into a fence, which is taken away then.
 
     Args:
         models: the things, in the order of their fall.
         seed: of their turns and places.
         wall: half the side of the fence about the origin [m].
+        stays: the fence is not taken away.
     """
     generator = torch.Generator().manual_seed(seed)
     turns = random_rotations(len(models), generator, torch.float64).numpy()
@@ -290,7 +291,7 @@ def dropped(models: Sequence[ObjectModel], seed: int, wall: float) -> tuple[Free
         height += 2 * reach
         bodies.append(FreeBody(model, object_parts(model), pose))
     fallen = posed(bodies, settle(bodies, wall=wall, seconds=4.0 + height))
-    return posed(fallen, settle(fallen))
+    return fallen if stays else posed(fallen, settle(fallen))
 
 
 def posed(bodies: Sequence[FreeBody], poses: Sequence[Pose]) -> tuple[FreeBody, ...]:

@@ -20,7 +20,7 @@ from graspd_bench.study import Case, Record, Request, Sections, Study
 from graspd_cell.grasp_source import InProcessGrasps, Offer
 from graspd_cell.picker import Attempt, Ending, Picker
 from graspd_cell.referee import Report
-from graspd_cell.simulated_robot import SimulatedRobot
+from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
 from graspd_cell.things import Thing, ThingSource, family_sources, find_sources
 from graspd_cell.world import pile_cell
 from graspd_core.arms.arm import load_arm
@@ -39,6 +39,8 @@ DEVELOPED_ON, _FIRST_SEED = 199, 200
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
 # Attempts at a bin: so many a thing, and some more.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
+# After so long graspd looks at no further thing [s]: longer than a robot waits, or a busy machine would spoil figures.
+_SECONDS = 20.0
 # Upper bounds of probabilities that the curve is told for.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
@@ -99,10 +101,12 @@ def run_cell(case: CellCase) -> Record:
     arm, hand = load_arm(arm_name), load_hand(hand_name)
     world = pile_cell(arm, hand, case.sources(), case.seed)
     robot = SimulatedRobot(world, seed=case.seed)
-    robot.wait(1.0)
+    robot.wait(SETTLING)
     began = robot.referee()
     watch = AttemptWatch(robot)
-    source = _TimedSource(InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed))
+    source = _TimedSource(
+        InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed, seconds=_SECONDS)
+    )
     picker = Picker(robot, source, arm, hand, world.layout)
     most, error = _TRIES_A_THING * case.size + _MORE_TRIES, ""
     try:

@@ -25,6 +25,8 @@ from graspd_core.types import TriangleMesh, joined
 
 # Of the arm's controller [rad], [s]; the hand's has none.
 ARM_TOLERANCES = Tolerances(path=0.1, goal=0.02, goal_time=1.0)
+# What was dropped into a bin comes to rest within this [s].
+SETTLING = 2.0
 # Steps between two looks at tolerances and forces. So long an arm brakes, and a camera takes for an image [s].
 _LOOK_EVERY, _BRAKING, CAMERA_PERIOD = 2, 0.3, 0.1
 
@@ -88,10 +90,17 @@ class SimulatedRobot:
 
     def meshes(self) -> list[tuple[str, TriangleMesh]]:
         """Return the surfaces of everything as it is now, base frame [m], with the names of their parts or things."""
-        posed = [(name, moved(mesh, body_pose(self._data, body))) for name, body, mesh in self._solids if body >= 0]
-        fixed = [(name, mesh) for name, body, mesh in self._solids if body < 0]
-        things = zip(self.world.things, self.thing_poses(), strict=True)
-        return fixed + posed + [(thing.name, moved(thing.seen, pose)) for thing, pose in things]
+        return [(name, moved(mesh, pose)) for (name, mesh), pose in zip(self.solids(), self.solid_poses(), strict=True)]
+
+    def solids(self) -> list[tuple[str, TriangleMesh]]:
+        """Return the same surfaces, each in a frame of its own."""
+        own = [(name, mesh) for name, _, mesh in self._solids]
+        return own + [(thing.name, thing.seen) for thing in self.world.things]
+
+    def solid_poses(self) -> list[Pose]:
+        """Return the poses of the frames of `solids` [m]."""
+        own = [body_pose(self._data, body) if body >= 0 else np.eye(4) for _, body, _ in self._solids]
+        return own + self.thing_poses()
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Run a motion to its end; see `Robot.follow`."""

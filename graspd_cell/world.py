@@ -218,7 +218,8 @@ def pile_cell(
     """Compile a cell with things that were dropped into the first bin. The same seed drops them the same way."""
     layout, things = layout_of(arm), [load_thing(source) for source in sources]
     poses = []
-    for body in dropped([thing.model for thing in things], seed, layout.pick.half - _GAP):
+    # Without the fence they would roll to where the bin's walls are.
+    for body in dropped([thing.model for thing in things], seed, layout.pick.half - _GAP, stays=True):
         pose = body.pose.copy()
         pose[:2, 3] += layout.pick.center
         poses.append(pose)

@@ -83,7 +83,7 @@ MAY_IMPORT = {
     "graspd_viewer": CORE | {"cli", "graspd_bench"},
     # The node sees the public names, values, the viewer, and what only a process that serves needs.
     "graspd_ros": CORE - {"optimize", "optimize/kernel", "mesh", "se3"} | {"graspd_viewer"},
-    "graspd_cell": CORE | {"cli", "graspd_bench", "graspd_viewer", "graspd_ros"},
+    "graspd_cell": CORE | {"cli", "graspd_dataset", "graspd_bench", "graspd_viewer", "graspd_ros"},
 }
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
@@ -92,8 +92,8 @@ MAX_PACKAGE_LINES = {
     "graspd_ros": 4_700,
     "graspd_bench": 8_700,
     "graspd_dataset": 2_900,
-    "graspd_viewer": 2_200,
-    "graspd_cell": 3_000,
+    "graspd_viewer": 2_300,
+    "graspd_cell": 3_500,
     "test": 30_000,
 }
 # Lines that a program reaches through its imports, those inside functions too.
@@ -116,9 +116,11 @@ CONFINED = {
     "ray": ("graspd_dataset/",),
     "pyarrow": ("graspd_dataset/",),
     "pytorch_kinematics": ("graspd_core/arms/", "graspd_bench/studies/"),
+    "ompl": ("graspd_cell/",),
+    "toppra": ("graspd_cell/",),
 }
 HEAVY = {"open3d", "trimesh", "igl", "mujoco", "matplotlib", "fast_simplification"}
-HEAVY |= {"pybullet", "viser", "ray", "pyarrow", "pytorch_kinematics"}
+HEAVY |= {"pybullet", "viser", "ray", "pyarrow", "pytorch_kinematics", "ompl", "toppra"}
 ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
 # What knows ROS: the node, and those parts of the cell that speak as drivers and their clients do.
 KNOWS_ROS = ("graspd_ros/", "graspd_cell/simulator_node.py", "graspd_cell/ros_robot.py", "graspd_cell/grasp_source.py")

@@ -11,8 +11,12 @@ import pytest
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_cell.referee import HARD
 from graspd_cell.robot import JointMotion, MotionAborted
-from graspd_cell.simulated_robot import ARM_TOLERANCES, SimulatedRobot
+from graspd_cell.simulated_robot import ARM_TOLERANCES, SETTLING, SimulatedRobot
+from graspd_cell.things import family_sources
+from graspd_cell.world import PICK_BIN, pile_cell
+from graspd_core.arms.arm import load_arm
 from graspd_core.errors import ConfigError
+from graspd_core.hands.library import load_hand
 
 RobotOf = Callable[..., SimulatedRobot]
 
@@ -185,3 +189,18 @@ def test_the_depth_image_agrees_with_the_known_scene(robot_of: RobotOf):
     assert (first != second).any()
     seen = first > 0
     assert np.abs(first[seen] - noisy.true_depth()[seen]).mean() < 0.005
+
+
+def test_no_thing_is_in_a_wall_and_a_pile_lies_still():
+    arm, hand = load_arm("ur5e_like"), load_hand("parallel_gripper")
+    world = pile_cell(arm, hand, family_sources((11,), ("jar", "tool", "drill", "pump", "animal", "pan")), 11)
+    robot = SimulatedRobot(world)
+    contact = robot._data.contact
+    deepest = min([0.0, *contact.dist[(np.sort(world.owner[contact.geom], 1)[:, 0] == PICK_BIN)]])
+    # Once things rolled out of the fence that they fell into, and hung in the walls.
+    assert deepest > -0.003
+    robot.wait(SETTLING)
+    before = robot.thing_poses()
+    robot.wait(0.5)
+    for first, then in zip(before, robot.thing_poses(), strict=True):
+        assert np.linalg.norm(first[:3, 3] - then[:3, 3]) < 0.01
