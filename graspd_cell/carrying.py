@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_cell.layout import Bin
+from graspd_cell.layout import Bin, Box
 from graspd_cell.motion import Balls, Mover, Points, balls_about
 from graspd_core.arms.arm import Arm
 from graspd_core.arms.inverse_kinematics import nearest_postures, solve, start_table
@@ -61,7 +61,15 @@ def held_balls(mover: Mover, q: Joints, surface: Points) -> Balls:
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
 SPOTS = ((0.0, 0.0), (0.45, 0.45), (-0.45, -0.45), (0.45, -0.45), (-0.45, 0.45))
 # Lowest point of a thing that is let go above the table [m], lowest first.
-_HEIGHTS = (0.08, 0.12, 0.17, 0.22)
+_HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
+
+
+def dropped_box(thing: Points) -> Box:
+    """Return the room that a thing may fill which was let go where its points were [m]: no camera looks there."""
+    low, high = thing.min(0), thing.max(0)
+    half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
+    x, y = (0.5 * (low + high))[:2].tolist()
+    return Box("dropped", (x, y, rise), (float(half[0]), float(half[1]), rise))
 
 
 def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:

@@ -36,7 +36,7 @@ Points = Float[np.ndarray, "_ 3"]
 
 
 class NoMotionError(GraspdError):
-    """No way for the arm, or one of the ends hits something."""
+    """No way for the arm, or its goal is in something."""
 
 
 # Cells of the grid of distances, and how far it reaches beyond the points seen [m].
@@ -70,7 +70,7 @@ class SeenWorld:
             away = np.minimum(away, outside + np.minimum(beyond.max(-1), 0.0))
         if self.distances is not None:
             cell = np.floor((at - self.origin) / _CELL).astype(int)
-            inside = ((cell >= 0) & (cell < self.distances.shape)).all(-1)
+            inside = np.asarray(((cell >= 0) & (cell < self.distances.shape)).all(-1))
             cell = np.where(inside[..., None], cell, 0)
             away = np.minimum(away, np.where(inside, self.distances[tuple(np.moveaxis(cell, -1, 0))], _AROUND))
         return away
@@ -297,7 +297,7 @@ def dense(path: Path, step: float = _STEP) -> Path:
     return np.concatenate([*parts, path[-1:]])
 
 
-# A motion may begin and end with the hand this deep in what was seen, whose surface is known to a cell, and with the
+# A motion may end with the hand this deep in what was seen, whose surface is known to a cell, and with the
 # arm, whose capsules are larger than its links, this deep in anything [m].
 _DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
@@ -306,16 +306,14 @@ def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 1.5) -
     """Return waypoints from one posture to another whose straight connections are clear.
 
     Raises:
-        NoMotionError: an end is in something, or no way was found in `seconds`.
+        NoMotionError: the goal is in something, or no way was found in `seconds`.
     """
     ends = np.stack([start, goal])
-    depths = mover.clearances(ends).min(1), mover.arm_clearances(ends).min(1)
-    for name, whole, own in zip(("start", "goal"), *depths, strict=True):
-        if whole < _DEEPEST or (own < ARM_DEEPEST and name == "goal"):
-            depth = f"{-1e3 * min(whole, own):.0f} mm"
-            raise NoMotionError(
-                f"motion: {mover.shape.arm.name} is {depth} deep in something at its {name}; valid: clear of all"
-            )
+    # Where the arm stands it stands, whatever it touches there.
+    whole, own = mover.clearances(ends)[1].min(), mover.arm_clearances(ends)[1].min()
+    if whole < _DEEPEST or own < ARM_DEEPEST:
+        told = f"{-1e3 * min(whole, own):.0f} mm deep in something at its goal; valid: clear of all"
+        raise NoMotionError(f"motion: {mover.shape.arm.name} is {told}")
     allowed = mover.allowed(ends)
     if mover.clear(ends, allowed):
         return ends
@@ -349,7 +347,7 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     about.setStateValidityChecker(lambda state: mover.clear(values(state)[None], allowed))
     about.setMotionValidator(Edges(about))
     about.setup()
-    ends = [space.allocState() for _ in range(2)]
+    ends: list[Any] = [space.allocState() for _ in range(2)]
     for state, q in zip(ends, (start, goal), strict=True):
         for joint in range(count):
             state[joint] = float(q[joint])
@@ -361,7 +359,7 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     planner.setup()
     if str(planner.solve(seconds)) != "Exact solution":
         return None
-    path = problem.getSolutionPath()
+    path: Any = problem.getSolutionPath()
     geometric.PathSimplifier(about).simplify(path, 0.3)
     return np.stack([values(state) for state in path.getStates()])
 
@@ -411,7 +409,7 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
         JointVelocityConstraint(np.stack([-most, most], 1)),
         JointAccelerationConstraint(np.stack([-push, push], 1)),
     ]
-    trajectory = TOPPRA(
+    trajectory: Any = TOPPRA(
         limits, toppra.SplineInterpolator(along, rows), parametrizer="ParametrizeConstAccel"
     ).compute_trajectory()
     if trajectory is None:

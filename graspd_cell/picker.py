@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from graspd_cell.carrying import held_balls, release_posture, straight
+from graspd_cell.carrying import dropped_box, held_balls, release_posture, straight, tip_pose
 from graspd_cell.grasp_held import Hold, after_squeeze, grips, still_holds
 from graspd_cell.grasp_source import Failure, GraspSource, Offer, cloud_of
-from graspd_cell.layout import CellLayout
+from graspd_cell.layout import Box, CellLayout
 from graspd_cell.motion import (
     ARM_DEEPEST,
     Mover,
@@ -117,6 +117,7 @@ class _Taking:
     began: float
     closed: float = 0.0
     hold: Hold | None = None
+    dropped: Box | None = None
 
 
 class Picker:
@@ -139,6 +140,8 @@ class Picker:
         self._pace, self._cancelled = pace or Pace(), cancelled
         self._failures: list[Failure] = []
         self._picked = 0
+        # Of things in the second bin, which the camera hardly sees.
+        self._dropped: list[Box] = []
         self.offer: Offer | None = None
         self.why_ended = ""
 
@@ -216,13 +219,13 @@ class Picker:
         balls, carried = mover.placed(self._arm_now())
         radius = np.concatenate([mover.shape.radius, mover.carried.radius])
         away, nearest = KDTree(np.concatenate([balls, carried])).query(points)
-        return seen_world(points[away > radius[nearest] + 0.03], 0.0, self._layout.solids[1:])
+        return seen_world(points[away > radius[nearest] + 0.03], 0.0, self._known)
 
     def go_home(self) -> None:
         """Bring the arm out of the camera's sight, the hand open."""
         now = self._arm_now()
         if np.abs(now - self._layout.start).max() > 0.02:
-            mover = self._mover(SeenWorld(0.0, self._layout.solids[1:]))
+            mover = self._mover(SeenWorld(0.0, self._known))
             up = straight(mover, now, np.array([0.0, 0.0, 0.12]))
             self._follow_arm(up, self._pace.free)
             self._follow_arm(find_path(mover, up[-1], self._layout.start), self._pace.free)
@@ -277,6 +280,8 @@ class Picker:
                 f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}"
             )
         path = find_path(mover, up[-1], goal)
+        there = np.linalg.inv(tip_pose(mover, up[-1])), tip_pose(mover, goal)
+        taking.dropped = dropped_box(risen @ (there[1] @ there[0])[:3, :3].T + (there[1] @ there[0])[:3, 3])
         lost = ""
 
         def slipped() -> bool:
@@ -297,6 +302,7 @@ class Picker:
         self._move_hand(taking.execution.hand[0])
         self._wait(self._pace.settle)
         self._picked += 1
+        self._dropped += [taking.dropped] if taking.dropped is not None else []
 
     def back_off(self, world: SeenWorld) -> None:
         """After a failure: open the hand and rise, as far as that goes."""
@@ -316,6 +322,11 @@ class Picker:
             self._failures.append(Failure(offer.place, offer.grasp.grasp))
 
     # What the behaviours are made of.
+
+    @property
+    def _known(self) -> tuple[Box, ...]:
+        """What stands in the cell, seen or not."""
+        return (*self._layout.solids[1:], *self._dropped)
 
     def _mover(self, world: SeenWorld, fingers: np.ndarray | None = None) -> Mover:
         fingers = self._hand_now() if fingers is None else fingers

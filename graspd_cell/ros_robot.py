@@ -243,10 +243,8 @@ def goal_of(motion: JointMotion) -> FollowJointTrajectory.Goal:
             point.velocities = motion.velocities[row].tolist()
         points.append(point)
     goal = FollowJointTrajectory.Goal(trajectory=JointTrajectory(joint_names=list(motion.names), points=points))
-    for allowed, field_ in ((motion.path_tolerance, goal.path_tolerance), (motion.goal_tolerance, goal.goal_tolerance)):
+    for allowed, field_ in ((motion.path_tolerance, "path_tolerance"), (motion.goal_tolerance, "goal_tolerance")):
         if allowed is not None:
-            widths = np.broadcast_to(allowed, len(motion.names)).tolist()
-            field_ += [
-                JointTolerance(name=name, position=width) for name, width in zip(motion.names, widths, strict=True)
-            ]
+            widths = zip(motion.names, np.broadcast_to(allowed, len(motion.names)).tolist(), strict=True)
+            setattr(goal, field_, [JointTolerance(name=name, position=width) for name, width in widths])
     return goal

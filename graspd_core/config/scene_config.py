@@ -44,7 +44,8 @@ class SegmentationConfig:
         target_reach: a target point this near to a thing means that thing [m].
         target_share: a box or mask that covers this share of a thing means all of it.
         obstacle_range: other things are reported as far as this from the object [m].
-        piled: things lie on each other, so that parts at a seam are things although they do not reach the support.
+        piled: things lie on each other: parts at a seam are things although they do not reach the support, and a heap
+            of any size may stand on it.
     """
 
     roi_low: tuple[float, float, float] | None = None

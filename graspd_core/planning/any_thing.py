@@ -1,8 +1,8 @@
 """The next thing of a scene: of all things seen, one with a grasp that is sure enough, else with the surest one.
 
 Things are looked at in an order that costs nothing: those that nothing was tried on in vain first, then those whose
-top is highest, since nothing lies on them. The first with a verified grasp ends the search, so that a request costs
-little more than one of a single thing.
+top is highest, since nothing lies on them. A thing gets one round of the planner as long as it never failed. The first
+with a verified grasp ends the search, so that a request costs little more than one of a single thing.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jaxtyping import Float
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.hands.model import HandModel
+from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
 from graspd_core.perception.scene import Scene
@@ -118,7 +119,8 @@ def plan_any_thing(
             told = OUT_OF_TRIES if len(failed) >= tries else "not looked at"
             things.append(ThingPlan(points, reason=told, looked_at=False))
             continue
-        things.append(_plan_thing(views, hand, points, failed, settings, surface, solids, plan))
+        scene = _scene_among(views, points, settings, surface, solids)
+        things.append(_thing_plan(points, scene, hand, failed, plan))
         if on_thing is not None:
             on_thing(things[-1])
         over = things[-1].surety > 1.0 or (seconds is not None and time.perf_counter() - began > seconds)
@@ -135,24 +137,41 @@ def _in_order(
     return sorted(rows, key=lambda row: (len(row[1]), -float(row[0][:, 2].max())))
 
 
-def _plan_thing(views, hand, points, failed, settings, surface, solids, plan) -> ThingPlan:
+def _scene_among(
+    views: Sequence[PointCloud],
+    points: Float[np.ndarray, "_ 3"],
+    settings: SceneConfig | None,
+    surface: Plane | None,
+    solids: Mapping[str, Sequence[TriangleMesh]] | None,
+) -> Scene | str:
+    """Return the scene of the thing that some points show, or why there is none."""
     # A point of the thing itself: the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
         scene = scene_from_views(views, target=Target(point=middle), settings=settings)
     except (CloudError, MeshError) as error:
-        return ThingPlan(points, reason=str(error))
-    if surface is not None:
-        scene = replace(scene, support=surface)
-    if solids:
-        scene = with_neighbours(scene, solids, settings)
+        return str(error)
+    scene = scene if surface is None else replace(scene, support=surface)
+    return with_neighbours(scene, solids, settings) if solids else scene
+
+
+def _thing_plan(
+    points: Float[np.ndarray, "_ 3"], scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any
+) -> ThingPlan:
+    if isinstance(scene, str):
+        return ThingPlan(points, reason=scene)
     lost = [failure.grasp for failure in failed if failure.grasp is not None]
-    plan = {**plan, "count": plan.get("count", 1) + 2 * len(lost), "seed": plan.get("seed", 0) + len(failed)}
+    config = plan.get("preset", "balanced")
+    config = load_preset(config) if isinstance(config, str) else config
+    if not failed:
+        config = replace(config, rounds=replace(config.rounds, most=1))
+    count, seed = plan.get("count", 1) + 2 * len(lost), plan.get("seed", 0) + len(failed)
+    plan = {**plan, "preset": config, "count": count, "seed": seed}
     result = plan_grasps(scene, hand, **plan)
     left = [grasp for grasp in unlike(result.grasps, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
         return ThingPlan(points, scene, result, None, _why_none(result))
-    best = max(left, key=lambda grasp: ((grasp.verdict is Verdict.VERIFIED), grasp.probability or 0.0))
+    best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
     reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp is sure enough"
     return ThingPlan(points, scene, result, best, reason)
 

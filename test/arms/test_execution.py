@@ -1,4 +1,4 @@
-"""A grasp as one timed trajectory of arm and hand: gates at rest, speeds within limits, efforts only of a closed hand."""
+"""A grasp as a timed trajectory of arm and hand: gates at rest, speeds within limits, efforts of a closed hand."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def reached_grasp(seed: int = 0) -> Grasp:
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     joints = [HAND.lower + share * (HAND.upper - HAND.lower) for share in (0.2, 0.5, 0.9)]
     places = [np.array([0.0, 0.0, z]) for z in (0.23, 0.2, 0.2)]
-    postures = (Posture(place, turn, q) for place, q in zip(places, joints, strict=True))
-    return Grasp(*postures, arm=ArmPath(("a", "b", "c"), steps, STAGE_ROWS))
+    before, touch, press = (Posture(place, turn, q) for place, q in zip(places, joints, strict=True))
+    return Grasp(before, touch, press, arm=ArmPath(("a", "b", "c"), steps, STAGE_ROWS))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -49,7 +49,7 @@ def test_rows_follow_the_arms_path_and_the_three_postures_in_the_order_of_the_ga
     grasp = reached_grasp()
     made = execution_of(grasp, HAND, arm_speeds=SPEEDS)
     assert grasp.arm is not None
-    gates = dict(zip(GATES, made.gates, strict=True))
+    gates = {str(gate): row for gate, row in zip(GATES, made.gates, strict=True)}
     for gate, stage in (("pregrasp", "pregrasp"), ("closed", "grasp"), ("squeezed", "grasp"), ("lifted", "lift")):
         np.testing.assert_allclose(made.arm[gates[gate]], grasp.arm.at(stage))
     for gate, posture in (("pregrasp", grasp.pregrasp), ("closed", grasp.grasp), ("squeezed", grasp.squeeze)):
@@ -72,12 +72,15 @@ def test_what_a_grasp_would_hold_beyond_the_mass_makes_the_lift_faster():
     times = [lift_time(replace(grasp, metrics=GraspMetrics({"payload": p})), 1.0, pace) for p in (1.0, 1.35, 9.0)]
     assert times == sorted(times, reverse=True)
     assert times[0] == gentle > times[1] > times[2]
-    made = [execution_of(grasp, HAND, arm_speeds=10 * SPEEDS, mass=1.0), execution_of(grasp, HAND, arm_speeds=10 * SPEEDS)]
+    made = [
+        execution_of(grasp, HAND, arm_speeds=10 * SPEEDS, mass=1.0),
+        execution_of(grasp, HAND, arm_speeds=10 * SPEEDS),
+    ]
     assert made[0].times[-1] == pytest.approx(made[1].times[-1])
 
 
 def test_a_grasp_that_no_arm_reaches_has_no_execution():
     with pytest.raises(ConfigError, match="no path of an arm"):
         execution_of(replace(reached_grasp(), arm=None), HAND, arm_speeds=SPEEDS)
-    with pytest.raises(ConfigError, match="finger_speed: 0.0; it must be positive"):
+    with pytest.raises(ConfigError, match=r"finger_speed: 0\.0; it must be positive"):
         ExecutionPace(finger_speed=0.0)
