@@ -75,7 +75,8 @@ def test_what_the_referee_saw_counts_and_not_what_the_picker_says(robot_of: Call
 def _record(pair: str, **changed: object) -> Record:
     base = {
         "ending": "picked", "target": "a", "out": ["a"], "astray": [], "hard": {}, "tries": 0,
-        "verified": True, "probability": 0.9, "graspd_cpu": 1.0, "graspd_seconds": 1.5, "closing_seconds": 3.0, "seconds": 8.0,
+        "verified": True, "probability": 0.9, "graspd_cpu": 1.0, "graspd_seconds": 1.5,
+        "closing_seconds": 3.0, "seconds": 8.0,
     }  # fmt: skip
     failed = {
         **base,
