@@ -208,6 +208,14 @@ def executed(attempt: Record) -> bool:
     return attempt["ending"] != str(Ending.NO_WAY)
 
 
+def first_attempts(attempts: Sequence[Record]) -> list[Record]:
+    """Return the first attempt at each thing, by what the thing truly was."""
+    firsts: dict[str, Record] = {}
+    for attempt in attempts:
+        firsts.setdefault(attempt["target"], attempt)
+    return list(firsts.values())
+
+
 _HEADINGS = [
     "arm and hand", "things", "in the bin", "can be held", "of those out", "all out", "astray", "attempts",
     "first attempts that succeeded", "hit something hard", "verified and executed", "of those in the other bin",
@@ -232,7 +240,7 @@ def _row(pair: str, size: str, own: Sequence[Record]) -> list[str]:
     fit = [(record, name) for record, name in there if record["fits"][name]]
     out = [record["ended"][name] == "place bin" for record, name in there]
     fit_out = [record["ended"][name] == "place bin" for record, name in fit]
-    first = [attempt for attempt in attempts if attempt["tries"] == 0]
+    first = [attempt for record in own for attempt in first_attempts(record["attempts"])]
     sure = [attempt for attempt in attempts if attempt["verified"] and executed(attempt)]
     return [
         pair,

@@ -74,11 +74,19 @@ def test_what_the_referee_saw_counts_and_not_what_the_picker_says(robot_of: Call
 
 def _record(pair: str, **changed: object) -> Record:
     base = {
-        "ending": "picked", "out": ["a"], "astray": [], "hard": {}, "tries": 0, "verified": True, "probability": 0.9,
-        "graspd_cpu": 1.0, "graspd_seconds": 1.5, "closing_seconds": 3.0, "seconds": 8.0,
+        "ending": "picked", "target": "a", "out": ["a"], "astray": [], "hard": {}, "tries": 0,
+        "verified": True, "probability": 0.9, "graspd_cpu": 1.0, "graspd_seconds": 1.5,
+        "closing_seconds": 3.0, "seconds": 8.0,
     }  # fmt: skip
-    failed = {**base, "ending": "lost while lifting", "out": [], "hard": {"hand on table": 60.0}, "probability": 0.6}
-    unreached = {**base, "ending": "no way for the arm", "out": [], "tries": 1, "closing_seconds": 0.0}
+    failed = {
+        **base,
+        "ending": "lost while lifting",
+        "target": "b",
+        "out": [],
+        "hard": {"hand on table": 60.0},
+        "probability": 0.6,
+    }
+    unreached = {**base, "ending": "no way for the arm", "target": "b", "out": [], "tries": 1, "closing_seconds": 0.0}
     return {
         "pair": pair,
         "size": 3,
