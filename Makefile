@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format docs pictures wheel demo bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
+.PHONY: help setup test check format docs pictures wheel demo cell bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -46,6 +46,9 @@ wheel: setup  ## a source distribution and a wheel, to dist/
 
 demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and figures out, in demo/
 	$(RUN)/python examples/demo.py
+
+cell: setup  ## a simulated arm, hand and camera empty a bin, in a browser; a line a pick without one
+	$(RUN)/graspd cell --view --film results/cell.png
 
 BENCH := $(RUN)/graspd bench --processes 2
 PAGES := README.md $(addprefix docs/,bench.md hands.md clouds.md stress.md metrics.md usage.md arms.md)

@@ -1,6 +1,11 @@
-"""All studies, a row each: `graspd bench NAME` runs one. To add one, write its file and its row."""
+"""All studies, a row each: `graspd bench NAME` runs one. To add one, write its file and its row.
+
+Packages that graspd_bench does not know add theirs by entry points of the group `graspd.studies`.
+"""
 
 from __future__ import annotations
+
+from importlib.metadata import entry_points
 
 from graspd_bench import failure_maps, suites, tables
 from graspd_bench.bullet.bullet_world import bullet_available
@@ -218,3 +223,5 @@ STUDIES: dict[str, Study] = {
         failures=True,
     ),
 }
+
+STUDIES |= {point.name: point.load() for point in entry_points(group="graspd.studies")}

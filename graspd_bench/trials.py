@@ -28,8 +28,8 @@ from jaxtyping import Float
 
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
-from graspd_core.perception.scene import ObjectModel
-from graspd_core.se3 import SE3, quaternion_from_rotation, rotation_from_quaternion
+from graspd_core.perception.scene import ObjectModel, object_parts
+from graspd_core.se3 import SE3, quaternion_from_rotation, random_rotations, rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh
 from graspd_core.verify.early_stop import CHECK_EVERY, CREEPING, ObjectState
 from graspd_core.verify.hold_trial import DIRECTIONS, close_hand, diverged, moved, object_state
@@ -269,6 +269,34 @@ def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
         first = int(model.joint(name).dofadr[0])
         model.dof_damping[first : first + 3] = slow * model.body_mass[body]
         model.dof_damping[first + 3 : first + 6] = turn * model.body_inertia[body].max()
+
+
+def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: bool = False) -> tuple[FreeBody, ...]:
+    """Return things at rest on the table z = 0 that fell one above the other into a fence, which is taken away then.
+
+    Args:
+        models: the things, in the order of their fall.
+        seed: of their turns and places.
+        wall: half the side of the fence about the origin [m].
+        stays: the fence is not taken away.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    turns = random_rotations(len(models), generator, torch.float64).numpy()
+    places = 0.3 * wall * (2 * torch.rand(len(models), 2, generator=generator, dtype=torch.float64).numpy() - 1)
+    bodies, height = [], 0.0
+    for model, turn, place in zip(models, turns, places, strict=True):
+        pose, reach = np.eye(4), model.radius + 0.01
+        pose[:3, :3] = turn
+        pose[:3, 3] = np.array([*place, height + reach]) - turn @ model.center_of_mass
+        height += 2 * reach
+        bodies.append(FreeBody(model, object_parts(model), pose))
+    fallen = posed(bodies, settle(bodies, wall=wall, seconds=4.0 + height))
+    return fallen if stays else posed(fallen, settle(fallen))
+
+
+def posed(bodies: Sequence[FreeBody], poses: Sequence[Pose]) -> tuple[FreeBody, ...]:
+    """Return the things at other poses."""
+    return tuple(replace(body, pose=pose) for body, pose in zip(bodies, poses, strict=True))
 
 
 def lift_out(

@@ -294,7 +294,7 @@ class GraspResult:
     `next_view` is `T_object_camera` [m] of one more view that would show most of the hidden side, where grasps hold on
     the likeliest shape and none is sure enough. `refused` counts by reason the candidates that no trial was spent on,
     because a restriction of the request did not admit them. `mass` is what the object weighed in the trials [kg] where
-    the hand could not hold what was assumed, else None.
+    the hand could not hold what was assumed, else None. `tried_mass` is what it weighed in the trials at all [kg].
     """
 
     outcome: Outcome
@@ -309,3 +309,4 @@ class GraspResult:
     next_view: Float[np.ndarray, "4 4"] | None = None
     refused: Mapping[str, int] = field(default_factory=dict)
     mass: float | None = None
+    tried_mass: float | None = None

@@ -52,7 +52,7 @@ class SceneNodes:
             if session.scene is not None:
                 for group in ("object", "around"):
                     self.draw(group, [p for p in scene_parts(session.scene) if p.name.startswith(group)])
-            self._draw_points(session.seen)
+            self.draw_points(session.seen)
             self._draw_hand(session.hand)
         self._aim(session)
 
@@ -130,7 +130,15 @@ class SceneNodes:
         self._links = {link: self._mesh(f"/{part.name}", part) for link, part in hand_parts(hand).items()}
         self.fade_hand(self._opacity)
 
-    def _draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
+    def place(self, group: str, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None:
+        """Move the parts of a group, in their order [m]."""
+        for node, pose in zip(self._groups.get(group, ()), poses, strict=True):
+            node.position, node.wxyz = PER_METRE * pose[:3, 3], _quaternion(pose[:3, :3])
+
+    def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
+        """Draw points in place of those before [m]."""
+        for node in self._groups.pop("cloud", ()):
+            node.remove()
         nodes = []
         if len(points):
             every = -(-len(points) // _MOST_POINTS)
@@ -162,7 +170,10 @@ class SceneNodes:
         elif session.grasps:
             middle = session.grasps[0].grasp.position
         side = perpendicular(up)
-        eye = middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up)
+        self.aim(middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up), middle, up)
+
+    def aim(self, eye: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> None:
+        """Let every visitor's camera look from `eye` at `middle` [m]."""
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
             camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle

@@ -82,13 +82,13 @@ fi
 echo "setup: installing packages into $venv (about 4 GB, a few minutes the first time)"
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE # another environment's ROS may have set it
 pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
-"${pip[@]}" -c constraints.txt -e ".[ros,view,bench,dataset,fuzz,docs,dev]" "setuptools>=70.1"
+"${pip[@]}" -c constraints.txt -e ".[ros,view,bench,dataset,cell,fuzz,docs,dev]" "setuptools>=70.1"
 echo "setup: compiling the messages of graspd_msgs (20 seconds)"
 # Against the very libraries that it will be loaded with; what it needs is installed by now.
 "${pip[@]}" --no-build-isolation --no-deps ./msg_defs
-# What comes with ROS and is not on PyPI: the type of /tf, MoveIt's grasp and collision object, the action GraspPlanning.
+# What comes with ROS and is not on PyPI: the type of /tf, MoveIt's grasp and collision object, two actions.
 for needed in tf2_msgs.msg:TFMessage object_recognition_msgs.msg:ObjectType moveit_msgs.msg:CollisionObject \
-    grasping_msgs.action:GraspPlanning; do
+    grasping_msgs.action:GraspPlanning control_msgs.action:FollowJointTrajectory; do
     package=${needed%%.*}
     if ! "$venv/bin/python" -c "from ${needed%%:*} import ${needed##*:}" 2>/dev/null; then
         rm -rf "$build" && mkdir "$build"

@@ -83,20 +83,22 @@ MAY_IMPORT = {
     "graspd_viewer": CORE | {"cli", "graspd_bench"},
     # The node sees the public names, values, the viewer, and what only a process that serves needs.
     "graspd_ros": CORE - {"optimize", "optimize/kernel", "mesh", "se3"} | {"graspd_viewer"},
+    "graspd_cell": CORE | {"cli", "graspd_dataset", "graspd_bench", "graspd_viewer", "graspd_ros"},
 }
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 25_850,
-    "graspd_ros": 5_080,
-    "graspd_bench": 8_700,
+    "graspd_core": 26_700,
+    "graspd_ros": 5_200,
+    "graspd_bench": 8_800,
     "graspd_dataset": 3_000,
-    "graspd_viewer": 2_200,
-    "test": 30_300,
+    "graspd_viewer": 2_300,
+    "graspd_cell": 3_800,
+    "test": 31_500,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 21_100, "graspd_ros.node": 25_000}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 21_500, "graspd_ros.node": 25_500}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
@@ -106,7 +108,7 @@ OPTIONAL = ("graspd_core/arms", "graspd_core/library", "graspd_core/hands/mano")
 
 # library: where it may be imported, as a path prefix below the repository root
 CONFINED = {
-    "mujoco": ("graspd_core/verify/", "graspd_core/hands/readers/", "graspd_bench/", "graspd_viewer/"),
+    "mujoco": ("graspd_core/verify/", "graspd_core/hands/readers/", "graspd_bench/", "graspd_viewer/", "graspd_cell/"),
     "pybullet": ("graspd_bench/bullet/",),
     "open3d": ("graspd_core/mesh/", "graspd_core/perception/"),
     "matplotlib": ("graspd_bench/",),
@@ -114,11 +116,15 @@ CONFINED = {
     "ray": ("graspd_dataset/",),
     "pyarrow": ("graspd_dataset/",),
     "pytorch_kinematics": ("graspd_core/arms/", "graspd_bench/studies/"),
+    "ompl": ("graspd_cell/",),
+    "toppra": ("graspd_cell/",),
 }
 HEAVY = {"open3d", "trimesh", "igl", "mujoco", "matplotlib", "fast_simplification"}
-HEAVY |= {"pybullet", "viser", "ray", "pyarrow", "pytorch_kinematics"}
+HEAVY |= {"pybullet", "viser", "ray", "pyarrow", "pytorch_kinematics", "ompl", "toppra"}
 ROS = {"rclpy", "ament_index_python", "builtin_interfaces", "launch", "launch_ros", "graspd_ros"}
-PACKAGES = ("graspd_core", "graspd_ros", "graspd_bench", "graspd_dataset", "graspd_viewer")
+# What knows ROS: the node, and those parts of the cell that speak as drivers and their clients do.
+KNOWS_ROS = ("graspd_ros/", "graspd_cell/simulator_node.py", "graspd_cell/ros_robot.py", "graspd_cell/grasp_source.py")
+PACKAGES = ("graspd_core", "graspd_ros", "graspd_bench", "graspd_dataset", "graspd_viewer", "graspd_cell")
 FOLDERS = {".".join(p.parent.relative_to(ROOT).parts) for name in PACKAGES for p in (ROOT / name).rglob("__init__.py")}
 
 
@@ -179,7 +185,7 @@ def breaches(path: str, source: str) -> list[str]:
         where = f"{path}:{found.line}: imports {found.module}"
         if library in PACKAGES and room_of(found.module) not in MAY_IMPORT[home] | {home}:
             wrong.append(f"{where}, but {home} may import only {sorted(MAY_IMPORT[home])}")
-        if parts[0] != "graspd_ros" and (library in ROS or library.endswith("_msgs")):
+        if not path.startswith(KNOWS_ROS) and (library in ROS or library.endswith("_msgs")):
             wrong.append(f"{where}, but {parts[0]} knows no ROS")
         if library in CONFINED and not path.startswith(CONFINED[library]):
             wrong.append(f"{where}, which only {' and '.join(CONFINED[library])} may")

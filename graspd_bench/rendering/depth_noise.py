@@ -9,6 +9,7 @@ correlated by 0.96 between neighbouring pixels and by 0.6 at a distance of eight
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -219,9 +220,15 @@ def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Gen
     """Normal numbers of unit variance, of which all but a share `white` of the variance is smooth."""
     from scipy.ndimage import gaussian_filter
 
+    smooth = gaussian_filter(rng.standard_normal(shape), blur, mode="wrap") / _blurred_scale(shape, blur)
+    return np.sqrt(1 - white) * smooth + np.sqrt(white) * rng.standard_normal(shape)
+
+
+@lru_cache(maxsize=16)
+def _blurred_scale(shape: tuple[int, ...], blur: float) -> float:
+    """Standard deviation of blurred white noise; wrapped around, so that it is the same everywhere."""
+    from scipy.ndimage import gaussian_filter
+
     impulse = np.zeros(shape)
     impulse[0, 0] = 1.0
-    # Wrapped around, so that the variance is the same everywhere and exactly that of the kernel.
-    scale = np.sqrt((gaussian_filter(impulse, blur, mode="wrap") ** 2).sum())
-    smooth = gaussian_filter(rng.standard_normal(shape), blur, mode="wrap") / scale
-    return np.sqrt(1 - white) * smooth + np.sqrt(white) * rng.standard_normal(shape)
+    return float(np.sqrt((gaussian_filter(impulse, blur, mode="wrap") ** 2).sum()))

@@ -22,7 +22,7 @@ from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.render import look_at, render_shaded, save_png
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, depth_views, moved, ring_poses, tabletop
 from graspd_bench.study import Case, Picture, Record, Request, Sections, find_objects
-from graspd_bench.trials import Lifted, lift_out, settle
+from graspd_bench.trials import Lifted, dropped, lift_out, posed, settle
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.hands.library import load_hand
@@ -32,12 +32,11 @@ from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.cloud.camera import cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.se3 import random_rotations, rotation_from_quaternion
+from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Posture, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings
 from graspd_core.verify.world import PROTOCOLS, FreeBody
@@ -107,25 +106,8 @@ def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
     """Things at rest: they fall one above the other into a fence, which is taken away then."""
     things = drawn_things(case)
     models = {thing: load_scene(thing, mass=MASS).object for thing in set(things)}
-    generator = torch.Generator().manual_seed(1000 * case.seed + case.size)
-    turns = random_rotations(case.size, generator, torch.float64).numpy()
     wall = 0.5 * _FENCE * float(np.sqrt(case.size)) + 0.05
-    places = 0.3 * wall * (2 * torch.rand(case.size, 2, generator=generator, dtype=torch.float64).numpy() - 1)
-    bodies, height = [], 0.0
-    for thing, turn, place in zip(things, turns, places, strict=True):
-        model, pose = models[thing], np.eye(4)
-        reach = model.radius + 0.01
-        pose[:3, :3] = turn
-        pose[:3, 3] = np.array([*place, height + reach]) - turn @ model.center_of_mass
-        height += 2 * reach
-        bodies.append(FreeBody(model, object_parts(model), pose))
-    fallen = posed(bodies, settle(bodies, wall=wall, seconds=4.0 + height))
-    return posed(fallen, settle(fallen))
-
-
-def posed(bodies: Sequence[FreeBody], poses: Sequence[Float[np.ndarray, "4 4"]]) -> tuple[FreeBody, ...]:
-    """The things elsewhere."""
-    return tuple(replace(body, pose=pose) for body, pose in zip(bodies, poses, strict=True))
+    return dropped([models[thing] for thing in things], 1000 * case.seed + case.size, wall)
 
 
 def seen_pile(case: PileCase, bodies: Sequence[FreeBody], look: int) -> tuple[list[PointCloud], Any]:

@@ -1,7 +1,7 @@
 """The command line, one file a command. Each command imports heavy libraries when it runs.
 
 graspd synthesize | replay | reconstruct | library | hands | doctor are graspd_core's own. Other packages add commands
-by entry points of the group `graspd.commands`: view, bench, dataset and import.
+by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
 """
 
 from __future__ import annotations

@@ -182,6 +182,7 @@ class Watched:
 
 # Packages beside graspd_core by the command, or the option, that needs them.
 SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd_dataset", "import": "graspd_dataset"}
+SIBLINGS |= {"cell": "graspd_cell"}
 
 
 def sibling(module: str) -> Any:

@@ -44,6 +44,8 @@ class SegmentationConfig:
         target_reach: a target point this near to a thing means that thing [m].
         target_share: a box or mask that covers this share of a thing means all of it.
         obstacle_range: other things are reported as far as this from the object [m].
+        piled: things lie on each other: parts at a seam are things although they do not reach the support, and a heap
+            of any size may stand on it.
     """
 
     roi_low: tuple[float, float, float] | None = None
@@ -71,6 +73,7 @@ class SegmentationConfig:
     target_reach: float = 0.05
     target_share: float = 0.8
     obstacle_range: float = 0.3
+    piled: bool = False
 
 
 @dataclass(frozen=True)
@@ -165,5 +168,5 @@ def load_scene_config(path: str | Path) -> SceneConfig:
 
 
 def _refuse(where: str, value: Any, least: int) -> None:
-    if isinstance(value, int | float) and (value < least or value <= 0):
+    if isinstance(value, int | float) and not isinstance(value, bool) and (value < least or value <= 0):
         raise ConfigError(f"{where}: {value!r} must be {f'at least {least}' if least else 'above zero'}")

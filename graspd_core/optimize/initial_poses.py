@@ -20,7 +20,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.optimize.loop import Joints, Poses, Positions, Values
-from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
+from graspd_core.optimize.obstacle_distance import ObstacleTensors, least_gap, make_obstacle_tensors, obstacle_gaps
 from graspd_core.optimize.restrictions import UNRESTRICTED, Aim, BoundRestrictions
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, aligning_rotation, normalize, quaternion_from_rotation, rotation_from_axis_angle
@@ -216,7 +216,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
         depth = -obstacle_gaps(replace(obstacles, sdfs=()), base, links).amin(-1)
         translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
     behind = drawn_back(translation, base.rotation, obstacles.approach)
-    gaps = [obstacle_gaps(obstacles, SE3(base.rotation, at), links).amin(-1) for at in (translation, behind)]
+    gaps = [least_gap(obstacles, SE3(base.rotation, at), links) for at in (translation, behind)]
     return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
 
 

@@ -130,7 +130,8 @@ def plan_grasps(
         refused=found.refused,
     )
     told = "" if run.over() else _why_few(run, scene, bound, found, result)
-    result = replace(result, message=message or told, support=support, mass=found.mass)
+    masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}
+    result = replace(result, message=message or told, support=support, **masses)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 

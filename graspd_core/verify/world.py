@@ -366,7 +366,7 @@ def build_world(
     set_physics(spec.option, protocol)
     if len(hand.primitives) > _CROWD:
         spec.memory = _MEMORY
-    _add_hand(spec, hand, protocol)
+    add_hand(spec, hand, protocol)
     add_object(spec, target, parts, protocol.friction)
     fixed = [TABLE] if support is not None else []
     if support is not None:
@@ -418,7 +418,8 @@ def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:
     return np.array([model.joint(f"joint:{name}").qposadr[0] for name in names], dtype=np.int64)
 
 
-def _add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:
+def add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:
+    """Add a hand's links, joints, motors and solids. Its base is a mocap body."""
     quaternions = quaternion_from_rotation(torch.as_tensor(hand.link_offset_rotation, dtype=torch.float64)).numpy()
     bodies: list[Any] = []
     coupled = {mimic.link: mimic for mimic in hand.mimics}

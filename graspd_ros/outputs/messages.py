@@ -24,7 +24,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from graspd_msgs.msg import Contact as ContactMessage
 from graspd_msgs.msg import Grasp as GraspMessage
-from graspd_msgs.msg import GraspArray, GraspProgress, Metric
+from graspd_msgs.msg import GraspArray, GraspExecution, GraspProgress, Metric
 from graspd_msgs.msg import TrialResult as TrialMessage
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, Header
@@ -154,14 +154,27 @@ def array_message(
         if ending.result.next_view is not None:
             message.next_view = PoseStamped(header=header, pose=pose_of_matrix(ending.result.next_view))
         ranked = enumerate(ending.result.grasps)
-        message.grasps = [grasp_message(grasp, rank, request_id, header, hand, pace) for rank, grasp in ranked]
+        message.grasps = [
+            grasp_message(grasp, rank, request_id, header, hand, pace, mass=ending.result.tried_mass)
+            for rank, grasp in ranked
+        ]
     return message
 
 
 def grasp_message(
-    grasp: Grasp, rank: int, request_id: str, header: Header, hand: HandModel, pace: Pace
+    grasp: Grasp,
+    rank: int,
+    request_id: str,
+    header: Header,
+    hand: HandModel,
+    pace: Pace,
+    *,
+    mass: float | None = None,
 ) -> GraspMessage:
-    """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN."""
+    """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN.
+
+    `mass` is that of the object [kg], which decides how fast it is lifted. None: nobody knows.
+    """
     _check_finite(grasp, rank)
     pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))
     message = GraspMessage(
@@ -198,6 +211,7 @@ def grasp_message(
     if grasp.arm is not None:
         message.arm_trajectory = arm_trajectory(grasp, grasp.arm, pace)
         message.arm_stages = list(grasp.arm.stages)
+        message.execution = execution_message(grasp, grasp.arm, hand, pace, mass)
     if hand.mount is not None:
         message.mount_link = hand.mount.parent
         message.mount_pregrasp_pose = mount_pose(grasp.pregrasp, hand.mount)
@@ -358,6 +372,31 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
         for positions, at in zip(path.positions, times, strict=True)
     ]
     return JointTrajectory(joint_names=list(path.joint_names), points=points)
+
+
+def execution_message(
+    grasp: Grasp, path: ArmPath, hand: HandModel, pace: Pace, mass: float | None = None
+) -> GraspExecution:
+    """Arm and hand in time, from the retreat to the end of the lift, with the points of the gates."""
+    from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
+
+    own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
+    speeds = np.full(len(path.joint_names), pace.joint_speed)
+    made = execution_of(grasp, hand, arm_speeds=speeds, mass=mass, pace=own)
+    times = [duration_of(at) for at in made.times.tolist()]
+    arm = [
+        JointTrajectoryPoint(positions=q, velocities=v, time_from_start=at)
+        for q, v, at in zip(made.arm.tolist(), made.arm_speed.tolist(), times, strict=True)
+    ]
+    rows = zip(made.hand.tolist(), made.hand_speed.tolist(), made.efforts.tolist(), times, strict=True)
+    fingers = [JointTrajectoryPoint(positions=q, velocities=v, effort=e, time_from_start=at) for q, v, e, at in rows]
+    return GraspExecution(
+        gates=list(GATES),
+        gate_points=list(made.gates),
+        arm=JointTrajectory(joint_names=list(made.arm_joints), points=arm),
+        hand=JointTrajectory(joint_names=list(made.hand_joints), points=fingers),
+        mass=UNMEASURED if mass is None else mass,
+    )
 
 
 def result_markers(

@@ -23,6 +23,7 @@ from graspd_core.optimize.obstacle_distance import (
     WIDE,
     gap_on_the_way,
     hand_reach,
+    least_gap,
     make_obstacle_tensors,
     obstacle_gaps,
 )
@@ -101,6 +102,22 @@ def test_gaps_up_to_the_widest_are_exact_and_wider_ones_are_known_to_be(hand, sc
     assert bool((gaps[~close] >= WIDE).all())
     # Some are not looked at.
     assert bool((gaps == WIDE).any())
+
+
+def test_the_least_gap_is_the_least_of_all_gaps(hand, scenes):
+    scene = on_table(beside(scenes["box"], 0.06))
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
+    assert obstacles is not None
+    rng = np.random.default_rng(2)
+    joints = hand.lower + (hand.upper - hand.lower) * rng.random((300, hand.num_joints))
+    turns = rng.normal(size=(300, 4))
+    rotation = rotation_from_quaternion(torch.as_tensor(turns / np.linalg.norm(turns, axis=1, keepdims=True)))
+    base = SE3(rotation, torch.as_tensor(rng.normal(size=(300, 3)) * 0.1))
+    links = forward(problem(scene, hand).hand.kinematics, torch.as_tensor(joints))
+    every = obstacle_gaps(obstacles, base, links).amin(-1)
+    assert bool((every < 0).any())
+    assert bool((every > WIDE).any() or (every == WIDE).any())
+    torch.testing.assert_close(least_gap(obstacles, base, links), every.clamp_max(WIDE))
 
 
 def test_a_free_object_pays_nothing(hand, scenes):

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
-from graspd_bench.rendering.tabletop import TabletopScene, ring_poses, tabletop, views_of
-from graspd_core.mesh.shapes import SHAPES
+from graspd_bench.rendering.tabletop import TabletopScene, moved, on_table, ring_poses, tabletop, views_of
+from graspd_core.config import SegmentationConfig
+from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.segment.segment import segment
+from graspd_core.perception.segment.segment import find_things, segment
 from graspd_core.perception.segment.target_selection import Target
 
 # As a D415 with half its pixels each way.
@@ -93,3 +94,29 @@ def test_most_that_touch_are_told_where_both_were_taken():
 def test_one_thing_is_not_told_to_be_two(shape, distance):
     view = view_of(tabletop(shape, yaw=0.3), 1.2, 0.8, distance)
     assert not [warning for warning in segment([view]).warnings if "touch" in warning]
+
+
+def test_things_that_touch_are_found_apart_even_where_together_they_are_too_large_for_a_thing():
+    view = view_of(CYLINDER_BESIDE, -1.2)
+    meshes = (CYLINDER_BESIDE.truth, *CYLINDER_BESIDE.obstacles)
+    middles = [0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)) for mesh in meshes]
+    # The two together are 0.16 m long, each of them less than 0.13 m.
+    for most in (0.35, 0.14):
+        found = find_things([view], SegmentationConfig(largest_object=most, piled=True))
+        assert len(found) == 2
+        nearest = [min(range(2), key=lambda k: np.linalg.norm(points.mean(0) - middles[k])) for points in found]
+        assert sorted(nearest) == [0, 1]
+
+
+def test_one_that_lies_on_another_is_a_thing_where_things_are_piled():
+    # A ball on a box: it does not come down to the table.
+    stage = tabletop("box")
+    top = stage.truth.vertices[:, 2].max()
+    ball = moved(make_shape("sphere"), np.eye(4))
+    up = np.eye(4)
+    up[2, 3] = top - ball.vertices[:, 2].min()
+    view = view_of(on_table(stage.truth, [moved(ball, up)]), -1.0, elevation=0.5)
+    assert len(find_things([view])) == 1
+    found = find_things([view], SegmentationConfig(piled=True))
+    assert len(found) == 2
+    assert max(points[:, 2].min() for points in found) > 0.5 * top

@@ -93,7 +93,7 @@ def segment(
 def find_things(
     views: Sequence[PointCloud], settings: SegmentationConfig | None = None
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Return the points [m] of each thing that `segment` would choose from without a target.
+    """Return the points [m] of each thing that `segment` would choose from, parted at seams where things touch.
 
     One of them as a target's point means the thing it is of. There may be none.
 
@@ -101,8 +101,16 @@ def find_things(
         CloudError: empty, all NaN, or too few points.
     """
     parted = _parted(views, settings or SegmentationConfig())
-    of_points = parted.label[parted.scene.voxel]
-    return tuple(parted.scene.points[of_points == k] for k in _candidates(parted))
+    scene, label, most = parted.scene, parted.label, parted.settings.largest_object
+    known, found = _candidates(parted), []
+    # Of what is too large for a thing, parts at seams may be things.
+    large = [k for k in range(int(label.max(initial=-1)) + 1) if extent(scene.mean[label == k]) > most]
+    for k in [*known, *(k for k in large if k not in known)]:
+        part = _parts(parted, label == k)
+        for mine in (part == number for number in range(int(part.max()) + 1)):
+            if extent(scene.mean[mine]) <= most:
+                found.append(scene.points[mine[scene.voxel]])
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -213,7 +221,8 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
     part = np.where(chosen, 0, -1)
     if support is not None:
         points = scene.mean[chosen]
-        part[chosen] = touching_things(points, parted.eyes, support.height(points), scene.size)
+        height = np.zeros(len(points)) if parted.settings.piled else support.height(points)
+        part[chosen] = touching_things(points, parted.eyes, height, scene.size)
     return part
 
 

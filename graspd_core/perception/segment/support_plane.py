@@ -133,7 +133,8 @@ def stands_on(
     part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> bool:
     """Whether a cluster of voxels is a thing on that support."""
-    if not settings.smallest_object <= extent(thing) <= settings.largest_object:
+    most = np.inf if settings.piled else settings.largest_object
+    if not settings.smallest_object <= extent(thing) <= most:
         return False
     flat = thing @ part.axes
     # From above, a round body hides as much of its height as half its width.
@@ -145,7 +146,7 @@ def stands_on(
         return False
     if part.beneath(thing, settings.gap).mean() < 0.5:
         return False
-    hull = convex_hull(flat)
+    hull = None if settings.piled else convex_hull(flat)
     return hull is None or part.area >= settings.support_area_ratio * float(hull.volume)
 
 

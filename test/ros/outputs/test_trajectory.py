@@ -30,6 +30,7 @@ from graspd_core.types import ArmPath, Grasp, Posture
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_ros.convert import matrix_of, matrix_of_pose
 from graspd_ros.outputs.messages import (
+    UNMEASURED,
     Pace,
     arm_trajectory,
     base_poses,
@@ -238,9 +239,17 @@ def test_the_message_of_a_grasp_has_it_only_where_there_is_an_arm():
     told = grasp_message(grasp, 0, "id", Header(frame_id="world"), hand, Pace())
     assert list(told.arm_stages) == list(STAGE_ROWS)
     assert len(told.arm_trajectory.points) == STAGE_ROWS[-1] + 1
+    made = told.execution
+    assert list(made.gates) == ["pregrasp", "closed", "squeezed", "lifted"]
+    assert made.gate_points[-1] == len(made.arm.points) - 1 == len(made.hand.points) - 1
+    assert list(made.hand.joint_names) == list(hand.joint_names)
+    assert seconds(made.arm) == seconds(made.hand)
+    assert made.mass == UNMEASURED
+    assert grasp_message(grasp, 0, "id", Header(), hand, Pace(), mass=0.3).execution.mass == 0.3
     bare = grasp_message(Grasp(grasp.pregrasp, grasp.grasp, grasp.squeeze), 0, "id", Header(), hand, Pace())
     assert list(bare.arm_stages) == []
     assert bare.arm_trajectory.points == []
+    assert bare.execution.gates == []
 
 
 def play(found: Grasp, hand: HandModel, scene) -> float:

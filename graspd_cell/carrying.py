@@ -1,0 +1,121 @@
+"""Where the arm goes beside graspd's own path: straight up and down, and to where a thing is let go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from graspd_cell.layout import Bin, Box
+from graspd_cell.motion import Balls, Mover, Points, balls_about
+from graspd_core.arms.arm import Arm
+from graspd_core.arms.inverse_kinematics import nearest_postures, solve, start_table
+from graspd_core.se3 import SE3
+
+Joints = Float[np.ndarray, "joints"]
+Pose = Float[np.ndarray, "4 4"]
+# Between two poses of a straight way [m], and the farthest that a joint moves between them [rad].
+_STEP, _JUMP = 0.02, 0.25
+_STEPS = 12
+
+
+def tip_pose(mover: Mover, q: Joints) -> Pose:
+    """Return `T_base_tip` at joint values."""
+    rotation, place = mover.shape.links(q[None])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation[0, mover.shape.arm.tip], place[0, mover.shape.arm.tip]
+    return pose
+
+
+def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows joints"]:
+    """Return joint values along a straight way of the tip [m], as far as it is reached and clear.
+
+    The first row is `q`.
+    """
+    arm, pose, rows = mover.shape.arm, tip_pose(mover, q), [q]
+    allowed = mover.allowed(q[None])
+    count = max(1, int(np.ceil(np.linalg.norm(way) / _STEP)))
+    for k in range(1, count + 1):
+        target = pose.copy()
+        target[:3, 3] += k / count * way
+        found = solve(arm, _se3([target]), torch.as_tensor(rows[-1])[None], _STEPS)
+        after = found.q[0].double().numpy()
+        far = np.abs(after - rows[-1]).max() > _JUMP
+        if not bool(found.reached[0]) or far or not mover.clear(np.stack([rows[-1], after]), allowed):
+            break
+        rows.append(after)
+    return np.stack(rows)
+
+
+def held_balls(mover: Mover, q: Joints, surface: Points) -> Balls:
+    """Return what is carried with a thing whose surface [m], base frame, is in the hand at joint values `q`."""
+    pose = tip_pose(mover, q)
+    local = balls_about((surface - pose[:3, 3]) @ pose[:3, :3])
+    at, radius = (np.concatenate(both) for both in ((mover.carried.at, local.at), (mover.carried.radius, local.radius)))
+    return Balls(at, radius)
+
+
+# Turns about the vertical that a thing is let go at, and spots in the bin, shares of half its side.
+_TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
+SPOTS = ((0.0, 0.0), (0.45, 0.45), (-0.45, -0.45), (0.45, -0.45), (-0.45, 0.45))
+# Lowest point of a thing that is let go above the table [m], lowest first.
+_HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
+
+
+def dropped_box(thing: Points) -> Box:
+    """Return the room that a thing may fill which was let go where its points were [m]: no camera looks there."""
+    low, high = thing.min(0), thing.max(0)
+    half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
+    x, y = (0.5 * (low + high))[:2].tolist()
+    return Box("dropped", (x, y, rise), (float(half[0]), float(half[1]), rise))
+
+
+def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:
+    """Return the nearest clear posture at which a thing hangs above a bin, turned as it is but for the vertical.
+
+    Args:
+        mover: with the thing in the hand.
+        q: where the arm is.
+        thing: points of its surface at `q`, base frame [m].
+        bin_: that it is brought to.
+        number: of the thing. Spots take turns.
+    """
+    arm, pose = mover.shape.arm, tip_pose(mover, q)
+    middle = np.array([*thing.mean(0)[:2], thing[:, 2].min()])
+    for height in _HEIGHTS:
+        for shift in range(len(SPOTS)):
+            spot = np.asarray(bin_.center) + bin_.half * np.asarray(SPOTS[(number + shift) % len(SPOTS)])
+            targets = [_turned(pose, middle, np.array([*spot, height]), turn) for turn in _TURNS]
+            found = _clear_postures(mover, arm, q, targets)
+            if len(found):
+                return found[np.abs(found - q).max(1).argmin()]
+    return None
+
+
+def _turned(pose: Pose, middle: np.ndarray, place: np.ndarray, turn: float) -> Pose:
+    about = np.eye(4)
+    about[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    moved = about @ pose
+    moved[:3, 3] = about[:3, :3] @ (pose[:3, 3] - middle) + place
+    return moved
+
+
+def _clear_postures(mover: Mover, arm: Arm, q: Joints, targets: Sequence[Pose]) -> Float[np.ndarray, "_ joints"]:
+    goal = _se3(targets)
+    starts = torch.cat([torch.as_tensor(q).expand(len(targets), 1, -1), nearest_postures(start_table(arm), goal, 2)], 1)
+    count = starts.shape[1]
+    rows = torch.arange(len(targets)).repeat_interleave(count)
+    found = solve(arm, goal[rows], starts.flatten(0, 1), _STEPS)
+    reached = found.q[found.reached].double().numpy()
+    # Whole turns back to where the arm is.
+    turned = reached + 2 * np.pi * np.round((q - reached) / (2 * np.pi))
+    inside = (turned >= arm.lower) & (turned <= arm.upper)
+    reached = np.where(inside, turned, reached)
+    return reached[mover.clearances(reached).min(1) >= mover.margin] if len(reached) else reached
+
+
+def _se3(poses: Sequence[Pose]) -> SE3:
+    stacked = torch.as_tensor(np.stack(poses))
+    return SE3(stacked[:, :3, :3], stacked[:, :3, 3])

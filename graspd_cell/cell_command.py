@@ -1,0 +1,140 @@
+"""`graspd cell`: a simulated arm empties a bin, shown in a browser or told in a line a pick."""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import gc
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd_core.cli.options import add_address
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
+from graspd_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graspd_cell.cell_view import LiveCell
+    from graspd_cell.picker import Attempt
+    from graspd_cell.referee import Report
+
+# The exit status where something is left in the bin that the picker could not take.
+EXIT_LEFT = 3
+# Seconds that a page waits for somebody to look.
+_PATIENCE = 20.0
+
+
+def add_command(commands: Any) -> None:
+    """Add this command to the parser's."""
+    parser = commands.add_parser("cell", help="a simulated arm, hand and camera empty a bin")
+    parser.set_defaults(run=run)
+    parser.add_argument("--arm", default="ur5e_like", metavar="NAME|PATH", help="default: ur5e_like")
+    parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="default: allegro_right")
+    parser.add_argument(
+        "--things", nargs="+", default=["families"], metavar="THING",
+        help="family:NAME[:NUMBER], shape:NAME or a folder of meshes with a csv of masses (default: families)",
+    )  # fmt: skip
+    parser.add_argument("--count", type=int, default=5, metavar="N", help="things in the bin (default 5)")
+    parser.add_argument("--seed", type=int, default=0, help="of the things and of how they fall (default 0)")
+    parser.add_argument("--preset", default="balanced", help="of graspd (default balanced)")
+    parser.add_argument("--attempts", type=int, default=None, metavar="N", help="at most (default: two a thing)")
+    parser.add_argument("--film", type=Path, default=None, metavar="PATH.png", help="eight frames of the first pick")
+    parser.add_argument("--view", action="store_true", help="show the cell in a browser, in real time")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="of --view, times real time (default 1)")
+    add_address(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Empty the bin; 0 where nothing is left, 3 where something is, 130 after Ctrl-C."""
+    import torch
+
+    from graspd_cell.cell_study import CellCase
+    from graspd_cell.cell_view import Film, LiveCell, ToldSource
+    from graspd_cell.grasp_source import InProcessGrasps
+    from graspd_cell.picker import Cancelled, Ending, Picker, summary
+    from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
+    from graspd_cell.things import find_sources
+    from graspd_cell.world import pile_cell
+    from graspd_core.arms.arm import load_arm
+    from graspd_core.hands.library import load_hand
+
+    _refuse(options)
+    torch.set_num_threads(1)
+    # What is frozen at the end is never freed, and OMPL's library complains of that on many lines.
+    atexit.register(gc.unfreeze)
+    found = () if options.things == ["families"] else find_sources(options.things)
+    things = tuple((source.source, source.mass) for source in found)
+    case = CellCase(f"{options.arm}+{options.hand}", options.count, options.seed, options.preset, things)
+    arm, hand = load_arm(options.arm), load_hand(options.hand)
+    world = pile_cell(arm, hand, case.sources(), options.seed)
+    robot = SimulatedRobot(world, seed=options.seed)
+    robot.wait(SETTLING)
+    live = LiveCell(robot, host=options.host, port=options.port, speed=options.speed) if options.view else None
+    film = Film(robot) if options.film else None
+    source = ToldSource(
+        InProcessGrasps(arm, hand, world.layout, preset=options.preset, seed=options.seed),
+        lambda view, offer: live.show_offer(hand, view, offer) if live else None,
+    )
+    attempts: list[Attempt] = []
+    with Interrupt() as interrupt:
+        _greet(live, interrupt.came)
+        picker = Picker(robot, source, arm, hand, world.layout, cancelled=interrupt.came)
+        try:
+            for attempt in picker.empty_the_bin(options.attempts or 2 * options.count + 3):
+                attempts.append(attempt)
+                report = robot.referee()
+                _tell(live, attempt, report)
+                if film is not None and attempt.ending is Ending.PICKED:
+                    film.save(options.film)
+                    film = None
+                elif film is not None:
+                    film.begin()
+        except Cancelled as error:
+            print(f"graspd: {error}", file=sys.stderr)
+        finally:
+            if live is not None:
+                live.page.close()
+    places = robot.referee().places
+    left = [name for name, place in places.items() if place != world.layout.place.name]
+    print(f"{summary(attempts)}; left: {', '.join(left) or 'nothing'}; {picker.why_ended or 'interrupted'}", flush=True)
+    if interrupt.came():
+        return EXIT_INTERRUPTED
+    return EXIT_LEFT if left else EXIT_OK
+
+
+def _refuse(options: argparse.Namespace) -> None:
+    from graspd_cell.cell_study import MOST_THINGS
+    from graspd_core.io.grasps_json import check_writable
+
+    if not 1 <= options.count <= MOST_THINGS:
+        raise ConfigError(f"--count {options.count}: valid: 1 to {MOST_THINGS}")
+    if not 0 <= options.seed < 2**31:
+        raise ConfigError(f"--seed {options.seed}: valid: 0 to 2^31 - 1")
+    if options.attempts is not None and options.attempts < 1:
+        raise ConfigError(f"--attempts {options.attempts}: valid: 1 or more")
+    if not options.speed > 0:
+        raise ConfigError(f"--speed {options.speed}: valid: more than zero")
+    if options.film is not None:
+        check_writable(options.film)
+
+
+def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
+    if live is not None:
+        print(f"graspd: {live.page.url} - the arm begins when it is open", file=sys.stderr, flush=True)
+        live.page.wait_for_visitor(_PATIENCE, stop)
+
+
+def _tell(live: LiveCell | None, attempt: Attempt, report: Report) -> None:
+    """Print a line of an attempt; the page has the same, and how many things are out."""
+    out = sum(place == "place bin" for place in report.places.values())
+    sure = "verified" if attempt.verified else "likely"
+    chance = "" if attempt.probability is None else f" {attempt.probability:.2f}"
+    reason = f": {attempt.reason}" if attempt.reason else ""
+    line = (
+        f"{attempt.number}: {attempt.ending}{reason}; {sure}{chance}; graspd {attempt.graspd_seconds:.1f} s, "
+        f"arm {attempt.seconds:.1f} s; {out} of {len(report.places)} out"
+    )
+    print(line, flush=True)
+    if live is not None:
+        live.page.tell(f"{out} of {len(report.places)} things out", line)

@@ -1,0 +1,315 @@
+"""`graspd bench cell`: bins emptied in simulated cells as fast as it goes, and what truly came of it.
+
+What the picker knows it was told by joints and camera. What is reported is what the referee saw. Before a bin is
+emptied, its things are named that the hand can hold at all: graspd finds a verified grasp of the true mesh at its true
+mass, alone in free space. Families and seeds up to `DEVELOPED_ON` were looked at while the picker was written.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graspd_bench.study import Case, Record, Request, Sections, Study
+from graspd_cell.grasp_source import InProcessGrasps, Offer
+from graspd_cell.picker import Attempt, Ending, Picker
+from graspd_cell.referee import Report
+from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
+from graspd_cell.things import Thing, ThingSource, family_sources, find_sources
+from graspd_cell.world import pile_cell
+from graspd_core.arms.arm import load_arm
+from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.perception.scene import build_scene
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Verdict
+from graspd_dataset.run_records import markdown_table, peak_mb
+
+PAIRS = ("ur5e_like+allegro_right", "panda_like+leap_right", "ur5e_like+parallel_gripper")
+SIZES, MOST_THINGS = (1, 5, 10), 24
+# Numbers of drawn things that nothing was chosen on begin here.
+DEVELOPED_ON, _FIRST_SEED = 199, 200
+SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
+# Attempts at a bin: so many a thing, and some more.
+_TRIES_A_THING, _MORE_TRIES = 2, 3
+# After so long graspd looks at no further thing [s]: longer than a robot waits, or a busy machine would spoil figures.
+_SECONDS = 20.0
+# Upper bounds of probabilities that the curve is told for.
+_BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
+
+
+@dataclass(frozen=True)
+class CellCase(Case):
+    """One bin: `size` things, drawn from `things` or from the families, and a robot that empties it."""
+
+    pair: str
+    size: int
+    seed: int
+    preset: str
+    things: tuple[tuple[str, float | None], ...] = ()
+
+    @property
+    def label(self) -> str:
+        return f"{self.pair} {self.size} {self.seed} {self.preset} {'folder' if self.things else 'families'}"
+
+    def sources(self) -> tuple[ThingSource, ...]:
+        """Return the things that are dropped, in this order."""
+        given = [ThingSource(*thing) for thing in self.things]
+        rng, order = np.random.default_rng((self.seed, self.size)), list[ThingSource]()
+        number = self.seed
+        while len(order) < self.size:
+            stock = given or list(family_sources((number,)))
+            order += [stock[k] for k in rng.permutation(len(stock))]
+            number += 1000
+        return tuple(order[: self.size])
+
+
+def cell_cases(request: Request) -> tuple[CellCase, ...]:
+    """Return a case a pair, size and seed. Raises ConfigError: a pair, a size or a thing that there is not."""
+    pairs, sizes = list[str](), list[int]()
+    for case in request.cases:
+        if case.isdigit() and 1 <= int(case) <= MOST_THINGS:
+            sizes.append(int(case))
+        elif case.count("+") == 1:
+            pairs.append(case)
+        else:
+            raise ConfigError(f"cases: {case!r}; valid: 1 to {MOST_THINGS} things, or a pair such as {PAIRS[0]}")
+    things = tuple((source.source, source.mass) for source in find_sources(request.objects))
+    sizes = sizes or ([1] if request.quick else list(SIZES))
+    pairs = pairs or list(PAIRS[2:] if request.quick else PAIRS)
+    seeds = request.seeds or (SEEDS[:1] if request.quick else SEEDS)
+    return tuple(
+        CellCase(pair, size, seed, request.preset(), things) for pair in pairs for size in sizes for seed in seeds
+    )
+
+
+def cell_seconds(case: CellCase) -> float:
+    """CPU seconds of a case, roughly."""
+    return 8.0 + 12.0 * case.size
+
+
+def run_cell(case: CellCase) -> Record:
+    """Return all that is told of one bin."""
+    arm_name, hand_name = case.pair.split("+")
+    arm, hand = load_arm(arm_name), load_hand(hand_name)
+    world = pile_cell(arm, hand, case.sources(), case.seed)
+    robot = SimulatedRobot(world, seed=case.seed)
+    robot.wait(SETTLING)
+    began = robot.referee()
+    watch = AttemptWatch(robot)
+    source = _TimedSource(
+        InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed, seconds=_SECONDS)
+    )
+    picker = Picker(robot, source, arm, hand, world.layout)
+    most, error = _TRIES_A_THING * case.size + _MORE_TRIES, ""
+    try:
+        for attempt in picker.empty_the_bin(most):
+            watch.note(attempt, source.cpu)
+            watch.about_to_look()
+    except GraspdError as failure:
+        error = str(failure)
+    ended = robot.referee()
+    fits = {thing.name: can_be_held(hand, thing, case.preset) for thing in world.things}
+    return {
+        "dropped": dict(began.places),
+        "ended": dict(ended.places),
+        "masses": {thing.name: round(thing.model.mass, 4) for thing in world.things},
+        "fits": fits,
+        "attempts": watch.records,
+        "looks": source.looks,
+        "graspd_cpu": source.all_cpu,
+        "why_ended": error or picker.why_ended,
+        "gave_up": bool(error),
+        "simulated_s": round(robot.time, 2),
+        "peak_mb": peak_mb(),
+    }
+
+
+def can_be_held(hand: HandModel, thing: Thing, preset: str) -> bool:
+    """Return whether graspd finds a verified grasp of a thing's true mesh at its true mass, alone in free space."""
+    scene = build_scene(thing.model.mesh, source=thing.name, mass=thing.model.mass)
+    result = plan_grasps(scene, hand, count=1, seed=0, preset=preset, measure=False)
+    return any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+
+
+class _TimedSource:
+    """Counts the processor's seconds that grasps take."""
+
+    def __init__(self, source: InProcessGrasps) -> None:
+        self._source, self.cpu, self.all_cpu, self.looks = source, 0.0, 0.0, 0
+
+    def next(self, view: Any, failures: Any) -> Offer:
+        """Ask on, and count."""
+        began = time.process_time()
+        offer = self._source.next(view, failures)
+        self.cpu = time.process_time() - began
+        self.all_cpu += self.cpu
+        self.looks += 1
+        return offer
+
+
+class AttemptWatch:
+    """Compares what a picker says of its attempts with what the referee saw.
+
+    Attributes:
+        records: of the attempts, JSON-ready.
+    """
+
+    def __init__(self, robot: SimulatedRobot) -> None:
+        self._robot, self.records = robot, list[Record]()
+        self.about_to_look()
+
+    def about_to_look(self) -> None:
+        """Remember where all is before an attempt."""
+        self._before: Report = self._robot.referee()
+        self._poses = self._robot.thing_poses()
+        self._robot.clear_forces()
+
+    def note(self, attempt: Attempt, cpu: float) -> Record:
+        """Add the record of an attempt that has just ended."""
+        now = self._robot.referee()
+        moved = {name: place for name, place in now.places.items() if place != self._before.places[name]}
+        target = self._target(attempt.place)
+        told = {key: value for key, value in asdict(attempt).items() if key != "place"}
+        record = {
+            **{key: round(value, 3) if isinstance(value, float) else value for key, value in told.items()},
+            "ending": str(attempt.ending),
+            "place": np.round(attempt.place, 4).tolist(),
+            "target": target,
+            "moved": moved,
+            "out": [name for name, place in moved.items() if place == "place bin"],
+            "astray": [name for name, place in moved.items() if place in ("table", "lost")],
+            "hard": now.hard(target),
+            "graspd_cpu": round(cpu, 3),
+        }
+        self.records.append(record)
+        return record
+
+    def _target(self, place: np.ndarray) -> str:
+        """The thing in the first bin that is nearest to where the picker saw it."""
+        world = self._robot.world
+        surfaces = [
+            (np.linalg.norm((thing.seen.vertices @ pose[:3, :3].T + pose[:3, 3]) - place, axis=1).min(), thing.name)
+            for thing, pose in zip(world.things, self._poses, strict=True)
+            if self._before.places[thing.name] == world.layout.pick.name
+        ]
+        return min(surfaces)[1] if surfaces else ""
+
+
+def executed(attempt: Record) -> bool:
+    """Return whether an attempt came as far as the hand at the thing: what arms cannot reach says nothing of grasps."""
+    return attempt["ending"] != str(Ending.NO_WAY)
+
+
+def first_attempts(attempts: Sequence[Record]) -> list[Record]:
+    """Return the first attempt at each thing, by what the thing truly was."""
+    firsts: dict[str, Record] = {}
+    for attempt in attempts:
+        firsts.setdefault(attempt["target"], attempt)
+    return list(firsts.values())
+
+
+_HEADINGS = [
+    "arm and hand", "things", "in the bin", "can be held", "of those out", "all out", "astray", "attempts",
+    "first attempts that succeeded", "hit something hard", "verified and executed", "of those in the other bin",
+]  # fmt: skip
+
+
+def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
+    """Return the table a pair and size, the curve of probabilities, the endings and the times."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        groups.setdefault((record["pair"], str(record["size"])), []).append(record)
+    body = [_row(*key, own) for key, own in groups.items()]
+    for pair in dict.fromkeys(record["pair"] for record in records):
+        body.append(_row(pair, "all", [record for record in records if record["pair"] == pair]))
+    parts = [markdown_table(_HEADINGS, body), _curve(records), _endings(records), _times(records)]
+    return {"cell": [part for part in parts if part]}
+
+
+def _row(pair: str, size: str, own: Sequence[Record]) -> list[str]:
+    attempts = [attempt for record in own for attempt in record["attempts"]]
+    there = [(r, name) for r in own for name, place in r["dropped"].items() if place == "pick bin"]
+    fit = [(record, name) for record, name in there if record["fits"][name]]
+    out = [record["ended"][name] == "place bin" for record, name in there]
+    fit_out = [record["ended"][name] == "place bin" for record, name in fit]
+    first = [attempt for record in own for attempt in first_attempts(record["attempts"])]
+    sure = [attempt for attempt in attempts if attempt["verified"] and executed(attempt)]
+    return [
+        pair,
+        size,
+        str(len(there)),
+        str(len(fit)),
+        _share(fit_out),
+        _share(out),
+        str(sum(len(attempt["astray"]) for attempt in attempts)),
+        str(len(attempts)),
+        _share([bool(attempt["out"]) for attempt in first]),
+        _share([bool(attempt["hard"]) for attempt in attempts]),
+        str(len(sure)),
+        _share([bool(attempt["out"]) for attempt in sure]),
+    ]
+
+
+def _share(flags: Sequence[bool]) -> str:
+    return f"{sum(flags)} ({100 * sum(flags) / len(flags):.0f} %)" if flags else "–"
+
+
+def _curve(records: Sequence[Record]) -> str:
+    tried = [a for r in records for a in r["attempts"] if a["probability"] is not None and executed(a)]
+    body, low = [], 0.0
+    for high in _BANDS:
+        own = [a for a in tried if low <= a["probability"] < high]
+        if own:
+            mean = sum(a["probability"] for a in own) / len(own)
+            body.append(
+                [f"{low:g} to {min(high, 1.0):g}", str(len(own)), f"{mean:.2f}", _share([bool(a["out"]) for a in own])]
+            )
+        low = high
+    return markdown_table(["probability", "executed", "mean", "in the other bin"], body) if body else ""
+
+
+def _endings(records: Sequence[Record]) -> str:
+    attempts = [attempt for record in records for attempt in record["attempts"]]
+    endings = Counter((attempt["ending"], bool(attempt["out"])) for attempt in attempts)
+    body = [[ending, "yes" if out else "no", str(count)] for (ending, out), count in endings.most_common()]
+    return markdown_table(["the picker says", "a thing is in the other bin", "attempts"], body)
+
+
+def _times(records: Sequence[Record]) -> str:
+    attempts = [attempt for record in records for attempt in record["attempts"] if attempt["closing_seconds"] > 0]
+    if not attempts:
+        return ""
+    cpu, wall, closing, whole = (
+        np.median([attempt[name] for attempt in attempts])
+        for name in ("graspd_cpu", "graspd_seconds", "closing_seconds", "seconds")
+    )
+    told = f"from image to grasp {wall:.1f} s ({cpu:.1f} CPU s); from there to the closed hand {closing:.1f} s"
+    return f"Medians: {told}; a whole attempt {whole:.1f} s of the robot's clock."
+
+
+def cell_came(record: Record) -> str:
+    """Return what came of a bin in a few words."""
+    there = [name for name, place in record["dropped"].items() if place == "pick bin"]
+    out = sum(record["ended"][name] == "place bin" for name in there)
+    return f"{out} of {len(there)} out in {len(record['attempts'])} attempts"
+
+
+STUDY = Study(
+    "bins emptied in simulated cells by three arms and hands, from depth images to the other bin",
+    cell_cases,
+    run_cell,
+    cell_sections,
+    ("../graspd_cell/*.py", "rendering/*.py"),
+    ("presets", "objects", "cases", "seeds", "quick"),
+    cell_seconds,
+    came=cell_came,
+    usual=False,
+)

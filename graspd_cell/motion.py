@@ -1,0 +1,418 @@
+"""Motions of the arm between postures, clear of all that the camera saw and of what is known to stand in the cell.
+
+Arm, hand and the thing in the hand are balls: the arm's from its capsules (docs/arms.md), the others from points of
+their surfaces, which are fixed to the tip while a motion lasts. What must not be touched is a grid of distances from
+the points seen, a floor, and boxes. Paths are found by OMPL's RRTConnect, which asks about whole edges at once, and
+timed by toppra within the arm's limits.
+
+OMPL's wheel stands alone, where roboplan's brings 25 others and asks for a model of its own of arm and scene. Ruckig's
+wheel goes from state to state only: waypoints in between are sent to a server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
+
+from graspd_cell.layout import Box
+from graspd_cell.robot import JointMotion
+from graspd_core.arms.arm import Arm, tip_hand
+from graspd_core.errors import GraspdError
+from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.surface_points import dense_samples
+from graspd_core.mesh.topology import voxel_keys
+
+Joints = Float[np.ndarray, "joints"]
+Path = Float[np.ndarray, "rows joints"]
+Points = Float[np.ndarray, "_ 3"]
+
+
+class NoMotionError(GraspdError):
+    """No way for the arm, or its goal is in something."""
+
+
+# Cells of the grid of distances, and how far it reaches beyond the points seen [m].
+_CELL, _AROUND = 0.01, 0.12
+
+
+@dataclass(frozen=True, eq=False)
+class SeenWorld:
+    """What must not be touched, base frame [m].
+
+    Attributes:
+        floor: height of what all stands on; the arm's first link is not held against it.
+        boxes: known solids.
+        points: that were seen, but for those of floor and boxes.
+        origin: the grid's lowest corner.
+        distances: distance of each cell to the nearest point seen.
+    """
+
+    floor: float
+    boxes: tuple[Box, ...] = ()
+    points: Points = field(default_factory=lambda: np.zeros((0, 3)))
+    origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    distances: Float[np.ndarray, "x y z"] | None = None
+
+    def clearance(self, at: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+        """Return the distance of places to the points seen and to the boxes. The floor is not among them."""
+        away = np.full(at.shape[:-1], np.inf)
+        for box in self.boxes:
+            beyond = np.abs(at - box.center) - box.half
+            outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+            away = np.minimum(away, outside + np.minimum(beyond.max(-1), 0.0))
+        if self.distances is not None:
+            cell = np.floor((at - self.origin) / _CELL).astype(int)
+            inside = np.asarray(((cell >= 0) & (cell < self.distances.shape)).all(-1))
+            cell = np.where(inside[..., None], cell, 0)
+            away = np.minimum(away, np.where(inside, self.distances[tuple(np.moveaxis(cell, -1, 0))], _AROUND))
+        return away
+
+
+def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
+    """Return the world that a camera's points [m], base frame, and known solids make.
+
+    Points within `slack` of the floor or of a box are the floor's or the box's own.
+    """
+    known = SeenWorld(floor, tuple(boxes))
+    points = points[np.isfinite(points).all(1)]
+    points = points[points[:, 2] > floor + slack]
+    points = points[known.clearance(points) > slack] if boxes else points
+    if not len(points):
+        return known
+    origin = points.min(0) - _AROUND
+    cell = ((points - origin) / _CELL).astype(int)
+    shape = tuple(cell.max(0) + 2 + int(_AROUND / _CELL))
+    free = np.ones(shape, dtype=bool)
+    free[tuple(cell.T)] = False
+    away: Any = distance_transform_edt(free)
+    # From the middle of a cell to a point somewhere in another.
+    return replace(known, points=points, origin=origin, distances=(_CELL * (away - 0.5)).astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Balls fixed to a link: their middles in its frame and their radii [m]."""
+
+    at: Points
+    radius: Float[np.ndarray, "_"]
+
+
+# Surface points of hands and things are kept so far apart, and stand for balls of this radius [m].
+_SPACING, _BALL = 0.012, 0.004
+# Points of a hand's surface that are drawn.
+_SAMPLES = 4000
+
+
+def balls_about(points: Points, spacing: float = _SPACING, radius: float = _BALL) -> Balls:
+    """Return a ball about one point in every cube of side `spacing` [m]."""
+    kept = np.unique(voxel_keys(points - points.min(0), spacing), return_index=True)[1]
+    return Balls(points[kept], np.full(len(kept), radius))
+
+
+@lru_cache(maxsize=4)
+def _hand_surface(hand: HandModel) -> tuple[Points, Int[np.ndarray, "_"]]:
+    return dense_samples(hand, count=_SAMPLES)[:2]
+
+
+def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
+    """Return the hand at its joint values, in the frame of the arm's tip."""
+    points, links = _hand_surface(hand)
+    rotations, translations = link_poses(hand, joints)
+    local = np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links]
+    mount = tip_hand(arm, hand)
+    return balls_about(local @ mount.rotation.numpy().T + mount.translation.numpy())
+
+
+@dataclass(frozen=True, eq=False)
+class ArmShape:
+    """An arm as balls, with what its kinematics need as arrays.
+
+    Attributes:
+        arm: the arm.
+        local: the arm's balls, frame of the link of each [m].
+        radius: of each, so much larger that they cover the capsule they were drawn in [m].
+        link: of each.
+    """
+
+    arm: Arm
+    local: Points
+    radius: Float[np.ndarray, "_"]
+    link: Int[np.ndarray, "_"]
+
+    @cached_property
+    def _constants(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Offset, sine and cosine parts of each link's turn, and what a slide adds: `R = A + sin B + cos C`."""
+        chain = self.arm.chain
+        x, y, z = chain.joint_axis.T
+        zero = np.zeros_like(x)
+        skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+        slides = np.array([kind == "prismatic" for kind in chain.joint_kind])[:, None, None]
+        skew = np.where(slides, 0.0, skew)
+        offset = chain.link_offset_rotation
+        square = offset @ skew @ skew
+        slide = np.where(slides, offset @ chain.joint_axis[..., None], 0.0)[..., 0]
+        return offset + square, offset @ skew, -square, slide
+
+    def links(self, q: Path) -> tuple[Float[np.ndarray, "rows links 3 3"], Float[np.ndarray, "rows links 3"]]:
+        """Return turn and place of every link at joint values, base frame."""
+        chain, (constant, sine, cosine, slide) = self.arm.chain, self._constants
+        rotation = np.empty((len(q), len(chain.link_names), 3, 3))
+        place = np.empty((len(q), len(chain.link_names), 3))
+        for link, (parent, joint) in enumerate(zip(chain.link_parent, chain.link_joint, strict=True)):
+            value = q[:, joint] if joint >= 0 else np.zeros(len(q))
+            turn = constant[link] + np.sin(value)[:, None, None] * sine[link]
+            turn = turn + np.cos(value)[:, None, None] * cosine[link]
+            shift = chain.link_offset_translation[link] + value[:, None] * slide[link]
+            if parent < 0:
+                rotation[:, link], place[:, link] = turn, shift
+                continue
+            rotation[:, link] = rotation[:, parent] @ turn
+            place[:, link] = place[:, parent] + np.einsum("bij,bj->bi", rotation[:, parent], shift)
+        return rotation, place
+
+    @cached_property
+    def beyond_shoulder(self) -> Bool[np.ndarray, "_"]:
+        """Which balls are held against floor and boxes: all but those of the base and the first link that moves."""
+        group = self.arm.chain.link_group
+        return (group[self.link] != 0) & (group[self.link] != group[self.arm.moved_link[0]])
+
+
+@lru_cache(maxsize=4)
+def arm_shape(arm: Arm) -> ArmShape:
+    """Return the balls of an arm's capsules, so dense that they stand out by less than an eighth of a radius."""
+    at, radius, link = [], [], []
+    for k, owner in enumerate(arm.capsules.link):
+        start, end, thick = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
+        count = 1 + int(np.ceil(np.linalg.norm(end - start) / thick))
+        gap = np.linalg.norm(end - start) / max(count - 1, 1)
+        at.append(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
+        radius.append(np.full(count, np.hypot(thick, gap / 2)))
+        link.append(np.full(count, owner))
+    return ArmShape(arm, np.concatenate(at), np.concatenate(radius), np.concatenate(link))
+
+
+# Balls that are nearer to each other than this in the seed posture are never held against each other [m].
+_TOUCHING = 0.01
+# Balls of hand and held thing that are held against the arm are so large [m].
+_COARSE = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """An arm with a hand at some joint values, and perhaps a thing in it, in a world.
+
+    Attributes:
+        shape: the arm.
+        world: what must not be touched.
+        carried: the hand and what is in it, frame of the tip.
+        margin: distance kept from all, where the ends of a motion keep it [m].
+    """
+
+    shape: ArmShape
+    world: SeenWorld
+    carried: Balls
+    margin: float = 0.015
+
+    @cached_property
+    def _own(self) -> tuple[Balls, np.ndarray, np.ndarray]:
+        """Coarse balls of what is carried, and the pairs of arm balls, and of arm and carried balls, held apart."""
+        shape, arm = self.shape, self.shape.arm
+        coarse = balls_about(self.carried.at, _COARSE, 0.5 * _COARSE)
+        group = arm.chain.link_group
+        parent = np.where(arm.chain.link_parent[group] < 0, -1, group[arm.chain.link_parent[group]])
+        own, above = group[shape.link], parent[shape.link]
+        first, second = np.triu_indices(len(own), 1)
+        near = (own[first] == own[second]) | (above[first] == own[second]) | (above[second] == own[first])
+        pairs = np.stack([first, second], 1)[~near]
+        balls, carried = self._placed(np.asarray(arm.seed)[None], coarse)
+        gap = np.linalg.norm(balls[0, pairs[:, 0]] - balls[0, pairs[:, 1]], axis=-1)
+        pairs = pairs[gap - shape.radius[pairs].sum(1) > _TOUCHING]
+        gap = np.linalg.norm(balls[0, :, None] - carried[0], axis=-1) - shape.radius[:, None] - coarse.radius
+        return coarse, pairs, np.argwhere(gap > _TOUCHING)
+
+    def _placed(self, q: Path, carried: Balls) -> tuple[np.ndarray, np.ndarray]:
+        rotation, place = self.shape.links(q)
+        link, tip = self.shape.link, self.shape.arm.tip
+        balls = np.einsum("bnij,nj->bni", rotation[:, link], self.shape.local) + place[:, link]
+        return balls, carried.at @ rotation[:, tip].swapaxes(1, 2) + place[:, None, tip]
+
+    def placed(self, q: Joints) -> tuple[Points, Points]:
+        """Return the middles of the balls of the arm, and of what it carries, base frame [m]."""
+        balls, carried = self._placed(q[None], self.carried)
+        return balls[0], carried[0]
+
+    def height(self, q: Joints) -> float:
+        """Return how high the tip is, base frame [m]."""
+        return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
+
+    def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
+        """Return the distance of every ball of arm and hand, and of every pair of them, to what must not be touched."""
+        shape = self.shape
+        coarse, pairs, with_carried = self._own
+        balls, carried = self._placed(q, self.carried)
+        held = shape.beyond_shoulder
+        at = np.concatenate([balls[:, held], carried], 1)
+        radius = np.concatenate([shape.radius[held], self.carried.radius])
+        away = np.minimum(self.world.clearance(at), at[..., 2] - self.world.floor) - radius
+        between = np.linalg.norm(balls[:, pairs[:, 0]] - balls[:, pairs[:, 1]], axis=-1) - shape.radius[pairs].sum(1)
+        parts = [away, between + self.margin]
+        if len(with_carried):
+            carried = self._placed(q, coarse)[1]
+            a, b = with_carried.T
+            gap = np.linalg.norm(balls[:, a] - carried[:, b], axis=-1) - shape.radius[a] - coarse.radius[b]
+            parts.append(gap + self.margin)
+        return np.concatenate(parts, 1)
+
+    def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
+        """Return the distance of the arm's balls, without the hand's, to floor, boxes and points seen."""
+        return self.clearances(q)[:, : int(self.shape.beyond_shoulder.sum())]
+
+    def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
+        """Return how near each ball may come: the margin, or as near as it is at one of the ends."""
+        return np.minimum(self.margin, self.clearances(ends).min(0) - 1e-3)
+
+    def clear(self, path: Path, allowed: Float[np.ndarray, "balls"]) -> bool:
+        """Whether the straight ways between rows keep away as far as is allowed."""
+        return bool((self.clearances(dense(path)) >= allowed).all())
+
+
+# Rows of a checked path are so near to each other [rad].
+_STEP = 0.04
+
+
+def dense(path: Path, step: float = _STEP) -> Path:
+    """Return the path with rows on the lines between its rows, none farther than `step` from the next [rad]."""
+    if len(path) < 2:
+        return path
+    counts = [max(1, int(np.ceil(np.abs(b - a).max() / step))) for a, b in pairwise(path)]
+    parts = [a + np.arange(n)[:, None] / n * (b - a) for (a, b), n in zip(pairwise(path), counts, strict=True)]
+    return np.concatenate([*parts, path[-1:]])
+
+
+# A motion may end with the hand this deep in what was seen, whose surface is known to a cell, and with the
+# arm, whose capsules are larger than its links, this deep in anything [m].
+_DEEPEST, ARM_DEEPEST = -0.02, -0.01
+
+
+def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 1.5) -> Path:
+    """Return waypoints from one posture to another whose straight connections are clear.
+
+    Raises:
+        NoMotionError: the goal is in something, or no way was found in `seconds`.
+    """
+    ends = np.stack([start, goal])
+    # Where the arm stands it stands, whatever it touches there.
+    whole, own = mover.clearances(ends)[1].min(), mover.arm_clearances(ends)[1].min()
+    if whole < _DEEPEST or own < ARM_DEEPEST:
+        told = f"{-1e3 * min(whole, own):.0f} mm deep in something at its goal; valid: clear of all"
+        raise NoMotionError(f"motion: {mover.shape.arm.name} is {told}")
+    allowed = mover.allowed(ends)
+    if mover.clear(ends, allowed):
+        return ends
+    found = _planned(mover, start, goal, allowed, seconds)
+    if found is None:
+        raise NoMotionError(f"motion: no clear way of {mover.shape.arm.name} was found in {seconds:g} s")
+    return _rounded(mover, found, allowed)
+
+
+def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, seconds: float) -> Path | None:
+    from ompl import base, geometric, util
+
+    util.setLogLevel(util.LogLevel.LOG_ERROR)
+    arm, count = mover.shape.arm, len(start)
+    space, bounds = base.RealVectorStateSpace(count), base.RealVectorBounds(count)
+    for joint in range(count):
+        # Whole turns away from both ends nothing is gained.
+        low, high = min(start[joint], goal[joint]) - np.pi, max(start[joint], goal[joint]) + np.pi
+        bounds.setLow(joint, float(max(arm.lower[joint], low)))
+        bounds.setHigh(joint, float(min(arm.upper[joint], high)))
+    space.setBounds(bounds)
+    about = base.SpaceInformation(space)
+
+    def values(state: Any) -> Joints:
+        return np.array([state[joint] for joint in range(count)])
+
+    class Edges(base.MotionValidator):
+        def checkMotion(self, first: Any, second: Any, *_: Any) -> bool:
+            return mover.clear(np.stack([values(first), values(second)]), allowed)
+
+    about.setStateValidityChecker(lambda state: mover.clear(values(state)[None], allowed))
+    about.setMotionValidator(Edges(about))
+    about.setup()
+    ends: list[Any] = [space.allocState() for _ in range(2)]
+    for state, q in zip(ends, (start, goal), strict=True):
+        for joint in range(count):
+            state[joint] = float(q[joint])
+    problem = base.ProblemDefinition(about)
+    problem.setStartAndGoalStates(*ends)
+    planner = geometric.RRTConnect(about)
+    planner.setRange(0.6)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    if str(planner.solve(seconds)) != "Exact solution":
+        return None
+    path: Any = problem.getSolutionPath()
+    geometric.PathSimplifier(about).simplify(path, 0.3)
+    return np.stack([values(state) for state in path.getStates()])
+
+
+def _rounded(mover: Mover, path: Path, allowed: np.ndarray) -> Path:
+    """Return the path with its corners cut twice (Chaikin), where that is clear."""
+    smooth = path
+    for _ in range(2):
+        inner = [row for a, b in pairwise(smooth) for row in (0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b)]
+        smooth = np.stack([smooth[0], *inner[1:-1], smooth[-1]]) if len(smooth) > 2 else smooth
+    return smooth if mover.clear(smooth, allowed) else path
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """How fast an arm is driven.
+
+    Attributes:
+        share: of its greatest joint speeds.
+        acceleration: of its joints [rad/s²].
+    """
+
+    share: float = 0.6
+    acceleration: float = 4.0
+
+
+# Time between two rows of a motion [s].
+_PERIOD = 0.02
+
+
+def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
+    """Return the fastest motion along a path within the speeds, from rest to rest."""
+    import toppra
+    from toppra.algorithm import TOPPRA
+    from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
+
+    rows = dense(path)
+    # Rows that say the same twice have no direction.
+    rows = rows[np.r_[True, np.abs(np.diff(rows, axis=0)).max(1) > 1e-6]]
+    if len(rows) < 2:
+        return JointMotion(arm.joint_names, np.array([_PERIOD]), path[-1:], np.zeros_like(path[-1:]))
+    toppra.setup_logging("ERROR")
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1))]
+    most = speeds.share * np.asarray(arm.chain.velocity)
+    push = np.full(len(most), speeds.acceleration)
+    limits = [
+        JointVelocityConstraint(np.stack([-most, most], 1)),
+        JointAccelerationConstraint(np.stack([-push, push], 1)),
+    ]
+    trajectory: Any = TOPPRA(
+        limits, toppra.SplineInterpolator(along, rows), parametrizer="ParametrizeConstAccel"
+    ).compute_trajectory()
+    if trajectory is None:
+        raise NoMotionError(f"motion: toppra found no times for a path of {len(rows)} rows of {arm.name}")
+    times = np.linspace(0.0, trajectory.duration, max(2, 1 + int(np.ceil(trajectory.duration / _PERIOD))))
+    return JointMotion(arm.joint_names, times[1:], trajectory(times)[1:], trajectory(times, 1)[1:])

@@ -1,0 +1,400 @@
+"""Empty a bin: look, ask graspd for the next thing, take it, carry it to the other bin, until nothing is left.
+
+Written to be copied. A behaviour is one function of `Picker`; each returns how it ended. Every wait has a timeout. All
+that the picker knows it was told by joints and camera, so that it drives a real cell as well: give it another `Robot`.
+When `cancelled` says so, the arm stops where it is and the hand stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from graspd_cell.carrying import dropped_box, held_balls, release_posture, straight, tip_pose
+from graspd_cell.grasp_held import Hold, after_squeeze, grips, still_holds
+from graspd_cell.grasp_source import Failure, GraspSource, Offer, cloud_of
+from graspd_cell.layout import Box, CellLayout
+from graspd_cell.motion import (
+    ARM_DEEPEST,
+    Mover,
+    NoMotionError,
+    SeenWorld,
+    Speeds,
+    arm_shape,
+    dense,
+    find_path,
+    hand_balls,
+    seen_world,
+    timed,
+)
+from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
+from graspd_core.arms.arm import Arm
+from graspd_core.arms.execution import Execution, ExecutionPace, execution_of
+from graspd_core.errors import GraspdError
+from graspd_core.hands.model import HandModel
+from graspd_core.mesh.mesh_files import surface_samples
+
+
+class Ending(StrEnum):
+    """How one attempt ended."""
+
+    PICKED = "picked"
+    NO_WAY = "no way for the arm"
+    NOT_GRIPPED = "closed on nothing"
+    LOST_LIFTING = "lost while lifting"
+    LOST_CARRYING = "lost while carrying"
+    ABORTED = "a motion was aborted"
+
+
+class Cancelled(GraspdError):
+    """Somebody cancelled: the arm is still, the hand is as it was."""
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """One attempt at one thing.
+
+    Attributes:
+        number: of the attempt, from 1.
+        ending: how it ended.
+        reason: why it failed; empty where it did not.
+        place: the middle of the thing's points [m].
+        verified: whether graspd called the grasp verified.
+        probability: that graspd gave it; None where it gave none.
+        tries: failures at this thing before.
+        graspd_seconds: from the image to the grasp, wall clock.
+        closing_seconds: from the image to the closed hand on the robot's clock, graspd's part not counted.
+        seconds: of the whole attempt on the robot's clock.
+        things: seen before it.
+    """
+
+    number: int
+    ending: Ending
+    reason: str
+    place: Float[np.ndarray, "3"]
+    verified: bool
+    probability: float | None
+    tries: int
+    graspd_seconds: float
+    closing_seconds: float
+    seconds: float
+    things: int
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast the picker works, and how long it waits.
+
+    Attributes:
+        free: of motions with an empty hand.
+        loaded: of motions with a thing in the hand.
+        grasp: of approach, closing and lift.
+        patience: seconds beyond a motion's own until it has to be over.
+        settle: seconds that the fingers get to press.
+        least_probability: of a grasp that is not verified, to be tried when nothing is.
+    """
+
+    free: Speeds = field(default_factory=lambda: Speeds(0.7, 5.0))
+    loaded: Speeds = field(default_factory=lambda: Speeds(0.4, 2.5))
+    grasp: ExecutionPace = field(default_factory=ExecutionPace)
+    patience: float = 3.0
+    settle: float = 0.4
+    least_probability: float = 0.4
+
+
+@dataclass(eq=False)
+class _Taking:
+    """What is known of the attempt that goes on."""
+
+    offer: Offer
+    execution: Execution
+    world: SeenWorld
+    began: float
+    closed: float = 0.0
+    hold: Hold | None = None
+    dropped: Box | None = None
+
+
+class Picker:
+    """Drives one robot.
+
+    Args:
+        robot: that is driven.
+        source: of grasps.
+        arm, hand: of the robot.
+        layout: of the cell; the arm waits at its `start`.
+        pace: speeds and timeouts.
+        cancelled: polled all the time.
+    """
+
+    def __init__(
+        self, robot: Robot, source: GraspSource, arm: Arm, hand: HandModel, layout: CellLayout,
+        *, pace: Pace | None = None, cancelled: Callable[[], bool] = never,
+    ) -> None:  # fmt: skip
+        self._robot, self._source, self._arm, self._hand, self._layout = robot, source, arm, hand, layout
+        self._pace, self._cancelled = pace or Pace(), cancelled
+        self._failures: list[Failure] = []
+        self._picked = 0
+        # Of things in the second bin, which the camera hardly sees.
+        self._dropped: list[Box] = []
+        self.offer: Offer | None = None
+        self.why_ended = ""
+
+    def empty_the_bin(self, most: int = 500) -> Iterator[Attempt]:
+        """Take thing after thing and yield each attempt; `why_ended` says then why there is no further one.
+
+        Raises:
+            Cancelled: somebody cancelled.
+            MotionAborted: the arm does not come home, so that nothing can be seen any more.
+        """
+        attempts = 0
+        while attempts < most:
+            self.go_home()
+            view, began = self._robot.look(), self._robot.joints().time
+            offer = self.offer = self._source.next(view, self._failures)
+            self._failures += offer.failures
+            likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
+            if offer.grasp is None or not (offer.verified or likely):
+                self.why_ended = offer.reason
+                if offer.exhausted:
+                    return
+                if offer.grasp is not None:
+                    self._failures.append(Failure(offer.place, offer.grasp.grasp))
+                continue
+            attempts += 1
+            attempt = self.attempt(offer, self.world_of(view), began, attempts)
+            self._learn(attempt, offer)
+            yield attempt
+        self.why_ended = f"{most} attempts"
+
+    def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
+        """Take one thing to the other bin, and tell how it ended."""
+        taking: _Taking | None = None
+        try:
+            assert offer.grasp is not None
+            speeds = self._pace.free.share * np.asarray(self._arm.chain.velocity)
+            execution = execution_of(offer.grasp, self._hand, arm_speeds=speeds, mass=offer.mass, pace=self._pace.grasp)
+            taking = _Taking(offer, execution, world, began)
+            ending, reason = self._steps(taking)
+        except NoMotionError as error:
+            ending, reason = Ending.NO_WAY, str(error)
+        except MotionAborted as error:
+            self._stop_if_cancelled()
+            ending, reason = Ending.ABORTED, str(error)
+        if ending is not Ending.PICKED:
+            self.back_off(world)
+        now, closed = self._robot.joints().time, taking.closed if taking else 0.0
+        tries = sum(np.linalg.norm(failure.place - offer.place) < 0.04 for failure in self._failures)
+        return Attempt(
+            number, ending, reason, offer.place, offer.verified, offer.grasp and offer.grasp.probability, int(tries),
+            offer.seconds, max(closed - began, 0.0), now - began, offer.things,
+        )  # fmt: skip
+
+    def _steps(self, taking: _Taking) -> tuple[Ending, str]:
+        self.go_to_retreat(taking)
+        self.close(taking)
+        gripped = self.squeeze(taking)
+        if not gripped.held:
+            return Ending.NOT_GRIPPED, gripped.reason
+        self.lift(taking)
+        assert taking.hold is not None
+        held = still_holds(taking.hold, self._hand, self._robot.joints())
+        if not held.held:
+            return Ending.LOST_LIFTING, held.reason
+        lost = self.carry(taking)
+        if lost:
+            return Ending.LOST_CARRYING, lost
+        self.let_go(taking)
+        return Ending.PICKED, ""
+
+    def world_of(self, view: DepthView) -> SeenWorld:
+        """Return what must not be touched: what a view shows without the robot, and what is known of the cell."""
+        points = cloud_of(view).points
+        mover = self._mover(SeenWorld(0.0))
+        balls, carried = mover.placed(self._arm_now())
+        radius = np.concatenate([mover.shape.radius, mover.carried.radius])
+        away, nearest = KDTree(np.concatenate([balls, carried])).query(points)
+        return seen_world(points[away > radius[nearest] + 0.03], 0.0, self._known)
+
+    def go_home(self) -> None:
+        """Bring the arm out of the camera's sight, the hand open."""
+        now = self._arm_now()
+        if np.abs(now - self._layout.start).max() > 0.02:
+            mover = self._mover(SeenWorld(0.0, self._known))
+            up = straight(mover, now, np.array([0.0, 0.0, 0.12]))
+            self._follow_arm(up, self._pace.free)
+            self._follow_arm(find_path(mover, up[-1], self._layout.start), self._pace.free)
+        self._move_hand(self._hand.open_posture)
+
+    def go_to_retreat(self, taking: _Taking) -> None:
+        """Bring the arm to where graspd's own path begins, with the fingers as at the pregrasp."""
+        start = taking.execution.hand[0]
+        self._move_hand(start)
+        mover = self._mover(taking.world, start)
+        depth = -mover.arm_clearances(dense(taking.execution.arm)).min()
+        if depth > -ARM_DEEPEST:
+            told = f"{1e3 * depth:.0f} mm deep in something; valid: clear of all"
+            raise NoMotionError(f"motion: on its way through the grasp {self._arm.name} is {told}")
+        goal = taking.execution.arm[0]
+        # From above, where the way down is straight, else as the planner finds.
+        above = straight(mover, goal, np.array([0.0, 0.0, 0.12]))[::-1]
+        path = find_path(mover, self._arm_now(), above[0])
+        self._follow_arm(np.concatenate([path, above[1:]]), self._pace.free)
+
+    def close(self, taking: _Taking) -> None:
+        """Follow graspd's path to the grasp: the arm first, then arm and fingers together."""
+        self._follow_gate(taking.execution, "pregrasp")
+        self._follow_gate(taking.execution, "closed")
+        taking.closed = self._robot.joints().time
+
+    def squeeze(self, taking: _Taking):
+        """Press, and tell whether the fingers closed on something."""
+        self._follow_gate(taking.execution, "squeezed")
+        self._wait(self._pace.settle)
+        assert taking.offer.grasp is not None
+        taking.hold = after_squeeze(self._hand, taking.offer.grasp, self._robot.joints())
+        return grips(taking.hold)
+
+    def lift(self, taking: _Taking) -> None:
+        """Lift along graspd's path."""
+        self._follow_gate(taking.execution, "lifted")
+
+    def carry(self, taking: _Taking) -> str:
+        """Bring the thing above the other bin. Returns why it was lost on the way; empty where it was not."""
+        hold, here = taking.hold, self._arm_now()
+        assert hold is not None
+        thing = self._surface_now(taking, here)
+        world = self._without_thing(taking)
+        mover = self._mover(world, self._hand_now())
+        mover = replace(mover, carried=held_balls(mover, here, thing))
+        up = straight(mover, here, np.array([0.0, 0.0, 0.1]))
+        risen = thing + np.array([0.0, 0.0, mover.height(up[-1]) - mover.height(here)])
+        goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
+        if goal is None:
+            raise NoMotionError(
+                f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}"
+            )
+        path = find_path(mover, up[-1], goal)
+        there = np.linalg.inv(tip_pose(mover, up[-1])), tip_pose(mover, goal)
+        taking.dropped = dropped_box(risen @ (there[1] @ there[0])[:3, :3].T + (there[1] @ there[0])[:3, 3])
+        lost = ""
+
+        def slipped() -> bool:
+            nonlocal lost
+            lost = still_holds(hold, self._hand, self._robot.joints()).reason
+            return bool(lost) or self._cancelled()
+
+        try:
+            self._follow_arm(np.concatenate([up, path[1:]]), self._pace.loaded, slipped)
+        except MotionAborted:
+            self._stop_if_cancelled()
+            if not lost:
+                raise
+        return lost or still_holds(hold, self._hand, self._robot.joints()).reason
+
+    def let_go(self, taking: _Taking) -> None:
+        """Open the hand slowly."""
+        self._move_hand(taking.execution.hand[0])
+        self._wait(self._pace.settle)
+        self._picked += 1
+        self._dropped += [taking.dropped] if taking.dropped is not None else []
+
+    def back_off(self, world: SeenWorld) -> None:
+        """After a failure: open the hand and rise, as far as that goes."""
+        self._stop_if_cancelled()
+        try:
+            self._move_hand(self._hand.open_posture)
+            mover = self._mover(world)
+            self._follow_arm(straight(mover, self._arm_now(), np.array([0.0, 0.0, 0.15])), self._pace.loaded)
+        except MotionAborted:
+            self._stop_if_cancelled()
+
+    def _learn(self, attempt: Attempt, offer: Offer) -> None:
+        """Remember what failed. Where something was taken out, things without a grasp may have one now."""
+        if attempt.ending is Ending.PICKED:
+            self._failures = [failure for failure in self._failures if failure.grasp is not None]
+        elif offer.grasp is not None:
+            self._failures.append(Failure(offer.place, offer.grasp.grasp))
+
+    # What the behaviours are made of.
+
+    @property
+    def _known(self) -> tuple[Box, ...]:
+        """What stands in the cell, seen or not."""
+        return (*self._layout.solids[1:], *self._dropped)
+
+    def _mover(self, world: SeenWorld, fingers: np.ndarray | None = None) -> Mover:
+        fingers = self._hand_now() if fingers is None else fingers
+        return Mover(arm_shape(self._arm), world, hand_balls(self._arm, self._hand, fingers))
+
+    def _surface_now(self, taking: _Taking, here: np.ndarray) -> np.ndarray:
+        """Points of the thing in the hand: it rose with the tip since the grasp."""
+        assert taking.offer.surface is not None
+        mover = self._mover(taking.world)
+        points = surface_samples(taking.offer.surface, 1500, 0)[0]
+        at = taking.execution.arm[taking.execution.gates[1]]
+        return points + np.array([0.0, 0.0, mover.height(here) - mover.height(at)])
+
+    def _without_thing(self, taking: _Taking) -> SeenWorld:
+        """The world without the points of the thing that is in the hand now."""
+        assert taking.offer.surface is not None
+        own = KDTree(surface_samples(taking.offer.surface, 1500, 0)[0])
+        points = taking.world.points
+        return seen_world(points[own.query(points)[0] > 0.02], 0.0, taking.world.boxes) if len(points) else taking.world
+
+    def _arm_now(self) -> np.ndarray:
+        return self._robot.joints().of(self._arm.joint_names).positions
+
+    def _hand_now(self) -> np.ndarray:
+        now = self._robot.joints().of(self._hand.joint_names).positions
+        return np.clip(now, self._hand.lower, self._hand.upper)
+
+    def _follow_arm(self, path: np.ndarray, speeds: Speeds, stop: Callable[[], bool] | None = None) -> None:
+        if len(path) > 1:
+            self._follow(timed(self._arm, path, speeds), stop)
+
+    def _follow_gate(self, execution: Execution, gate: str) -> None:
+        """Run the part of a grasp's trajectory that leads to one gate."""
+        rows = execution.rows_to(gate)
+        times = execution.times[rows] - execution.times[rows.start]
+        positions = np.concatenate([execution.arm[rows], execution.hand[rows]], 1)[1:]
+        speeds = np.concatenate([execution.arm_speed[rows], execution.hand_speed[rows]], 1)[1:]
+        self._follow(JointMotion((*execution.arm_joints, *execution.hand_joints), times[1:], positions, speeds))
+
+    def _move_hand(self, goal: np.ndarray) -> None:
+        """Move the fingers to joint values, all of them in step."""
+        hand, now = self._hand, self._hand_now()
+        speed = np.minimum(np.where(hand.slides, 0.1, 1.5), 0.6 * hand.velocity)
+        seconds = max(0.3, 1.5 * float((np.abs(goal - now) / speed).max()))
+        if np.abs(goal - now).max() > 1e-3:
+            goal = np.clip(goal, hand.lower, hand.upper)[None]
+            self._follow(JointMotion(hand.joint_names, np.array([seconds]), goal, np.zeros_like(goal)))
+
+    def _follow(self, motion: JointMotion, stop: Callable[[], bool] | None = None) -> JointReading:
+        self._stop_if_cancelled()
+        try:
+            return self._robot.follow(motion, motion.duration + self._pace.patience, stop or self._cancelled)
+        except MotionAborted:
+            self._stop_if_cancelled()
+            raise
+
+    def _wait(self, seconds: float) -> None:
+        self._stop_if_cancelled()
+        self._robot.wait(seconds)
+
+    def _stop_if_cancelled(self) -> None:
+        if self._cancelled():
+            raise Cancelled("the picker was cancelled; the arm is still")
+
+
+def summary(attempts: Sequence[Attempt]) -> str:
+    """Say in a line what came of some attempts."""
+    picked = [attempt for attempt in attempts if attempt.ending is Ending.PICKED]
+    first = [attempt for attempt in attempts if attempt.tries == 0]
+    good = sum(attempt.ending is Ending.PICKED for attempt in first)
+    return f"{len(picked)} things in {len(attempts)} attempts; {good} of {len(first)} at the first attempt"

@@ -1,0 +1,78 @@
+"""Arm and hand as one robot: its URDF, and its frames as they are published on /tf.
+
+Frames of the arm keep their names; those of the hand begin with `hand_`, since both have a base link.
+"""
+
+from __future__ import annotations
+
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from graspd_cell.world import CellWorld, Pose
+from graspd_core.arms.arm import Arm, tip_hand
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.readers.xml_io import read_xml
+
+CAMERA_FRAME, HAND_PREFIX = "camera_depth_optical_frame", "hand_"
+
+
+def robot_description(arm: Arm, hand: HandModel) -> str:
+    """Return the URDF of the arm that carries the hand. A hand without a URDF is left out.
+
+    Links of the hand begin with `hand_`; joints keep their names.
+    """
+    root = read_xml(Path(arm.chain.urdf))
+    root.set("name", f"{arm.name}_{hand.name}")
+    path = Path(hand.urdf)
+    if path.suffix == ".pkl" or (own := read_xml(path)).tag != "robot":
+        return ET.tostring(root, encoding="unicode")
+    for link in own.iter("link"):
+        if link.get("name"):
+            link.set("name", HAND_PREFIX + str(link.get("name")))
+    for joint in own.findall("joint"):
+        for end in joint.findall("parent") + joint.findall("child"):
+            end.set("link", HAND_PREFIX + str(end.get("link")))
+    for mesh in own.iter("mesh"):
+        name = str(mesh.get("filename"))
+        if "://" not in name:
+            mesh.set("filename", (path.parent / name).resolve().as_uri())
+    for element in own:
+        if element.tag in ("link", "joint", "material"):
+            root.append(element)
+    mount, turn = ET.SubElement(root, "joint", name=f"{HAND_PREFIX}mount", type="fixed"), tip_hand(arm, hand)
+    with warnings.catch_warnings():
+        # A hand that points straight along x has more than one set of angles. Any will do.
+        warnings.simplefilter("ignore")
+        roll, pitch, yaw = Rotation.from_matrix(turn.rotation.numpy()).as_euler("xyz")
+    x, y, z = turn.translation.tolist()
+    ET.SubElement(mount, "parent", link=arm.chain.link_names[arm.tip])
+    ET.SubElement(mount, "child", link=HAND_PREFIX + hand.base_link)
+    ET.SubElement(mount, "origin", xyz=f"{x:.9g} {y:.9g} {z:.9g}", rpy=f"{roll:.9g} {pitch:.9g} {yaw:.9g}")
+    return ET.tostring(root, encoding="unicode")
+
+
+def frames_of(world: CellWorld, poses: Mapping[str, Pose]) -> list[tuple[str, str, Pose]]:
+    """Return each link's frame as parent, child and `T_parent_child` [m].
+
+    Args:
+        world: the cell.
+        poses: of the links in the base frame, as `SimulatedRobot.link_poses` gives them.
+    """
+    arm, hand, found = world.arm, world.hand, []
+    for prefix, key, robot in (("", "", arm.chain), (HAND_PREFIX, "hand/", hand)):
+        for link, name in enumerate(robot.link_names):
+            parent = robot.link_parent[link]
+            if parent >= 0:
+                above, pose = f"{prefix}{robot.link_names[parent]}", poses[f"{key}{robot.link_names[parent]}"]
+            elif key:
+                above = arm.chain.link_names[arm.tip]
+                pose = poses[above]
+            else:
+                continue
+            found.append((above, f"{prefix}{name}", np.linalg.inv(pose) @ poses[f"{key}{name}"]))
+    return found

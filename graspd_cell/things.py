@@ -1,0 +1,134 @@
+"""Things with their real masses: drawn families, authored shapes, or a folder of meshes and a csv of masses."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graspd_bench.rendering.families import FAMILIES, PREFIX, draw_thing
+from graspd_core.errors import ConfigError, MeshError
+from graspd_core.mesh.mesh_files import MESH_ENDINGS, simplify
+from graspd_core.mesh.shapes import SHAPES
+from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
+from graspd_core.perception.scene import ObjectModel, object_parts
+from graspd_core.types import TriangleMesh
+
+# Of authored shapes: between wood and water [kg/m³].
+SHAPE_DENSITY = 700.0
+# Columns of a csv of masses, the first of each that it has.
+_NAME_COLUMNS, _MASS_COLUMNS = ("name", "mesh", "file"), ("mass_kg", "mass")
+# Faces of a thing as the camera sees it.
+_SEEN_FACES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """Something to be taken out of a bin.
+
+    Attributes:
+        name: of the thing.
+        model: mesh, mass and inertia.
+        parts: its convex parts, which collide [m].
+        seen: its surface, simplified for the camera [m].
+    """
+
+    name: str
+    model: ObjectModel
+    parts: tuple[TriangleMesh, ...]
+    seen: TriangleMesh
+
+
+@dataclass(frozen=True)
+class ThingSource:
+    """Where a thing comes from: `family:NAME:SEED`, `shape:NAME` or a mesh file with its mass [kg]."""
+
+    source: str
+    mass: float | None = None
+
+    @property
+    def name(self) -> str:
+        """A short name for reports."""
+        return Path(self.source).stem if self.mass is not None else self.source.split(":", 1)[1].replace(":", " ")
+
+
+def family_sources(seeds: Sequence[int], families: Sequence[str] = tuple(FAMILIES)) -> tuple[ThingSource, ...]:
+    """Return one thing a family and seed."""
+    return tuple(ThingSource(f"{PREFIX}{family}:{seed}") for seed in seeds for family in families)
+
+
+def find_sources(names: Sequence[str]) -> tuple[ThingSource, ...]:
+    """Return the things that names stand for: `family:NAME[:SEED]`, `shape:NAME`, or a folder.
+
+    Raises GraspdError: there is no such thing, or a folder has no masses.
+    """
+    found: list[ThingSource] = []
+    for name in names:
+        kind, _, rest = name.partition(":")
+        if f"{kind}:" == SHAPE_PREFIX and rest in SHAPES:
+            found.append(ThingSource(name))
+        elif f"{kind}:" == PREFIX and rest.split(":")[0] in FAMILIES and (":" not in rest or rest[-1].isdigit()):
+            found.append(ThingSource(name if ":" in rest else f"{name}:0"))
+        elif Path(name).is_dir():
+            found += folder_sources(Path(name))
+        else:
+            families = ", ".join(FAMILIES)
+            raise ConfigError(
+                f"unknown thing {name!r}; valid: a folder of meshes, shape:NAME, or family:NAME[:SEED] of {families}"
+            )
+    return tuple(found)
+
+
+def folder_sources(folder: Path) -> tuple[ThingSource, ...]:
+    """Return the meshes of a folder with the masses that its csv file gives.
+
+    Raises ConfigError: the folder has no csv file with names and masses, or a mesh without one.
+    """
+    meshes = sorted(path for path in folder.iterdir() if path.suffix.lower().lstrip(".") in MESH_ENDINGS)
+    masses: dict[str, float] = {}
+    for path in sorted(folder.glob("*.csv")):
+        masses |= _masses(path)
+    if not meshes:
+        raise ConfigError(f"{folder}: no meshes; endings: {', '.join(sorted(MESH_ENDINGS))}")
+    if missing := [path.name for path in meshes if path.stem not in masses]:
+        told = f"its csv files name {', '.join(masses) or 'none'}"
+        raise ConfigError(f"{folder}: no mass of {missing[0]}; {told}; columns: name, mass_kg")
+    return tuple(ThingSource(str(path), masses[path.stem]) for path in meshes)
+
+
+def _masses(path: Path) -> dict[str, float]:
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    columns = list(rows[0]) if rows else []
+    name = next((column for column in _NAME_COLUMNS if column in columns), None)
+    mass = next((column for column in _MASS_COLUMNS if column in columns), None)
+    if name is None or mass is None:
+        return {}
+    found = {}
+    for row in rows:
+        try:
+            found[Path(str(row[name])).stem] = float(row[mass])
+        except (TypeError, ValueError):
+            raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]!r}, no number of kilograms") from None
+        if not 0 < found[Path(str(row[name])).stem] < np.inf:
+            raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]}; valid: more than zero kilograms")
+    return found
+
+
+def load_thing(source: ThingSource) -> Thing:
+    """Load a thing with its mass. Raises GraspdError: its mesh cannot be used."""
+    kind, _, rest = source.source.partition(":")
+    if f"{kind}:" == PREFIX:
+        family, _, seed = rest.partition(":")
+        drawn = draw_thing(family, int(seed or 0))
+        model = load_scene(drawn.mesh, mass=drawn.mass).object
+    else:
+        model = load_scene(source.source, mass=source.mass).object
+        if source.mass is None:
+            model = model.at_mass(SHAPE_DENSITY * model.volume)
+    if not model.volume > 0:
+        raise MeshError(f"{source.source}: encloses no volume")
+    return Thing(source.name, model, object_parts(model), simplify(model.mesh, _SEEN_FACES))

@@ -1,0 +1,190 @@
+"""The next thing of a scene: of all things seen, one with a grasp that is sure enough, else with the surest one.
+
+Things are looked at in an order that costs nothing: those that nothing was tried on in vain first, then those whose
+top is highest, since nothing lies on them. A thing gets one round of the planner as long as it never failed. The first
+with a verified grasp ends the search, so that a request costs little more than one of a single thing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.config import SceneConfig
+from graspd_core.errors import CloudError, MeshError
+from graspd_core.hands.model import HandModel
+from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.obstacles import with_neighbours
+from graspd_core.perception.scene import Scene
+from graspd_core.perception.scene_from_views import scene_from_views
+from graspd_core.perception.segment.segment import find_things
+from graspd_core.perception.segment.target_selection import Target
+from graspd_core.planning.plan_grasps import plan_grasps
+from graspd_core.types import Grasp, GraspResult, Plane, Posture, TriangleMesh, Verdict
+
+# A grasp is like one that was lost where its base is this near to it and turned by less [m], [rad].
+LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
+# Why a thing is not looked at any more.
+OUT_OF_TRIES = "tried in vain too often"
+# What is seen within this of a place where something failed is that thing [m].
+_SAME_PLACE = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Failure:
+    """A grasp that was tried in vain, or a thing that had none.
+
+    Attributes:
+        place: the middle of the thing's points [m].
+        grasp: its posture at the grasp; None where none was tried.
+    """
+
+    place: Float[np.ndarray, "3"]
+    grasp: Posture | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ThingPlan:
+    """What is known of one thing of a scene.
+
+    Attributes:
+        points: that show it [m].
+        scene: it among the others; None where none could be made.
+        result: of planning; None without a scene.
+        grasp: the best one, verified or not; None where there is none.
+        reason: why there is no verified grasp; empty where there is.
+        looked_at: whether a grasp was looked for in this request.
+    """
+
+    points: Float[np.ndarray, "_ 3"]
+    scene: Scene | None = None
+    result: GraspResult | None = None
+    grasp: Grasp | None = None
+    reason: str = ""
+    looked_at: bool = True
+
+    @property
+    def place(self) -> Float[np.ndarray, "3"]:
+        """The middle of its points [m]."""
+        return self.points.mean(0)
+
+    @property
+    def surety(self) -> float:
+        """How likely its grasp holds; more than one where it is verified, less than zero where there is none."""
+        if self.grasp is None:
+            return -1.0
+        return (self.grasp.probability or 0.0) + float(self.grasp.verdict is Verdict.VERIFIED)
+
+
+def plan_any_thing(
+    views: Sequence[PointCloud],
+    hand: HandModel,
+    *,
+    settings: SceneConfig | None = None,
+    surface: Plane | None = None,
+    solids: Mapping[str, Sequence[TriangleMesh]] | None = None,
+    failures: Sequence[Failure] = (),
+    tries: int = 4,
+    seconds: float | None = None,
+    on_thing: Callable[[ThingPlan], None] | None = None,
+    **plan: Any,
+) -> tuple[ThingPlan, ...]:
+    """Plan for the things seen until one has a verified grasp, and return all of them, the surest first.
+
+    Args:
+        views: what each camera saw [m].
+        hand: that grasps.
+        settings: of the way from clouds to scenes.
+        surface: what all things stand on, where it is known.
+        solids: what else is known to stand there, by name, frame of the views [m].
+        failures: of before. A thing is not looked at again after `tries` of them. No grasp is given that is like one.
+        tries: of a thing at most.
+        seconds: after which no further thing is begun.
+        on_thing: called with each thing that was looked at.
+        plan: of `plan_grasps`; its `seed` is advanced with every failure of a thing.
+
+    Raises:
+        CloudError: empty, all NaN, or too few points.
+        ConfigError: see `plan_grasps`.
+    """
+    began, things, over = time.perf_counter(), list[ThingPlan](), False
+    for points, failed in _in_order(find_things(views, settings and settings.segmentation), failures):
+        if over or len(failed) >= tries:
+            told = OUT_OF_TRIES if len(failed) >= tries else "not looked at"
+            things.append(ThingPlan(points, reason=told, looked_at=False))
+            continue
+        scene = _scene_among(views, points, settings, surface, solids)
+        things.append(_thing_plan(points, scene, hand, failed, plan))
+        if on_thing is not None:
+            on_thing(things[-1])
+        over = things[-1].surety > 1.0 or (seconds is not None and time.perf_counter() - began > seconds)
+    return tuple(sorted(things, key=lambda thing: -thing.surety))
+
+
+def _in_order(
+    things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
+) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
+    """Things with what failed on them: fewest failures first, then the highest."""
+    rows = [
+        (points, [f for f in failures if np.linalg.norm(points.mean(0) - f.place) < _SAME_PLACE]) for points in things
+    ]
+    return sorted(rows, key=lambda row: (len(row[1]), -float(row[0][:, 2].max())))
+
+
+def _scene_among(
+    views: Sequence[PointCloud],
+    points: Float[np.ndarray, "_ 3"],
+    settings: SceneConfig | None,
+    surface: Plane | None,
+    solids: Mapping[str, Sequence[TriangleMesh]] | None,
+) -> Scene | str:
+    """Return the scene of the thing that some points show, or why there is none."""
+    # A point of the thing itself: the middle of a ring is empty.
+    middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
+    try:
+        scene = scene_from_views(views, target=Target(point=middle), settings=settings)
+    except (CloudError, MeshError) as error:
+        return str(error)
+    scene = scene if surface is None else replace(scene, support=surface)
+    return with_neighbours(scene, solids, settings) if solids else scene
+
+
+def _thing_plan(
+    points: Float[np.ndarray, "_ 3"], scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any
+) -> ThingPlan:
+    if isinstance(scene, str):
+        return ThingPlan(points, reason=scene)
+    lost = [failure.grasp for failure in failed if failure.grasp is not None]
+    config = plan.get("preset", "balanced")
+    config = load_preset(config) if isinstance(config, str) else config
+    if not failed:
+        config = replace(config, rounds=replace(config.rounds, most=1))
+    count, seed = plan.get("count", 1) + 2 * len(lost), plan.get("seed", 0) + len(failed)
+    plan = {**plan, "preset": config, "count": count, "seed": seed}
+    result = plan_grasps(scene, hand, **plan)
+    left = [grasp for grasp in unlike(result.grasps, lost) if grasp.verdict is not Verdict.FAILED]
+    if not left:
+        return ThingPlan(points, scene, result, None, _why_none(result))
+    best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
+    reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp is sure enough"
+    return ThingPlan(points, scene, result, best, reason)
+
+
+def _why_none(result: GraspResult) -> str:
+    return result.message or next((g.reason for g in result.grasps if g.reason), "") or result.outcome.value
+
+
+def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:
+    """Return the grasps that are not like any of those that were lost."""
+    return [grasp for grasp in grasps if not any(_alike(grasp.grasp, posture) for posture in lost)]
+
+
+def _alike(a: Posture, b: Posture) -> bool:
+    cosine = min(abs(float(a.quaternion_wxyz @ b.quaternion_wxyz)), 1.0)
+    return bool(np.linalg.norm(a.position - b.position) < LIKE_DISTANCE and 2 * np.arccos(cosine) < LIKE_TURN)

@@ -1,0 +1,114 @@
+"""Motions of the arm keep clear of what was seen and known, stay within the limits, and say where there is no way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from graspd_cell.carrying import held_balls, release_posture, straight, tip_pose
+from graspd_cell.layout import Box, layout_of
+from graspd_cell.motion import (
+    Mover,
+    NoMotionError,
+    Speeds,
+    arm_shape,
+    dense,
+    find_path,
+    hand_balls,
+    seen_world,
+    timed,
+)
+from graspd_core.arms.arm import arm_links, load_arm
+from graspd_core.hands.library import load_hand
+
+ARMS = ("ur5e_like", "panda_like")
+HAND = load_hand("parallel_gripper")
+
+
+def mover_of(arm_name: str, points: np.ndarray | None = None, boxes: tuple[Box, ...] = ()) -> Mover:
+    arm = load_arm(arm_name)
+    world = seen_world(np.zeros((0, 3)) if points is None else points, 0.0, boxes)
+    return Mover(arm_shape(arm), world, hand_balls(arm, HAND, HAND.open_posture))
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_links_are_where_the_arms_own_kinematics_have_them(name: str):
+    arm = load_arm(name)
+    q = arm.seed + np.random.default_rng(0).uniform(-0.5, 0.5, (20, len(arm.seed)))
+    rotation, place = arm_shape(arm).links(q)
+    true = arm_links(arm, torch.as_tensor(q))
+    np.testing.assert_allclose(rotation, true.rotation.numpy(), atol=1e-12)
+    np.testing.assert_allclose(place, true.translation.numpy(), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_way_around_a_pillar_of_points_keeps_clear_of_every_one_of_them(name: str):
+    arm = load_arm(name)
+    middle = mover_of(name)
+    start, goal = arm.seed.copy(), arm.seed.copy()
+    start[0], goal[0] = arm.seed[0] - 0.7, arm.seed[0] + 0.7
+    tip = tip_pose(middle, arm.seed)[:3, 3]
+    # In the way of the straight connection, as high as the hand.
+    points = tip + np.random.default_rng(1).uniform([-0.02, -0.02, -0.35], [0.02, 0.02, -0.02], (4000, 3))
+    mover = mover_of(name, points)
+    assert mover.clearances(dense(np.stack([start, goal]))).min() < 0
+    path = find_path(mover, start, goal, seconds=20.0)
+    np.testing.assert_allclose(path[[0, -1]], [start, goal])
+    motion = timed(arm, path, Speeds())
+    for q in np.vstack([start, motion.positions])[::3]:
+        balls, carried = mover.placed(q)
+        away = np.linalg.norm(points[:, None] - np.concatenate([balls, carried])[None], axis=-1)
+        assert (away.min(0) > np.concatenate([mover.shape.radius, mover.carried.radius])).all()
+
+
+def test_times_keep_to_speed_and_acceleration():
+    arm = load_arm("panda_like")
+    goal = arm.seed + np.array([0.8, 0.3, -0.5, 0.4, 0.2, -0.6, 0.9])
+    speeds = Speeds(0.5, 3.0)
+    motion = timed(arm, np.stack([arm.seed, 0.5 * (arm.seed + goal) + 0.1, goal]), speeds)
+    assert motion.velocities is not None
+    assert (np.abs(motion.velocities) <= 0.5 * arm.chain.velocity * 1.02).all()
+    change = np.abs(np.diff(motion.velocities, axis=0)) / np.diff(motion.times)[:, None]
+    # Splines are held to their limits at the points of a grid, not between them.
+    assert change.max() < 1.3 * speeds.acceleration
+    np.testing.assert_allclose(motion.positions[-1], goal, atol=1e-6)
+    np.testing.assert_allclose(motion.velocities[-1], 0.0, atol=1e-6)
+
+
+def test_an_end_in_something_and_a_walled_in_goal_are_told_by_name():
+    arm = load_arm("ur5e_like")
+    tip = tip_pose(mover_of("ur5e_like"), arm.seed)[:3, 3]
+    block = Box("block", (float(tip[0]), float(tip[1]), float(tip[2])), (0.1, 0.1, 0.1))
+    mover = mover_of("ur5e_like", boxes=(block,))
+    away = arm.seed.copy()
+    away[0] += 1.5
+    with pytest.raises(NoMotionError, match=r"ur5e_like is \d+ mm deep in something at its goal; valid: clear"):
+        find_path(mover, away, arm.seed)
+    # A wall from the floor to above all of the arm.
+    start, goal = arm.seed.copy(), arm.seed.copy()
+    start[0], goal[0] = arm.seed[0] - 0.8, arm.seed[0] + 0.8
+    way = tip[:2] / np.linalg.norm(tip[:2])
+    reach, height = np.meshgrid(np.linspace(0.13, 1.4, 150), np.linspace(0.02, 1.6, 150))
+    wall = np.stack([reach.ravel() * way[0], reach.ravel() * way[1], height.ravel()], 1)
+    with pytest.raises(NoMotionError, match=r"no clear way of ur5e_like was found in 0\.3 s"):
+        find_path(mover_of("ur5e_like", wall), start, goal, seconds=0.3)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_thing_is_raised_straight_and_let_go_above_the_other_bin(name: str):
+    arm = load_arm(name)
+    layout = layout_of(arm)
+    mover = mover_of(name, boxes=layout.solids[1:])
+    up = straight(mover, arm.seed, np.array([0.0, 0.0, 0.1]))
+    lifted = tip_pose(mover, up[-1])[:3, 3] - tip_pose(mover, arm.seed)[:3, 3]
+    np.testing.assert_allclose(lifted, [0.0, 0.0, 0.1], atol=1e-3)
+    tip = tip_pose(mover, up[-1])
+    thing = np.random.default_rng(0).uniform(-0.03, 0.03, (300, 3)) + tip[:3, 3] + 0.15 * tip[:3, 2]
+    loaded = Mover(mover.shape, mover.world, held_balls(mover, up[-1], thing))
+    goal = release_posture(loaded, up[-1], thing, layout.place, 0)
+    assert goal is not None
+    moved = (thing - tip[:3, 3]) @ tip[:3, :3] @ tip_pose(loaded, goal)[:3, :3].T + tip_pose(loaded, goal)[:3, 3]
+    assert layout.place.holds(moved.mean(0))
+    assert moved[:, 2].min() > 0.05
+    assert loaded.clearances(goal[None]).min() >= loaded.margin

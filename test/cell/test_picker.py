@@ -1,0 +1,136 @@
+"""The picker with real parts: from bin to bin, gates in order, a loss is noticed, a cancel stops everything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from graspd_cell.grasp_held import after_squeeze, grips, still_holds
+from graspd_cell.grasp_source import InProcessGrasps, Offer
+from graspd_cell.picker import Cancelled, Ending, Picker
+from graspd_cell.robot import DepthView, JointMotion
+from graspd_cell.simulated_robot import SimulatedRobot
+from graspd_core.planning.any_thing import Failure
+
+RobotOf = Callable[..., SimulatedRobot]
+THING = "shape:box"
+OFFERS: dict[tuple[str, str], Offer] = {}
+
+
+class KeptGrasps:
+    """Grasps of graspd, planned once for each robot, since all look at the same thing in the same place."""
+
+    def __init__(self, robot: SimulatedRobot) -> None:
+        self._world = robot.world
+
+    def next(self, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
+        key = self._world.arm.name, self._world.hand.name
+        if key not in OFFERS:
+            source = InProcessGrasps(self._world.arm, self._world.hand, self._world.layout, preset="fast", seconds=60.0)
+            OFFERS[key] = source.next(view, failures)
+        return OFFERS[key]
+
+
+def picker_of(robot: SimulatedRobot, source: object = None, **more) -> Picker:
+    world = robot.world
+    return Picker(robot, source or KeptGrasps(robot), world.arm, world.hand, world.layout, **more)  # pyright: ignore
+
+
+@pytest.fixture
+def robot(pair: tuple[str, str], robot_of: RobotOf) -> SimulatedRobot:
+    ready = robot_of(*pair, THING, height=0.05)
+    ready.wait(1.0)
+    ready.clear_forces()
+    return ready
+
+
+def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(robot: SimulatedRobot):
+    ends: list[np.ndarray] = []
+    follow = robot.follow
+
+    def noted(motion: JointMotion, *more) -> object:
+        if len(motion.names) == len(robot.world.joint_names):
+            ends.append(motion.positions[-1])
+        return follow(motion, *more)
+
+    robot.follow = noted
+    (attempt,) = picker_of(robot).empty_the_bin(most=1)
+    assert (attempt.ending, attempt.reason) == (Ending.PICKED, "")
+    report = robot.referee()
+    assert dict(report.places) == {"box": "place bin"}
+    assert report.hard("box") == {}
+    grasp = OFFERS[robot.world.arm.name, robot.world.hand.name].grasp
+    assert grasp is not None
+    assert grasp.arm is not None
+    count = len(robot.world.arm.joint_names)
+    stages = [(grasp.arm.at("pregrasp"), grasp.pregrasp), (grasp.arm.at("grasp"), grasp.grasp)]
+    stages += [(grasp.arm.at("grasp"), grasp.squeeze), (grasp.arm.at("lift"), grasp.squeeze)]
+    assert len(ends) == len(stages)
+    for end, (arm, posture) in zip(ends, stages, strict=True):
+        np.testing.assert_allclose(end[:count], arm, atol=1e-9)
+        limits = robot.world.hand.lower, robot.world.hand.upper
+        np.testing.assert_allclose(end[count:], np.clip(posture.joint_positions, *limits), atol=1e-9)
+
+
+def test_an_empty_bin_ends_it_with_a_reason(robot_of: RobotOf):
+    robot = robot_of("ur5e_like", "parallel_gripper")
+    world = robot.world
+    source = InProcessGrasps(world.arm, world.hand, world.layout, preset="fast")
+    picker = picker_of(robot, source)
+    assert list(picker.empty_the_bin()) == []
+    assert picker.why_ended
+
+
+def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRobot):
+    """The referee's hand: the thing is gone in the moment of the lift."""
+    follow, calls = robot.follow, 0
+
+    def stolen(motion: JointMotion, *more) -> object:
+        nonlocal calls
+        calls += len(motion.names) == len(robot.world.joint_names)
+        if calls == 4:
+            robot._data.qpos[robot.world.thing_qpos[0]] += 3.0
+            calls += 1
+        return follow(motion, *more)
+
+    robot.follow = stolen
+    (attempt,) = picker_of(robot).empty_the_bin(most=1)
+    assert attempt.ending is Ending.LOST_LIFTING
+    assert attempt.reason
+    # The arm has come away from the bin, and the hand is open.
+    hand = robot.world.hand
+    now = robot.joints().of(hand.joint_names).positions
+    assert (np.abs(now - hand.open_posture) / hand.joint_scale).max() < 0.1
+
+
+def test_fingers_that_close_on_nothing_are_told_from_fingers_that_press(pair: tuple[str, str], robot_of: RobotOf):
+    robot = robot_of(*pair, THING, height=0.05)
+    robot.wait(1.0)
+    offer = KeptGrasps(robot).next(robot.look(), ())
+    grasp, hand = offer.grasp, robot.world.hand
+    assert grasp is not None
+    # Far from everything, at the arm's start.
+    for posture in (grasp.pregrasp, grasp.squeeze):
+        goal = np.clip(posture.joint_positions, hand.lower, hand.upper)[None]
+        robot.follow(JointMotion(hand.joint_names, np.array([1.5]), goal, np.zeros_like(goal)), 5.0)
+    robot.wait(0.5)
+    hold = after_squeeze(hand, grasp, robot.joints())
+    assert not grips(hold).held or not still_holds(hold, hand, robot.joints()).held
+
+
+@pytest.mark.parametrize("after", [0.5, 2.5, 4.5, 6.5])
+def test_a_cancel_at_any_time_leaves_the_arm_still_and_the_hand_as_it_is(robot_of: RobotOf, after: float):
+    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
+    robot.wait(1.0)
+    begun = robot.time
+    picker = picker_of(robot, cancelled=lambda: robot.time > begun + after)
+    with pytest.raises(Cancelled):
+        list(picker.empty_the_bin(most=1))
+    assert robot.time < begun + after + 1.0
+    targets = robot.hand.targets.copy()
+    before = robot.joints().positions
+    robot.wait(1.0)
+    assert np.abs(robot.joints().positions - before).max() < 5e-3
+    np.testing.assert_array_equal(robot.hand.targets, targets)

@@ -1,0 +1,100 @@
+"""The picker's robot over DDS: it looks, moves both controllers, and stops, in a simulated cell of its own process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+
+from graspd_cell.grasp_source import cloud_of
+from graspd_cell.layout import layout_of
+from graspd_cell.robot import JointMotion, MotionAborted
+from graspd_cell.ros_robot import RobotSilentError, RobotTopics, RosRobot
+from graspd_core.arms.arm import load_arm
+from graspd_core.hands.library import load_hand
+
+PATIENCE = 100.0
+ARM, HAND = load_arm("ur5e_like"), load_hand("parallel_gripper")
+
+
+@pytest.fixture(scope="module")
+def robot(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosRobot]:
+    folder: Path = tmp_path_factory.mktemp("cell")
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder)}
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    arguments = ["--arm", ARM.name, "--hand", HAND.name, "--things", "family:pear:0", "--clock", "--speed", "3"]
+    context = Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node("picker", context=context)
+    process = subprocess.Popen([sys.executable, "-m", "graspd_cell.simulator_node", *arguments], env=environment)
+    driven = RosRobot(node, ARM.joint_names, HAND.joint_names, RobotTopics(patience=PATIENCE))
+    yield driven
+    driven.close()
+    process.terminate()
+    process.wait(PATIENCE)
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def to(robot: RosRobot, change: float, seconds: float) -> JointMotion:
+    """A motion of all arm joints by so much."""
+    goal = robot.joints().of(ARM.joint_names).positions + change
+    return JointMotion(ARM.joint_names, np.array([seconds]), goal[None], np.zeros((1, len(goal))))
+
+
+def test_a_look_shows_the_thing_in_the_bin_where_the_layout_has_it(robot: RosRobot):
+    robot.wait(1.0)
+    before = robot.joints().time
+    view, layout = robot.look(), layout_of(ARM)
+    assert view.time > before
+    np.testing.assert_allclose(view.T_base_camera, layout.T_base_camera, atol=1e-6)
+    points = cloud_of(view).points
+    inside = (np.abs(points[:, :2] - layout.pick.center) < layout.pick.half - 0.02).all(1) & (points[:, 2] > 0.02)
+    assert inside.sum() > 300
+
+
+def test_a_motion_of_arm_and_hand_reaches_both_goals(robot: RosRobot):
+    arm = robot.joints().of(ARM.joint_names).positions + 0.1
+    rows = np.array([[*robot.joints().of(ARM.joint_names).positions, 0.06], [*arm, 0.02]])
+    reading = robot.follow(JointMotion((*ARM.joint_names, *HAND.joint_names), np.array([0.5, 2.0]), rows), 10.0)
+    np.testing.assert_allclose(reading.of(ARM.joint_names).positions, arm, atol=0.02)
+    assert reading.of(HAND.joint_names).positions[0] == pytest.approx(0.02, abs=0.004)
+
+
+def test_a_stop_leaves_the_arm_still(robot: RosRobot):
+    begun = robot.joints()
+    with pytest.raises(MotionAborted, match="stopped"):
+        robot.follow(to(robot, -0.8, 4.0), 20.0, lambda: robot.joints().time > begun.time + 1.0)
+    robot.wait(0.5)
+    held = robot.joints().of(ARM.joint_names).positions
+    robot.wait(1.0)
+    assert np.abs(robot.joints().of(ARM.joint_names).positions - held).max() < 2e-3
+    assert 0.01 < np.abs(held - begun.of(ARM.joint_names).positions).max() < 0.7
+
+
+def test_what_the_controller_refuses_says_why_and_timeouts_end_a_motion(robot: RosRobot):
+    with pytest.raises(MotionAborted, match="is sent at"):
+        robot.follow(to(robot, 0.5, 0.02), 5.0)
+    with pytest.raises(MotionAborted, match="timeout"):
+        robot.follow(to(robot, 0.3, 6.0), 0.5)
+    with pytest.raises(MotionAborted, match="no joint; valid: all joints of the arm"):
+        robot.follow(JointMotion((), np.array([1.0]), np.zeros((1, 0))), 1.0)
+
+
+def test_a_silent_topic_is_named(domain: int):
+    context = Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node("deaf", context=context)
+    deaf = RosRobot(node, ("a",), ("b",), RobotTopics(joint_states="/nobody", patience=0.2))
+    with pytest.raises(RobotSilentError, match=r"/nobody with joint 'a' within 0\.2 s"):
+        deaf.joints()
+    deaf.close()
+    node.destroy_node()
+    rclpy.shutdown(context=context)

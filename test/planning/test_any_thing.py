@@ -1,0 +1,81 @@
+"""Of all things seen, one with a grasp that is sure enough; what failed is not asked again in the same way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core.errors import CloudError
+from graspd_core.hands.library import load_hand
+from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.planning.any_thing import OUT_OF_TRIES, Failure, ThingPlan, plan_any_thing, unlike
+from graspd_core.types import Grasp, Posture, Verdict
+
+HAND = load_hand("parallel_gripper")
+ASKED = {"preset": "fast", "measure": False, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def views() -> tuple[PointCloud, ...]:
+    """A box, and a flat one beside it, from one place above."""
+    scene = tabletop("box", obstacles=[("bowl", 0.16, 0.05)])
+    return views_of(scene, CAMERA, ring_poses(1, elevation=np.deg2rad(55.0)), DEFAULT, 3)
+
+
+@pytest.fixture(scope="module")
+def first(views: tuple[PointCloud, ...]) -> tuple[ThingPlan, ...]:
+    return plan_any_thing(views, HAND, **ASKED)
+
+
+def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first: tuple[ThingPlan, ...]):
+    assert len(first) == 2
+    best = first[0]
+    assert best.grasp is not None
+    assert best.grasp.verdict is Verdict.VERIFIED
+    assert best.surety > 1.0
+    assert best.reason == ""
+    # The price is that of one thing wherever the first has a grasp.
+    assert sum(thing.looked_at for thing in first) == 1
+    assert first[1].reason == "not looked at"
+
+
+def test_what_failed_comes_last_and_is_given_up_after_some_tries(
+    views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]
+):
+    place = first[0].place
+    other = plan_any_thing(views, HAND, failures=[Failure(place)], **ASKED)
+    assert np.linalg.norm(other[0].place - place) > 0.05
+    over = plan_any_thing(views, HAND, failures=[Failure(thing.place) for thing in first] * 2, tries=2, **ASKED)
+    assert [thing.reason for thing in over] == [OUT_OF_TRIES] * 2
+    assert not any(thing.looked_at for thing in over)
+
+
+def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]):
+    assert first[0].grasp is not None
+    lost = Failure(first[0].place, first[0].grasp.grasp)
+    # The other thing is out of tries.
+    out = [Failure(first[1].place)] * 4
+    again = plan_any_thing(views, HAND, failures=[lost, *out], **ASKED)
+    assert again[0].grasp is not None
+    assert unlike([again[0].grasp], [first[0].grasp.grasp])
+
+
+def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):
+    bare = PointCloud(views[0].points[views[0].points[:, 2] < 0.003], views[0].viewpoint)
+    assert plan_any_thing([bare], HAND, **ASKED) == ()
+    with pytest.raises(CloudError, match="no points at all"):
+        plan_any_thing([PointCloud(np.zeros((0, 3)), np.zeros(3))], HAND)
+
+
+def test_alike_is_near_and_turned_by_little():
+    def at(x: float, half_turn: float) -> Posture:
+        return Posture(np.array([x, 0.0, 0.0]), np.array([np.cos(half_turn), 0.0, 0.0, np.sin(half_turn)]), np.zeros(1))
+
+    def grasp(posture: Posture) -> Grasp:
+        return Grasp(posture, posture, posture)
+
+    assert unlike([grasp(at(0.01, 0.1))], [at(0.0, 0.0)]) == []
+    assert unlike([grasp(at(0.01, np.pi + 0.1))], [at(0.0, 0.0)]) == []
+    assert len(unlike([grasp(at(0.02, 0.0)), grasp(at(0.0, 0.2))], [at(0.0, 0.0)])) == 2
