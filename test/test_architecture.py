@@ -88,7 +88,7 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
 MAX_PACKAGE_LINES = {
     "graspd_core": 25_160,
-    "graspd_ros": 5_080,
+    "graspd_ros": 5_090,
     "graspd_bench": 8_670,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_200,
@@ -96,7 +96,7 @@ MAX_PACKAGE_LINES = {
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 20_280, "graspd_ros.node": 24_400}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 20_280, "graspd_ros.node": 24_410}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
