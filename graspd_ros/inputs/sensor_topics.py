@@ -16,7 +16,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
+from graspd_core.io.messages import stamp_of
+
 DEPTH = 5
+MOST_TWICE = 100  # messages that may be heard by two subscriptions
 SILENCE = 5.0  # seconds that a publisher may be there without a message before that is told
 REPEAT = 10.0  # seconds between two lines about messages that were lost
 REMEDY = (
@@ -55,6 +58,8 @@ class SensorTopic:
         self._received = self._lost = 0
         self._silent_since = self._told = -float("inf")
         self._subscription: Subscription | None = None
+        self._before: Subscription | None = None
+        self._twice: set[int] = set()  # stamps of what the one before heard when there were two
         self._qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         # What somebody asks for is left as it is; rclpy keeps it in no public place.
         self._fixed = f"qos_overrides.{self.name}.subscription.reliability" in getattr(node, "_parameter_overrides", {})
@@ -100,24 +105,39 @@ class SensorTopic:
         )
         same = (wanted.reliability, wanted.durability) == (self._qos.reliability, self._qos.durability)
         if self._subscription is None or (offers and not same and not self._fixed):
-            self._stop()
-            self._qos = wanted
+            # The one before stays until the new one has heard something: what comes once could come in between.
+            self._destroy(self._before)
+            self._before, self._qos, self._twice = self._subscription, wanted, set()
             self._listen()
 
     def _listen(self, overrides: QoSOverridingOptions | None = None) -> None:
+        qos = self._qos
+
+        def take(message: Any) -> None:
+            stamp = stamp_of(message)
+            if qos is not self._qos:
+                self._twice = {stamp, *self._twice} if len(self._twice) < MOST_TWICE else {stamp}
+            elif self._before is not None:
+                self._destroy(self._before)
+                self._before = None
+            if qos is self._qos and stamp and stamp in self._twice:
+                return
+            self._received += 1
+            self._callback(message)
+
         lost = SubscriptionEventCallbacks(message_lost=lambda status: self._on_lost(status.total_count_change))
         self._subscription = self._node.create_subscription(
-            self._kind, self.name, self._take, self._qos, event_callbacks=lost, qos_overriding_options=overrides
+            self._kind, self.name, take, qos, event_callbacks=lost, qos_overriding_options=overrides
         )
 
     def _stop(self) -> None:
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
+        self._destroy(self._before)
+        self._destroy(self._subscription)
+        self._before = self._subscription = None
 
-    def _take(self, message: Any) -> None:
-        self._received += 1
-        self._callback(message)
+    def _destroy(self, subscription: Subscription | None) -> None:
+        if subscription is not None:
+            self._node.destroy_subscription(subscription)
 
     def _on_lost(self, count: int) -> None:
         self._lost += count
