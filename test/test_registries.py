@@ -16,7 +16,7 @@ from graspd_core.hands.library import load_hand
 from graspd_core.io.grasps_json import grasps_of, result_document
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import load_scene
-from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
+from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
 from graspd_core.verify.metrics import METRICS, Metric, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
@@ -41,7 +41,8 @@ def target():
 @pytest.fixture
 def grasp(hand) -> Grasp:
     posture = Posture(np.array([0.0, 0.0, 0.25]), np.array([1.0, 0.0, 0.0, 0.0]), hand.open_posture)
-    return Grasp(posture, posture, posture, (), 1.0)
+    touch = Contact(hand.base_link, (0.0, 0.0, 0.25), (0.0, 0.0, 1.0))
+    return Grasp(posture, posture, posture, (touch,), 1.0)
 
 
 def document(grasp: Grasp, target: Any, hand: Any) -> dict[str, Any]:
