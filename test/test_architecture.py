@@ -87,7 +87,7 @@ MAY_IMPORT = {
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 25_530,
+    "graspd_core": 25_540,
     "graspd_ros": 4_700,
     "graspd_bench": 8_670,
     "graspd_dataset": 2_970,
