@@ -41,7 +41,8 @@ def target():
 @pytest.fixture
 def grasp(hand) -> Grasp:
     posture = Posture(np.array([0.0, 0.0, 0.25]), np.array([1.0, 0.0, 0.0, 0.0]), hand.open_posture)
-    return Grasp(posture, posture, posture, (), 1.0)
+    touch = Contact(hand.base_link, (0.0, 0.0, 0.25), (0.0, 0.0, 1.0))
+    return Grasp(posture, posture, posture, (touch,), 1.0)
 
 
 def document(grasp: Grasp, target: Any, hand: Any) -> dict[str, Any]:

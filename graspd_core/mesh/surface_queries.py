@@ -164,6 +164,8 @@ def closest_points(
 
 # How far about a point the faces lie that its normal may be of [m]: the two of an edge, the many of a rounding.
 _ABOUT = 3e-4
+# Rounds of weighing these faces at most, and a change of a weight that ends them.
+_SWEEPS, _SETTLED = 100, 1e-7
 # Directions in which they are looked for: to the corners and the middles of the faces of a cube.
 _AROUND = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) != 2]
@@ -179,18 +181,21 @@ def pressed_points(
 
     On a face this is the face's own normal. On an edge or a corner every direction between those of its faces is one.
     """
-    from scipy.optimize import nnls
-
     closest, own = closest_points(surface, points)
     around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]
-    found = np.array(own)
-    for row, faces in enumerate(around.reshape(len(points), -1, 3)):
-        between = np.vstack([own[row], faces]).T
-        nearest = between @ nnls(between, normals[row])[0]
-        length = np.linalg.norm(nearest)
-        if length > 1e-6:
-            found[row] = nearest / length
-    return closest, found
+    between = np.concatenate([own[:, None], around.reshape(len(points), -1, 3)], 1)
+    # The nearest sum of the faces' normals with weights of at least zero, one weight after the other.
+    weights, rest = np.zeros(between.shape[:2]), np.array(normals)
+    for _ in range(_SWEEPS):
+        before = weights.copy()
+        for face in range(between.shape[1]):
+            change = np.maximum((rest * between[:, face]).sum(1), -weights[:, face])
+            weights[:, face] += change
+            rest -= change[:, None] * between[:, face]
+        if np.abs(weights - before).max(initial=0.0) < _SETTLED:
+            break
+    nearest, length = normals - rest, np.linalg.norm(normals - rest, axis=1, keepdims=True)
+    return closest, np.where(length > _SETTLED, nearest / np.maximum(length, _SETTLED), own)
 
 
 def first_hits(

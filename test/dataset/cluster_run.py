@@ -15,7 +15,7 @@ os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "token", "RAY_AU
 
 from ray.cluster_utils import Cluster
 
-from graspd_dataset.blocks import DatasetRequest, blocks_of
+from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.guarded_calls import Limits
 from graspd_dataset.ray_engine import RayEngine, ray_running
@@ -35,7 +35,9 @@ def main(out: str) -> None:
     with ray_running(cluster.address, None) as ray:
         engine = RayEngine(ray, store, Limits(), ship=True)
         slots = engine.slots()
-        for _, report in run_blocks(missing_blocks(blocks, store), engine):
+        for what, report in run_blocks(missing_blocks(blocks, store), engine):
+            if not isinstance(what, Block):
+                continue
             reports.append(report)
             if len(reports) == 1:
                 cluster.remove_node(nodes[0], allow_graceful=False)

@@ -57,7 +57,7 @@ def test_a_ply_with_faces_is_a_mesh(tmp_path):
         ("a.npy", lambda p: np.save(p, np.zeros((9, 6))), r"colours or normals beside x, y, z\? .*points\[:, :3\]"),
         (
             "a.npy",
-            lambda p: np.save(p, {"points": 1}, allow_pickle=True),
+            lambda p: np.save(p, np.array({"points": 1}, dtype=object)),
             r"a pickled object of Python, .*np.savez\(path",
         ),
         ("a.xyz", lambda p: p.write_text("0,0,1\n0,1,1\n"), "its numbers are separated by commas"),

@@ -154,7 +154,8 @@ def a_grasp(verdict: Verdict) -> Grasp:
     posture = Posture(np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.1, -0.7, 0.5]), np.array([0.25, -1.0]))
     hold = TrialResult("hold", verdict is Verdict.VERIFIED, 0.002, 0.01)
     trials = () if verdict is Verdict.UNVERIFIED else (hold,)
-    return Grasp(posture, posture, posture, (), score=1.5, metrics=GraspMetrics({"penetration": 0.001}), trials=trials)
+    touch, metrics = Contact("tip", (1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), GraspMetrics({"penetration": 0.001})
+    return Grasp(posture, posture, posture, (touch,), score=1.5, metrics=metrics, trials=trials)
 
 
 def a_result(*grasps: Grasp) -> GraspResult:
