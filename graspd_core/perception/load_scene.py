@@ -13,6 +13,7 @@ from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.perception.cloud.mesh_views import view_in_mesh
 from graspd_core.perception.scene import Scene, build_scene, refuse_numbers
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.types import TriangleMesh
@@ -52,20 +53,25 @@ def load_scene(
     given = "mesh" if isinstance(source, TriangleMesh) else str(source)
     numbers = {"mass": mass, "friction": friction, "resolution": resolution}
     refuse_numbers(given, scale=scale, **numbers)
+    mesh, views, warnings = None, (), ()
     if not isinstance(source, TriangleMesh) and is_cloud_file(source):
+        views = tuple(
+            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
+        )
+    else:
+        mesh, warnings = _read_mesh(source, scale)
+        view = view_in_mesh(mesh, given)
+        if view is not None:
+            views, warnings = (view,), (f"{given}: one camera's open sheet: its points are taken as a cloud",)
+    if views or mesh is None:
         # A mesh needs none of what makes an object of a cloud.
         from graspd_core.perception.scene_from_views import scene_from_views
 
-        views = [
-            replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in load_views(source)
-        ]
-        scene = scene_from_views(
-            views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
-        )
-        return replace(scene, object=replace(scene.object, scale=scale))
+        about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}
+        scene = scene_from_views(views, **about, **numbers)
+        return replace(scene, object=replace(scene.object, scale=scale, warnings=warnings + scene.object.warnings))
     if target is not None:
         raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which thing is meant")
-    mesh, warnings = _read_mesh(source, scale)
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 
 
