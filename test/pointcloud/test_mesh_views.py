@@ -12,7 +12,7 @@ from graspd_core.perception.cloud.mesh_views import view_in_mesh
 from graspd_core.types import TriangleMesh
 
 
-@pytest.mark.parametrize("turn", [(1, 1, 1), (1, -1, -1), (-1, 1, 1)])
+@pytest.mark.parametrize("turn", [np.array(turn) for turn in ((1, 1, 1), (1, -1, -1), (-1, 1, 1))])
 def test_a_sheet_of_pixels_is_a_view_however_it_is_wound(turn):
     mesh = TriangleMesh(sheet().vertices * turn, sheet().faces)
     for wound in (mesh, TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])):
