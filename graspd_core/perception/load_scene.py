@@ -22,6 +22,7 @@ from graspd_core.perception.cloud.cloud_files import (
     recording_told,
 )
 from graspd_core.perception.cloud.depth_files import is_depth_image, load_depth_view
+from graspd_core.perception.cloud.mesh_views import view_in_mesh
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import Scene, build_scene, refuse_numbers
 from graspd_core.perception.segment.target_selection import Target
@@ -67,20 +68,25 @@ def load_scene(
     given = "mesh" if isinstance(source, TriangleMesh) else str(source)
     numbers = {"mass": mass, "friction": friction, "resolution": resolution}
     refuse_numbers(given, scale=scale, **numbers)
+    mesh, views, warnings = None, (), ()
     if not isinstance(source, TriangleMesh) and (camera is not None or is_depth_image(source) or is_cloud_file(source)):
+        views = scaled_views(source, camera, scale, view_point)
+    else:
+        mesh, warnings = _read_mesh(source, scale)
+        view = view_in_mesh(mesh, given)
+        if view is not None:
+            views, warnings = (view,), (f"{given}: one camera's open sheet: its points are taken as a cloud",)
+    if views or mesh is None:
         # A mesh needs none of what makes an object of a cloud.
         from graspd_core.perception.scene_from_views import scene_from_views
 
-        views = scaled_views(source, camera, scale, view_point)
-        scene = scene_from_views(
-            views, target=target, alone=alone, settings=settings, source=given, device=device, **numbers
-        )
-        return replace(scene, object=replace(scene.object, scale=scale))
+        about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}
+        scene = scene_from_views(views, **about, **numbers)
+        return replace(scene, object=replace(scene.object, scale=scale, warnings=warnings + scene.object.warnings))
     if view_point is not None:
         raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
     if target is not None:
         raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which thing is meant")
-    mesh, warnings = _read_mesh(source, scale)
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 
 

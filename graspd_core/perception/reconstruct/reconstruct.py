@@ -122,7 +122,9 @@ def reconstruct(
 
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:
-    return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
+    # Some drivers send infinity where they saw nothing: it becomes NaN.
+    with np.errstate(invalid="ignore"):
+        return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
 
 
 def _closed(

@@ -1,0 +1,125 @@
+"""Meshes that are views: points of one camera with faces between neighbouring pixels, as camera viewers write them.
+
+Such a sheet is open, all of it faces the camera, and the triangles are halves of pixels. Taken for a solid, a table and
+what stands on it would be one thing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from graspd_core.errors import MeshError
+from graspd_core.mesh.topology import scaled_normals
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
+from graspd_core.types import TriangleMesh
+
+# Fewer vertices are no camera's picture.
+MIN_VERTICES = 2000
+# So large a share of the faces turns the same side to the camera, and all lie within this angle of its axis.
+FACING_SHARE, MIN_COSINE = 0.98, 0.25
+# Faces of half a pixel each have areas in the image that differ by less than this share of the usual one.
+PIXEL_SPREAD = 0.1
+# In a grid of pixels six faces meet at this share of the vertices inside, and edges of depth leave several borders.
+GRID_SHARE, MIN_BORDERS = 0.75, 3
+_MOST_FACES, _STEPS = 20_000, 300
+
+
+def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
+    """Return the view that a mesh is, seen from the origin, or None if the mesh is not one camera's sheet.
+
+    Raises:
+        MeshError: the mesh is a camera's sheet in another frame than the camera's, which does not say where it stood.
+    """
+    if len(mesh.vertices) < MIN_VERTICES or len(mesh.faces) < MIN_VERTICES or not np.isfinite(mesh.vertices).all():
+        return None
+    borders = _borders(mesh)
+    if borders == 0:
+        return None
+    some = mesh.faces[:: 1 + len(mesh.faces) // _MOST_FACES]
+    # Pixels without depth are written as zeros, and some writers join them to their neighbours.
+    some = some[mesh.vertices[some].any(2).all(1)]
+    if not len(some):
+        return None
+    corners, normals = mesh.vertices[some], scaled_normals(mesh.vertices, some)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    if _faces(corners, normals, np.zeros(3)) and _pixels(corners):
+        return PointCloud(mesh.vertices, np.zeros(3))
+    if borders >= MIN_BORDERS and _is_grid(mesh) and _camera_place(corners, normals) is not None:
+        raise MeshError(
+            f"{source}: one side of a scene, an open sheet as camera viewers export it, not in the camera's frame; "
+            "a mesh is a solid; give the points as a cloud with its camera's place (npz: points, viewpoint)"
+        )
+    return None
+
+
+def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) -> bool:
+    """Whether all faces turn the same side to a place, and lie ahead of it."""
+    way = corners.mean(1) - eye
+    distance = np.linalg.norm(way, axis=1)
+    if not distance.min() > 0:
+        return False
+    way = way / distance[:, None]
+    axis = way.mean(0)
+    share = float(((way * normals).sum(1) > 0).mean())
+    ahead = (way @ axis).min() > MIN_COSINE * np.linalg.norm(axis)
+    return bool(ahead and max(share, 1 - share) > FACING_SHARE)
+
+
+def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
+    """Whether the faces are halves of pixels of a camera at the origin that looks along an axis."""
+    for axis in range(3):
+        depth = corners[..., axis]
+        if np.abs(depth).min() < 1e-9:
+            continue
+        image = np.delete(corners, axis, 2) / depth[..., None]
+        one, other = image[:, 1] - image[:, 0], image[:, 2] - image[:, 0]
+        area = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
+        usual = float(np.median(area))
+        if usual > 0 and np.median(np.abs(area - usual)) < PIXEL_SPREAD * usual:
+            return True
+    return False
+
+
+def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vector | None:
+    """A place outside that all faces turn the same side to; None where none is found."""
+    centre, middle = corners.mean(1), corners.mean((0, 1))
+    size = float(np.ptp(centre, axis=0).max())
+    for side in (1.0, -1.0):
+        eye = middle + side * size * normals.mean(0) / max(float(np.linalg.norm(normals.mean(0))), 1e-12)
+        for _ in range(_STEPS):
+            wrong = side * ((eye - centre) * normals).sum(1) < 0
+            if wrong.mean() < 1 - FACING_SHARE:
+                return eye if _faces(corners, normals, eye) else None
+            eye = eye + 0.1 * size * side * normals[wrong].mean(0)
+    return None
+
+
+def _edges(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Each edge once, and how many faces share it."""
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    keys, count = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
+    return np.column_stack([keys // len(mesh.vertices), keys % len(mesh.vertices)]), count
+
+
+def _borders(mesh: TriangleMesh) -> int:
+    """How many closed lines the surface ends at."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges, count = _edges(mesh)
+    used, compact = np.unique(edges[count == 1], return_inverse=True)
+    if not len(used):
+        return 0
+    one, other = compact.reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(used), len(used)))
+    return int(connected_components(graph, directed=False)[0])
+
+
+def _is_grid(mesh: TriangleMesh) -> bool:
+    edges, count = _edges(mesh)
+    inner = np.ones(len(mesh.vertices), dtype=bool)
+    inner[edges[count == 1]] = False
+    meet = np.bincount(mesh.faces.ravel(), minlength=len(mesh.vertices))
+    inner &= meet > 0
+    return bool(inner.any() and (meet[inner] == 6).mean() > GRID_SHARE)

@@ -1,0 +1,74 @@
+"""Every situation of the table, by every way in that takes it: the scene that it shows, or a refusal by name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from situations import SITUATIONS, Situation
+
+from graspd_core.cli import main
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
+from graspd_core.errors import GraspdError
+from graspd_core.perception.load_scene import load_scene
+from graspd_core.perception.segment.target_selection import Target
+
+REFUSED = [row for row in SITUATIONS if isinstance(row.expect, str)]
+ANSWERED = [row for row in SITUATIONS if not isinstance(row.expect, str)]
+
+
+def name_of(row: Situation) -> str:
+    return row.name
+
+
+def arguments(row: Situation) -> dict[str, Any]:
+    """The library's arguments that stand for the options of the command line."""
+    target = row.options.get("target")
+    return {**row.options, "target": None if target is None else Target(point=np.array(target))}
+
+
+def words(row: Situation) -> list[str]:
+    """The command line's options."""
+    said = []
+    for name, value in row.options.items():
+        values = [] if value is True else list(value) if isinstance(value, tuple) else [value]
+        said += [f"--{name}", *map(str, values)]
+    return said
+
+
+def test_the_table_names_each_situation_once_and_where_most_of_them_came_up():
+    assert len({row.name for row in SITUATIONS}) == len(SITUATIONS) >= 40
+    assert sum(bool(row.thread) for row in SITUATIONS) >= 30
+    assert all(re.fullmatch(r"[\w.-]+/[\w.-]+/(issues|pull)/\d+", row.thread) for row in SITUATIONS if row.thread)
+
+
+@pytest.mark.parametrize("row", REFUSED, ids=name_of)
+def test_the_library_refuses_it_by_name(row: Situation, tmp_path: Path):
+    with pytest.raises(GraspdError, match=str(row.expect)) as refusal:
+        load_scene(row.make(tmp_path), resolution=16, **arguments(row))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("row", REFUSED, ids=name_of)
+def test_the_command_line_refuses_it_in_the_same_words(row: Situation, tmp_path: Path, capsys):
+    assert main(["synthesize", str(row.make(tmp_path)), *words(row)]) == EXIT_BAD_INPUT
+    (line,) = [said for said in capsys.readouterr().err.splitlines() if not said.startswith("usage")]
+    assert re.search(str(row.expect), line)
+
+
+@pytest.mark.parametrize("row", ANSWERED, ids=name_of)
+def test_the_library_makes_the_object_that_it_shows(row: Situation, tmp_path: Path):
+    thing = load_scene(row.make(tmp_path), resolution=16, **arguments(row)).object
+    assert thing.volume == pytest.approx(float(row.expect), rel=row.near)
+    assert any(re.search(row.warns, warning) for warning in (*thing.warnings, "")), thing.warnings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ANSWERED, ids=name_of)
+def test_the_command_line_answers_it_and_says_the_same(row: Situation, tmp_path: Path, capsys):
+    asked = ["-n", "1", "--preset", "fast", "--verify", "none", *words(row)]
+    assert main(["synthesize", str(row.make(tmp_path)), *asked]) == EXIT_OK
+    assert re.search(row.warns, capsys.readouterr().err)
