@@ -106,10 +106,10 @@ def forms(seen: Seen, rng: np.random.Generator) -> dict[str, PointCloud]:
 def outcome(seen: Seen, form: str, cloud: PointCloud, place: Vector) -> str:
     """What the answer is: refused, doubted, no verified grasp, or verified and whether all of those hold."""
     hand, protocol = load_hand("allegro_right"), out_of_place(PROTOCOLS["standard"])
-    asked = {"alone": True} if form == "alone" else {"target": Target(point=seen.target)}
+    target = None if form == "alone" else Target(point=seen.target)
     try:
         said = PointCloud(cloud.points, place)
-        scene = scene_from_views([said], mass=PROTOCOL_MASS, **asked)
+        scene = scene_from_views([said], target=target, alone=target is None, mass=PROTOCOL_MASS)
         if scene.evidence is not None and scene.evidence.doubts:
             return "doubted"
         result = plan_grasps(scene, hand, count=2, measure=False)

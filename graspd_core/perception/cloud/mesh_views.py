@@ -38,13 +38,13 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
         return None
     some = mesh.faces[:: 1 + len(mesh.faces) // _MOST_FACES]
     # Pixels without depth are written as zeros, and some writers join them to their neighbours.
-    some = some[mesh.vertices[some].any(2).all(1)]
+    some = some[np.asarray(mesh.vertices[some].any(2)).all(1)]
     if not len(some):
         return None
     corners, normals = mesh.vertices[some], scaled_normals(mesh.vertices, some)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     if _faces(corners, normals, np.zeros(3)) and _pixels(corners):
-        return PointCloud(mesh.vertices, np.zeros(3))
+        return PointCloud(mesh.vertices, np.zeros(3), posed=True)
     if borders >= MIN_BORDERS and _is_grid(mesh) and _camera_place(corners, normals) is not None:
         raise MeshError(
             f"{source}: one side of a scene, an open sheet as camera viewers export it, not in the camera's frame; "
