@@ -88,17 +88,17 @@ MAY_IMPORT = {
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 24_980,
-    "graspd_ros": 4_700,
+    "graspd_core": 25_510,
+    "graspd_ros": 4_720,
     "graspd_bench": 8_700,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_300,
-    "graspd_cell": 3_500,
-    "test": 30_000,
+    "graspd_cell": 3_670,
+    "test": 30_450,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 20_100, "graspd_ros.node": 23_900}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 20_250, "graspd_ros.node": 24_030}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
