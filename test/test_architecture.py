@@ -93,8 +93,8 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_700,
     "graspd_dataset": 2_900,
     "graspd_viewer": 2_300,
-    "graspd_cell": 3_670,
-    "test": 30_450,
+    "graspd_cell": 3_800,
+    "test": 30_500,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
