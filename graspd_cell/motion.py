@@ -302,7 +302,7 @@ def dense(path: Path, step: float = _STEP) -> Path:
 _DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
 
-def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 1.5) -> Path:
+def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -> Path:
     """Return waypoints from one posture to another whose straight connections are clear.
 
     Raises:

@@ -46,7 +46,9 @@ def robot(pair: tuple[str, str], robot_of: RobotOf) -> SimulatedRobot:
     return ready
 
 
-def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(robot: SimulatedRobot):
+def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(
+    robot: SimulatedRobot, monkeypatch: pytest.MonkeyPatch
+):
     ends: list[np.ndarray] = []
     follow = robot.follow
 
@@ -55,7 +57,7 @@ def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(robot: Simula
             ends.append(motion.positions[-1])
         return follow(motion, *more)
 
-    robot.follow = noted
+    monkeypatch.setattr(robot, "follow", noted)
     (attempt,) = picker_of(robot).empty_the_bin(most=1)
     assert (attempt.ending, attempt.reason) == (Ending.PICKED, "")
     report = robot.referee()
@@ -83,7 +85,7 @@ def test_an_empty_bin_ends_it_with_a_reason(robot_of: RobotOf):
     assert picker.why_ended
 
 
-def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRobot):
+def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRobot, monkeypatch: pytest.MonkeyPatch):
     """The referee's hand: the thing is gone in the moment of the lift."""
     follow, calls = robot.follow, 0
 
@@ -95,7 +97,7 @@ def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRob
             calls += 1
         return follow(motion, *more)
 
-    robot.follow = stolen
+    monkeypatch.setattr(robot, "follow", stolen)
     (attempt,) = picker_of(robot).empty_the_bin(most=1)
     assert attempt.ending is Ending.LOST_LIFTING
     assert attempt.reason

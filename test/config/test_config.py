@@ -134,7 +134,7 @@ def test_an_empty_file_holds_the_defaults_and_a_missing_one_is_named(tmp_path: P
 
 def test_one_file_reaches_every_field(tmp_path: Path):
     def other(name: str, value: Any) -> Any:
-        given = {"roi_low": [0.0, 0.0, 0.0], "roi_high": [1.0, 1.0, 1.0], "poisson": "open3d"}
+        given = {"roi_low": [0.0, 0.0, 0.0], "roi_high": [1.0, 1.0, 1.0], "poisson": "open3d", "piled": True}
         return given[name] if name in given else 2 * value
 
     values = {name: {f: other(f, v) for f, v in dataclasses.asdict(part).items()} for name, part in PARTS}
