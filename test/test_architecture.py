@@ -86,7 +86,8 @@ MAY_IMPORT = {
     "graspd_cell": CORE | {"cli", "graspd_dataset", "graspd_bench", "graspd_viewer", "graspd_ros"},
 }
 # Lines of Python of each package at most. They are lowered when the code shrinks, and raised only with a reason.
-# The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test.
+# The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test. What inputs are checked for, which
+# came after it, took 1,700, 500 and 3,300.
 MAX_PACKAGE_LINES = {
     "graspd_core": 26_700,
     "graspd_ros": 5_200,
@@ -94,11 +95,11 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_000,
     "graspd_viewer": 2_300,
     "graspd_cell": 3_800,
-    "test": 31_500,
+    "test": 32_345,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 21_500, "graspd_ros.node": 25_500}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 21_600, "graspd_ros.node": 25_540}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
