@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from graspd_core.perception.cloud.camera import (
 from graspd_core.perception.cloud.point_cloud import (
     CloudLayout,
     PointCloud,
+    finite_points,
     organised_points,
     points_from_layout,
 )
@@ -90,7 +91,9 @@ class CameraPlace:
             optical = (self.sensor_frame or frame).endswith("optical_frame")
             if self.sensor_frame.removeprefix("/") not in ("", frame.removeprefix("/")):
                 T = lookup(frame, self.sensor_frame)
-        return seen_from(pixels_from_message(message), T[:3, 3], T[:3, 2] if optical else None)
+        pixels = pixels_from_message(message)
+        points = finite_points(pixels)
+        return replace(seen_from(pixels, T[:3, 3], T[:3, 2] if optical else None), points=points)
 
 
 ORIGIN = CameraPlace()

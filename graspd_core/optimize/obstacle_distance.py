@@ -178,14 +178,14 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 
 @torch.no_grad()
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
-    """Return the least of `obstacle_gaps` of each hand [m]; `wide` where it is wider.
+    """Return the least of `obstacle_gaps` of each hand [m]; a thing farther away than `wide` does not count.
 
     Only links near an obstacle's grid are looked at: in a bin, of a hand and five obstacles, a tenth of all.
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:
         corners = base.apply(place_points(obstacles.corner_matrix, links))
-        least = torch.minimum(least, (corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii).amin(-1))
+        least = (corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii).amin(-1)
     if obstacles.sdfs:
         rotation = base.rotation[:, None] @ links.rotation
         place = base.apply(links.translation)

@@ -95,7 +95,7 @@ def reconstruct_object(
     else:
         check_scene(views)
         seen = segment(views, target=target, settings=settings.segmentation)
-    doubts = _doubts(seen, views, settings.segmentation.max_range)
+    doubts = _doubts(seen, views, settings.segmentation.max_range) if seen.views else ()
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
     whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts))
     told = tuple(f"cloud: {doubt}; no grasp counts as verified" for doubt in doubts)
@@ -116,7 +116,8 @@ def _doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) ->
 def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
     away = np.concatenate([np.linalg.norm(view.points[::50] - view.viewpoint, axis=1) for view in views])
     beyond = float((away[np.isfinite(away)] > farthest).mean()) if np.isfinite(away).any() else 0.0
-    thing = float(np.median(np.linalg.norm(seen.views[0].points - seen.views[0].viewpoint, axis=1)))
+    first = np.linalg.norm(seen.views[0].points - seen.views[0].viewpoint, axis=1)
+    thing = float(np.median(first[np.isfinite(first)])) if np.isfinite(first).any() else 0.0
     asked = "are its numbers metres? (the camera's depth unit; --units or --scale for a file)"
     if thing < _NEAREST and seen.views[0].posed:
         return (f"the object is {1e3 * thing:.0f} mm from its camera, nearer than depth cameras see: {asked}",)

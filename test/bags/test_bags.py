@@ -171,7 +171,9 @@ def test_depth_in_a_frame_whose_name_says_another_direction_is_told(tmp_path, ca
             Record("/points", START + i, cloud_message(np.ones((60, 3)) * [0, 0, 1], frame, START)) for i in (0, 1)
         ]
         write_bag(tmp_path / frame, records)
-        options = argparse.Namespace(topic=None, camera_info=None, every=1, limit=None, frame=None)
+        options = argparse.Namespace(
+            topic=None, camera_info=None, every=1, limit=None, frame=None, view_point=None, sensor_frame=""
+        )
         assert len(list(bag_views(tmp_path / frame, options))) == 2
         told = capsys.readouterr().err
         assert told.count("the points lie along z of 'camera_link'") == (frame == "camera_link")

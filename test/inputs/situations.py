@@ -376,7 +376,7 @@ MESHES = (
     Situation(
         "a mesh in mm",
         mesh_file("a.stl", scaled("box", 1000)),
-        r"scale 0.001 \(--units mm\) makes it",
+        r"scale 0.001 \(from mm\) makes it",
         "moveit/moveit/issues/279",
     ),
     Situation(
@@ -390,7 +390,7 @@ MESHES = (
     Situation(
         "a mesh in cm",
         mesh_file("a.stl", scaled("box", 100)),
-        r"scale 0.01 \(--units cm\) makes it",
+        r"scale 0.01 \(from cm\) makes it",
         "tesseract-robotics/tesseract/issues/1184",
     ),
     Situation(

@@ -9,12 +9,13 @@ surface that bends turns away.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import CloudError
-from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, finite_points, longest_side, measured
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, longest_side, measured
 from graspd_core.se3 import perpendicular
 
 # An organised cloud, NaN where nothing was seen.
@@ -42,7 +43,7 @@ HIDDEN_DEPTH, HIDDEN_DEPTH_SHARE, ROUGHNESS_TIMES = 0.03, 0.05, 8.0
 SAME_SURFACE, FLATNESS, GRAZING = 0.6, 0.15, 0.1
 LINK_SPACINGS = 3.0
 THING_SPACING = 0.004  # [m]
-ABOUT_THING = 0.12  # [m]
+ABOUT_THING, FARTHEST = 0.12, 1e7  # [m]
 # Places on other sides of the thing are tried too. Nothing speaks for the one that is said where this share of them
 # fits as well: the true place has 0.2 in nine of ten clouds of scenes, and 0.34 of cut-out things.
 OTHER_SIDE, MOST_CHANCE = float(np.cos(np.pi / 4)), 0.3
@@ -63,19 +64,19 @@ _DIRECTIONS = np.column_stack([_DIRECTIONS, _HEIGHTS])
 
 
 def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) -> PointCloud:
-    """Return the finite points of an organised cloud, with `posed` set if its pixels fit a camera at the viewpoint.
+    """Return an organised cloud, NaN and all, with `posed` set if its pixels fit a camera at the viewpoint.
 
     A grid of one row or column tells nothing.
 
     Raises:
-        CloudError: the pixels show that the camera stood elsewhere, and where, or no point is finite.
+        CloudError: the pixels show that the camera stood elsewhere, and where.
     """
     fits = None if min(pixels.shape[:2]) < 2 else _pinhole_fits(pixels, viewpoint)
     place = _pinhole_place(pixels) if fits is False else None
     if place is not None:
         x, y, z = place
         raise _refusal(viewpoint, f"its pixels show it at ({x:.3f}, {y:.3f}, {z:.3f})")
-    return PointCloud(finite_points(pixels), np.asarray(viewpoint, dtype=float), forward, posed=bool(fits))
+    return PointCloud(pixels.reshape(-1, 3), np.asarray(viewpoint, dtype=float), forward, posed=bool(fits))
 
 
 def check_scene(views: Sequence[PointCloud]) -> None:
@@ -113,13 +114,13 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
     Raises:
         CloudError: and why the camera cannot have stood there.
     """
-    if view.posed or len(thing.points) < FEWEST_POINTS:
-        return ""
-    own = _some(thing.thinned(THING_SPACING).points, view.viewpoint, MOST_POINTS)
-    if len(own) < FEWEST_POINTS:
+    own = _thinned(thing)
+    if view.posed or len(own) < FEWEST_POINTS:
         return ""
     low, high = own.min(0) - ABOUT_THING, own.max(0) + ABOUT_THING
     near = _some(view.points[((view.points > low) & (view.points < high)).all(1)], view.viewpoint, MOST_POINTS)
+    if len(near) < FEWEST_POINTS:
+        return ""
     surfaces, (around, roughness) = _surfaces(own), _around(near)
     nearer = np.full(len(near), max(HIDDEN_DEPTH, ROUGHNESS_TIMES * roughness))
 
@@ -145,7 +146,7 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
 
 def fits_nowhere(thing: PointCloud) -> bool:
     """Whether no camera on any side sees all points of a thing, as where it is shown from all round."""
-    own = _some(thing.thinned(THING_SPACING).points, thing.viewpoint, MOST_POINTS)
+    own = _thinned(thing)
     surfaces, middle = _surfaces(own), own.mean(0)
     far = float(np.linalg.norm(thing.viewpoint - middle))
     return all(_away_share(own, surfaces, middle + far * way) > MAX_AWAY_SHARE for way in _DIRECTIONS)
@@ -273,6 +274,14 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     over = Delaunay(flat[on]).find_simplex(flat) >= 0
     near, far = (over & (side > 1.5 * PLANE_TOLERANCE) & (side < THING_HEIGHT) for side in (height, -height))
     return bool(far.mean() > MAX_HIDDEN_SHARE and far.sum() > near.sum())
+
+
+def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
+    """Some of a thing's points, none where their numbers cannot be metres."""
+    known = thing.points[measured(thing.points, thing.viewpoint)]
+    if not len(known) or np.abs(known).max() > FARTHEST:
+        return np.zeros((0, 3))
+    return _some(replace(thing, points=known).thinned(THING_SPACING).points, thing.viewpoint, MOST_POINTS)
 
 
 def _some(points: Points, viewpoint: Vector, most: int) -> Float[np.ndarray, "m 3"]:

@@ -56,6 +56,12 @@ EXECUTORS: list[Executor] = []  # a node holds its own by a weak reference only
 Start = Callable[..., subprocess.Popen[str]]
 
 
+@pytest.fixture(scope="module")
+def domain(claim_domain: Callable[[], int]) -> int:
+    """A domain without the node that other tests share: it hears the same topics."""
+    return claim_domain()
+
+
 @pytest.fixture
 def node(monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Node]:
     """A node with the shared memory that Fast DDS has by itself."""
