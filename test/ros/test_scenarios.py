@@ -245,7 +245,23 @@ def test_under_sim_time_a_clouds_age_is_told_by_the_clock_topic(client, start_no
     assert process.alive()
 
 
-def test_depth_whose_calibration_comes_once_is_grasped_packed_too_and_what_does_not_pair_is_told(client, node):
+def test_depth_whose_calibration_comes_once_is_grasped_packed_too_and_what_does_not_pair_is_told(
+    client, node, claim_domain, tmp_path
+):
+    """In a domain of its own: other tests publish plain images, and the node hears those first."""
+    own = type(client)(claim_domain())
+    process = type(node)(own.domain, tmp_path, {}, None)
+    try:
+        own.event(event="ready")
+        own.wait_for_match()
+        own.forget()
+        depth_images_are_grasped(own)
+    finally:
+        process.stop()
+        own.close()
+
+
+def depth_images_are_grasped(client) -> None:
     ((depth, _),) = depth_views(tabletop("cylinder", yaw=0.3), CAMERA, ring_poses(1, elevation=0.8), DEFAULT)
     client.set_parameters(cloud_policy="off", **ONE)
     depth[~np.isfinite(depth)] = 0
