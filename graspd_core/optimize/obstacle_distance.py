@@ -193,7 +193,7 @@ def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = W
         middle = (rotation @ middle[..., None]).squeeze(-1) + place
     for sdf in obstacles.sdfs:
         off_grid = (middle - (sdf.origin + sdf.half)).abs() - sdf.half
-        touched = torch.lt(off_grid, (reach + wide)[:, None]).all(-1)
+        touched = torch.lt(off_grid, reach[:, None] + wide).all(-1)
         row, ball = touched[:, obstacles.links].nonzero(as_tuple=True)
         link = obstacles.links[ball]
         points = (rotation[row, link] @ obstacles.points[ball][..., None]).squeeze(-1) + place[row, link]

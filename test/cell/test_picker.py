@@ -55,7 +55,7 @@ def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(robot: Simula
             ends.append(motion.positions[-1])
         return follow(motion, *more)
 
-    robot.follow = noted
+    robot.follow = noted  # pyright: ignore[reportAttributeAccessIssue]
     (attempt,) = picker_of(robot).empty_the_bin(most=1)
     assert (attempt.ending, attempt.reason) == (Ending.PICKED, "")
     report = robot.referee()
@@ -95,7 +95,7 @@ def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRob
             calls += 1
         return follow(motion, *more)
 
-    robot.follow = stolen
+    robot.follow = stolen  # pyright: ignore[reportAttributeAccessIssue]
     (attempt,) = picker_of(robot).empty_the_bin(most=1)
     assert attempt.ending is Ending.LOST_LIFTING
     assert attempt.reason
