@@ -100,6 +100,7 @@ def run_cell(case: CellCase) -> Record:
     arm_name, hand_name = case.pair.split("+")
     arm, hand = load_arm(arm_name), load_hand(hand_name)
     world = pile_cell(arm, hand, case.sources(), case.seed)
+    fits = {thing.name: can_be_held(hand, thing, case.preset) for thing in world.things}
     robot = SimulatedRobot(world, seed=case.seed)
     robot.wait(SETTLING)
     began = robot.referee()
@@ -116,7 +117,6 @@ def run_cell(case: CellCase) -> Record:
     except GraspdError as failure:
         error = str(failure)
     ended = robot.referee()
-    fits = {thing.name: can_be_held(hand, thing, case.preset) for thing in world.things}
     return {
         "dropped": dict(began.places),
         "ended": dict(ended.places),
@@ -226,12 +226,17 @@ def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return the table a pair and size, the curve of probabilities, the endings and the times."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
-        groups.setdefault((record["pair"], str(record["size"])), []).append(record)
+        groups.setdefault((_stock(record), str(record["size"])), []).append(record)
     body = [_row(*key, own) for key, own in groups.items()]
-    for pair in dict.fromkeys(record["pair"] for record in records):
-        body.append(_row(pair, "all", [record for record in records if record["pair"] == pair]))
+    for stock in dict.fromkeys(map(_stock, records)):
+        body.append(_row(stock, "all", [record for record in records if _stock(record) == stock]))
     parts = [markdown_table(_HEADINGS, body), _curve(records), _endings(records), _times(records)]
     return {"cell": [part for part in parts if part]}
+
+
+def _stock(record: Record) -> str:
+    """Arm and hand, and whether the things were drawn or given."""
+    return f"{record['pair']}, given things" if record.get("things") else str(record["pair"])
 
 
 def _row(pair: str, size: str, own: Sequence[Record]) -> list[str]:

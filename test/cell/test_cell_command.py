@@ -30,10 +30,10 @@ def test_a_bin_is_emptied_in_a_line_a_pick_and_a_film(tmp_path: Path, capsys: py
     words = ("--hand", "parallel_gripper", "--things", "shape:box", "--count", "1", "--film", str(film))
     status = cell_command.run(_options(*words))
     *lines, last = capsys.readouterr().out.splitlines()
-    assert lines
+    # A busy machine may end before the first grasp is found. What came of it is not this test's business.
     assert all(line.startswith(f"{number}: ") for number, line in enumerate(lines, 1))
-    # What came of it is not this test's business. That it is told truly is.
-    out = lines[-1].endswith("1 of 1 out")
+    # That it is told truly is.
+    out = bool(lines) and lines[-1].endswith("1 of 1 out")
     assert (status == 0, "left: nothing" in last) == (out, out)
     assert film.exists() == any(": picked" in line for line in lines)
 
