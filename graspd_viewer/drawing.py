@@ -195,7 +195,7 @@ class Mechanics:
 
         None where the contacts do not close around the object: there is a push that they do not resist at all.
         """
-        return prepare_grasp(self._metrics, grasp.grasp).weakest_push
+        return prepare_grasp(self._metrics, grasp.grasp).wrench_hull.weakest_push
 
 
 STAGES = ("retreat", "pregrasp", "grasp", "squeeze")

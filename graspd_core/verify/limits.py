@@ -31,35 +31,45 @@ def payload(
     protocol: Protocol,
     *,
     least: float = LEAST_PAYLOAD,
+    held: bool = False,
     stop: StopHook = lambda: False,
 ) -> float:
     """Return the greatest mass [kg] whose pulls the grasp holds, zero where it does not hold the `least`.
 
     The hand closes once on the object's own mass. Each direction is then pulled as hard as the hold trial pulls the
-    mass that is asked about, from the same state.
+    mass that is asked about, from the same state. `held` says that a hold trial has shown that it holds the `least`.
     """
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
-    most = MOST_PAYLOAD
+    most = math.inf
     try:
         with trial_data(world) as data:
             if close_hand(world, data, grasp, protocol, np.zeros(2), stop=stop):
                 return 0.0
-            held = np.empty(mujoco.mj_stateSize(world.model, kind))
-            mujoco.mj_getState(world.model, data, held, kind)
-            for direction in DIRECTIONS[list(protocol.pulls)]:
+            closed = np.empty(mujoco.mj_stateSize(world.model, kind))
+            mujoco.mj_getState(world.model, data, closed, kind)
+            # Hands are weakest against what pulls the object out of them, the way they came.
+            way = grasp.grasp.position - grasp.pregrasp.position
+            directions = DIRECTIONS[list(protocol.pulls)]
+            for direction in directions[np.argsort(-directions @ way, kind="stable")]:
 
                 def holds(mass: float, direction: np.ndarray = direction) -> bool:
-                    mujoco.mj_setState(world.model, data, held, kind)
+                    mujoco.mj_setState(world.model, data, closed, kind)
                     data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
                     return not step_until_known(world, data, protocol, np.zeros(2), steps, stop=stop)
 
-                # Only a direction that is weaker than those before it is looked at closely.
-                if not holds(least):
+                if not held and not holds(least):
                     return 0.0
-                most = most if holds(most) else _greatest(holds, least, most)
+                if math.isinf(most):
+                    low = high = least
+                    while high < MOST_PAYLOAD and holds(high := min(2 * low, MOST_PAYLOAD)):
+                        low = high
+                    most = _greatest(holds, low, high) if low < high else high
+                # Only a direction that is weaker than those before it is looked at closely.
+                elif not holds(most):
+                    most = _greatest(holds, least, most)
     except mujoco.FatalError:
         return 0.0
     return most

@@ -98,8 +98,8 @@ _ROWS = (
     ),
     Metric(
         "intersection_volume", "cm³", 1e6, lambda g: g.shared_volume,
-        "IV: volume shared by hand and object, in 1 mm voxels of a lattice fixed in the hand's base frame; an octree "
-        "finds them, so that no overlap is too small to be visited",
+        "IV: volume shared by hand and object, in 2 mm cells of a lattice fixed in the hand's base frame; an octree "
+        "finds them, so that no overlap is too small to be visited, and a cell counts by the thickness of the overlap",
     ),
     Metric(
         "contact_per_volume", "1/cm", 1e-2, _contact_per_volume,
@@ -110,11 +110,11 @@ _ROWS = (
         "links with a sample outside by at most 2 mm, or inside", 0,
     ),
     Metric(
-        "epsilon", "", 1.0, lambda g: g.wrench_hull[0],
+        "epsilon", "", 1.0, lambda g: g.wrench_hull.epsilon,
         "ε: radius of the largest ball about the origin in the convex hull of contact wrenches (Ferrari and Canny, "
         "ICRA 1992); 0 when the origin is outside", 3,
     ),
-    Metric("volume", "", 1.0, lambda g: g.wrench_hull[1], "volume of that hull", 3),
+    Metric("volume", "", 1.0, lambda g: g.wrench_hull.volume, "volume of that hull", 3),
     Metric(
         "payload", "kg", 1.0, None,
         "greatest mass whose pulls in the hold trial the grasp holds, at its friction, by bisection to a tenth; of "

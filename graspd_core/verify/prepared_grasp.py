@@ -36,6 +36,7 @@ from graspd_core.mesh.surface_queries import (
     unsigned_distance,
 )
 from graspd_core.mesh.topology import packed_rows
+from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Posture
@@ -72,6 +73,7 @@ class MetricsContext:
 
     Attributes:
         points: of the object's surface and edges [m].
+        tree: of these points, a `scipy.spatial.KDTree`.
         world: of the hold trial; None where there is none, and then no contact depth is measured.
     """
 
@@ -80,13 +82,18 @@ class MetricsContext:
     surface: HandSurface
     query: DistanceQuery
     points: Float[np.ndarray, "points 3"]
+    tree: Any
     world: World | None = None
 
 
 def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext:
     """Sample the hand and prepare the object's distance, once for all grasps of that object by that hand."""
-    points = surface_samples(target.mesh, _SAMPLES, _SEED)[0], crease_points(target.mesh, _SAMPLES // 4, _SEED)
-    return MetricsContext(target, hand, hand_surface(hand), make_distance_query(target.mesh), np.concatenate(points))
+    from scipy.spatial import KDTree
+
+    creases = crease_points(target.mesh, _SAMPLES // 4, _SEED)
+    points = np.concatenate([surface_samples(target.mesh, _SAMPLES, _SEED)[0], creases])
+    query = make_distance_query(target.mesh)
+    return MetricsContext(target, hand, hand_surface(hand), query, points, KDTree(points))
 
 
 @lru_cache(maxsize=8)
@@ -151,20 +158,35 @@ def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.nd
     return placed.distance <= within
 
 
-VOXEL = 0.001
-# Cells are halved until they are voxels: 16 mm, 8, 4, 2, 1.
-_HALVINGS = 4
-# Half the diagonal of a cube of side 1, with room for float32 distances.
+# Cells are halved until they are 2 mm wide: 16 mm, 8, 4, 2. Lengths of cells are counted in the smallest.
+_CELL, _HALVINGS = 0.002, 3
+# A link shares nothing with the object where all its samples are farther off [m]: they lie some 3 mm apart.
+_NO_SAMPLE_NEARER = 0.01
+# Half the diagonal of a cube of side 1, with room for rounding.
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
 
 
 def penetration(context: MetricsContext, placed: PlacedHand) -> float:
-    """Greatest depth of a hand sample inside the object, or of a point of the object inside a link [m]."""
+    """Return the greatest depth of a hand sample inside the object, or of a point of the object inside a link [m]."""
     worst = float(max(0.0, -placed.distance.min()))
-    for link in range(context.hand.num_links):
-        local = (context.points - placed.translations[link]) @ placed.rotations[link]
+    centers, radii = _link_balls(context.hand)
+    centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
+    for link, near in enumerate(context.tree.query_ball_point(centers, radii)):
+        local = (context.points[near] - placed.translations[link]) @ placed.rotations[link]
         worst = max(worst, float(depth_inside(context.hand, link, local).max(initial=0.0)))
     return worst
+
+
+@lru_cache(maxsize=8)
+def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links"]]:
+    """Return centers, link frames, and radii of balls about the solids of each link [m]; zero for a bare link."""
+    centers, radii = np.zeros((hand.num_links, 3)), np.zeros(hand.num_links)
+    for link, primitives in enumerate(hand.primitives_of):
+        if primitives:
+            low, high = zip(*map(bounds, primitives), strict=True)
+            low, high = np.min(low, axis=0), np.max(high, axis=0)
+            centers[link], radii[link] = (low + high) / 2, np.linalg.norm(high - low) / 2
+    return centers, radii
 
 
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
@@ -207,38 +229,57 @@ def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
 
 
 def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
-    """Greatest depth of a hand sample inside a link that is not adjacent to its own [m]."""
+    """Return the greatest depth of a hand sample inside a link that is not adjacent to its own [m]."""
     hand, worst = context.hand, 0.0
-    for link in range(hand.num_links):
-        others = placed.points[~hand.adjacent[link][placed.links]]
+    centers, radii = _link_balls(hand)
+    centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
+    apart = np.linalg.norm(centers[:, None] - centers, axis=-1) - radii[:, None] - radii
+    # Samples of a link lie on its solids, so that links whose balls are apart cannot meet.
+    meet = (apart < 0) & ~hand.adjacent
+    for link in np.flatnonzero(meet.any(1)).tolist():
+        others = placed.points[meet[link][placed.links]]
+        others = others[np.linalg.norm(others - centers[link], axis=1) < radii[link]]
         local = (others - placed.translations[link]) @ placed.rotations[link]
         worst = max(worst, float(depth_inside(hand, link, local).max(initial=0.0)))
     return worst
 
 
 def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
-    """Volume of the hand inside the object [m³], counted in 1 mm voxels of a lattice fixed in the hand's base frame.
+    """Return the volume of the hand inside the object [m³], summed over 2 mm cells of a lattice in the base frame.
 
-    An octree of each solid finds them: a cell is dropped when its centre is farther outside solid or object than its
-    half diagonal, and known to be wholly inside the object when it is that far inside; no overlap is too small or too
-    thin to be visited. Cells have integer coordinates in voxels, so that what solids share is counted once.
+    An octree of each solid finds the cells, so no overlap is too small or too thin to be visited. A cell counts by the
+    thickness of what hand and object share in it, as of two flat faces that meet: exact for a flat overlap of any
+    thickness. What solids share is counted once.
     """
     solids = _placed_solids(context.hand, placed)
     cells, which = _root_cells(solids, placed)
-    # Whether a cell is known to lie inside the object as a whole.
-    known = np.zeros(len(cells), dtype=bool)
-    for halving in range(_HALVINGS + 1):
-        size = 2 ** (_HALVINGS - halving)
-        half_diagonal = _HALF_DIAGONAL * size * VOXEL if size > 1 else 0.0
-        centers = (cells + 0.5 * size) * VOXEL @ placed.rotations[0].T + placed.translations[0]
-        kept = _solid_distance(solids, which, centers) < half_diagonal
-        cells, which, known, centers = cells[kept], which[kept], known[kept], centers[kept]
+    size = 2**_HALVINGS
+    while len(cells):
+        half_diagonal = _HALF_DIAGONAL * size * _CELL
+        centers = (cells + 0.5 * size) * _CELL @ placed.rotations[0].T + placed.translations[0]
+        kept = _near_box(context.query, centers, half_diagonal)
+        cells, which, centers = cells[kept], which[kept], centers[kept]
+        depth = -_solid_distance(solids, which, centers)
+        kept = depth > -half_diagonal
+        cells, which, centers, depth = cells[kept], which[kept], centers[kept], depth[kept]
+        # Solids overlap, and share cells.
+        _, first, same = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
         if size == 1:
-            known[~known] = inside(context.query, centers[~known])
-            return len(np.unique(packed_rows(cells[known]))) * VOXEL**3
-        kept, known = _against_object(context, centers, known, half_diagonal)
-        cells, which, known = _halve(cells[kept], size // 2), np.repeat(which[kept], 8), np.repeat(known[kept], 8)
+            deepest = np.full(len(first), -np.inf)
+            np.maximum.at(deepest, same, depth)
+            depths = deepest, -signed_distance(context.query, centers[first])
+            in_hand, in_object = (np.clip(0.5 + depth / _CELL, 0.0, 1.0) for depth in depths)
+            return float(np.maximum(in_hand + in_object - 1.0, 0.0).sum()) * _CELL**3
+        kept = unsigned_distance(context.query, centers[first]) < half_diagonal
+        kept[~kept] = inside(context.query, centers[first[~kept]])
+        kept = kept[same]
+        size //= 2
+        cells, which = _halve(cells[kept], size), np.repeat(which[kept], 8)
     return 0.0
+
+
+def _near_box(query: DistanceQuery, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
+    return np.all((points > query.tree.low - margin) & (points < query.tree.high + margin), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,14 +310,19 @@ def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
 def _root_cells(
     solids: _PlacedSolids, placed: PlacedHand
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
-    """Cells of the coarsest size over the boxes of all solids, base frame, in voxels; and the solid of each, rising."""
+    """Return the coarsest cells over the boxes of all solids, base frame, and the solid of each, rising."""
     size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
+    near = np.full(len(placed.translations), np.inf)
+    np.minimum.at(near, placed.links, placed.distance)
     for primitive in solids.primitives:
+        if near[primitive.link] > _NO_SAMPLE_NEARER:
+            cells.append(cells[0])
+            continue
         low, high = bounds(primitive)
         rotation = base.T @ placed.rotations[primitive.link]
         center = (placed.translations[primitive.link] - placed.translations[0]) @ base + rotation @ (low + high) / 2
         reach = np.abs(rotation) @ (high - low) / 2
-        ends = np.floor((center - reach) / (size * VOXEL)), np.ceil((center + reach) / (size * VOXEL))
+        ends = np.floor((center - reach) / (size * _CELL)), np.ceil((center + reach) / (size * _CELL))
         cells.append(size * _lattice(*(end.astype(np.int64) for end in ends)))
     return np.concatenate(cells), np.repeat(np.arange(len(solids.primitives)), [len(some) for some in cells[1:]])
 
@@ -295,19 +341,6 @@ def _solid_distance(
     return np.concatenate(parts)
 
 
-def _against_object(
-    context: MetricsContext,
-    centers: Float[np.ndarray, "cells 3"],
-    known: Bool[np.ndarray, "cells"],
-    half_diagonal: float,
-) -> tuple[Bool[np.ndarray, "cells"], Bool[np.ndarray, "cells"]]:
-    kept, whole = np.ones(len(centers), dtype=bool), known.copy()
-    unknown = np.flatnonzero(~known)
-    clear = unknown[unsigned_distance(context.query, centers[unknown]) > half_diagonal]
-    whole[clear] = kept[clear] = inside(context.query, centers[clear])
-    return kept, whole
-
-
 def _halve(cells: Int[np.ndarray, "cells 3"], size: int) -> Int[np.ndarray, "children 3"]:
     return (cells[:, None] + size * _lattice(np.zeros(3, dtype=int), np.full(3, 2))).reshape(-1, 3)
 
@@ -321,49 +354,73 @@ CONE_EDGES = 8
 _FLAT = 1e-9
 
 
+# Wrenches are moved by up to this, so that no more than six lie on a facet. A compiled hull whose planes are farther
+# off than the second number is built again by Qhull.
+_JOGGLE, _PLANE_ERROR = 1e-9, 1e-9
+# The compiled hull numbers wrenches by bytes.
+_MOST_WRENCHES = 256
+
+
+@dataclass(frozen=True, eq=False)
+class WrenchHull:
+    """The convex hull of unit-force friction-cone wrenches, quality figures of Ferrari and Canny.
+
+    Attributes:
+        epsilon: radius of the largest ball about the origin in the hull; 0 where the origin is outside.
+        volume: of the hull.
+        weakest_push: the unit disturbance (force, torque over length) that is resisted least, against the nearest
+            facet; None where the origin is outside.
+    """
+
+    epsilon: float = 0.0
+    volume: float = 0.0
+    weakest_push: Float[np.ndarray, "6"] | None = None
+
+
 def wrench_hull(
     arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
-) -> tuple[float, float]:
-    """Ferrari-Canny ε and volume of the convex hull of unit-force friction-cone wrenches.
+) -> WrenchHull:
+    """Return the hull of the wrenches of contacts.
 
     Args:
         arms: contact points about the centre of mass [m].
         normals: outward unit normals of the object.
         friction: Coulomb coefficient.
         length: torque scale, the object's largest radius [m].
-
-    Returns:
-        Radius of the largest origin-centred ball in the hull (0 where the origin is outside) and the hull's volume.
     """
-    hull = _hull(arms, normals, friction, length)
-    return (0.0, 0.0) if hull is None else (max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume))
-
-
-def weakest_push(
-    arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
-) -> Float[np.ndarray, "6"] | None:
-    """The unit disturbance (force, torque over length) that contacts resist least: against the hull's nearest facet.
-
-    Arguments as of `wrench_hull`. None where the hull does not hold the origin.
-    """
-    hull = _hull(arms, normals, friction, length)
-    if hull is None or hull.equations[:, -1].max() >= 0:
-        return None
-    return -hull.equations[hull.equations[:, -1].argmax(), :-1]
-
-
-def _hull(arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float) -> Any:
-    """The convex hull of the contacts' wrenches; None where it has no volume."""
-    from scipy.spatial import ConvexHull
-
     if len(arms) < 2:
-        return None
+        return WrenchHull()
     wrenches = cone_wrenches(arms, normals, friction, length)
     extent = np.linalg.svd(wrenches - wrenches.mean(0), compute_uv=False)
     if extent[-1] <= _FLAT * extent[0]:
+        return WrenchHull()
+    offset, normal, volume = compiled_hull(wrenches) or qhull(wrenches)
+    return WrenchHull(offset, volume, -normal) if offset > 0 else WrenchHull(volume=volume)
+
+
+# Distance from the origin and outward normal of the nearest facet, and volume.
+Hull = tuple[float, Float[np.ndarray, "6"], float]
+
+
+def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
+    """Return the hull by the compiled kernel, or None where there is no kernel or it fails."""
+    library = kernel().library
+    if library is None or len(wrenches) > _MOST_WRENCHES:
         return None
-    # Joggled by some 1e-10: takes half the time of merging facets, and is the same every time.
-    return ConvexHull(wrenches, qhull_options="QJ")
+    joggle = np.random.default_rng(0).uniform(-_JOGGLE, _JOGGLE, wrenches.shape)
+    points, found = np.ascontiguousarray(wrenches + joggle), np.empty(9)
+    failed = library.graspd_wrench_hull(len(points), points.ctypes.data, found.ctypes.data)
+    return None if failed or not found[8] < _PLANE_ERROR else (float(found[0]), found[1:7], float(found[7]))
+
+
+def qhull(wrenches: Float[np.ndarray, "n 6"]) -> Hull:
+    """Return the hull by Qhull."""
+    from scipy.spatial import ConvexHull
+
+    # Joggled: takes half the time of merging facets, and is the same every time.
+    hull = ConvexHull(wrenches, qhull_options="QJ")
+    nearest = hull.equations[:, -1].argmax()
+    return -float(hull.equations[nearest, -1]), hull.equations[nearest, :-1], float(hull.volume)
 
 
 def cone_wrenches(
@@ -382,7 +439,7 @@ def cone_wrenches(
 
 
 # Contacts that the wrench hull is made of. The protocol allows 32, whose hull in six dimensions has some 22,000 facets
-# and takes four times as long; that raises ε by a tenth (docs/metrics.md). Benchmarks ask for 32, planning does not.
+# and takes five times as long; that raises ε by a tenth (docs/metrics.md). Benchmarks ask for 32, planning does not.
 MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
 # Half the distance of a central difference [m].
 _STEP = 2e-4
@@ -405,21 +462,12 @@ class PreparedGrasp:
     max_contacts: int
 
     @cached_property
-    def wrench_hull(self) -> tuple[float, float]:
-        """Ferrari-Canny radius and volume of the grasp wrench hull."""
-        return wrench_hull(*self._contacts)
-
-    @cached_property
-    def weakest_push(self) -> Float[np.ndarray, "6"] | None:
-        """The unit disturbance that the wrench hull resists least (force, torque over the object's radius)."""
-        return weakest_push(*self._contacts)
-
-    @property
-    def _contacts(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float, float]:
+    def wrench_hull(self) -> WrenchHull:
+        """Hull of the wrenches of at most `max_contacts` contacts, torques over the object's radius."""
         target, points = self.context.target, self.placed.points[touching(self.placed)]
         chosen = points[farthest_points(points, self.max_contacts)]
         normals = surface_normals(self.context.query, chosen)
-        return chosen - target.center_of_mass, normals, target.friction, target.radius
+        return wrench_hull(chosen - target.center_of_mass, normals, target.friction, target.radius)
 
     @cached_property
     def shared_volume(self) -> float:

@@ -167,7 +167,10 @@ def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tu
 
 def _measured(trials: TrialContext, context: MetricsContext, friction: bool, grasp: Grasp) -> GraspMetrics:
     """Metrics of a grasp that passed its trials, and how much it holds."""
-    found = {**measure(context, grasp.grasp), "payload": payload(trials.alone, grasp, trials.protocol)}
+    world = trials.alone
+    mass = float(world.model.body_mass[world.object_body])
+    most = payload(world, grasp, trials.protocol, least=mass, held=True)
+    found = {**measure(context, grasp.grasp), "payload": most}
     if friction:
         found["least_friction"] = least_friction(trials.alone, grasp, trials.protocol)
     return GraspMetrics(found)

@@ -138,8 +138,8 @@ def test_verdicts_and_order_do_not_depend_on_the_number_of_threads(candidates, t
         assert any(grasp.verdict is Verdict.VERIFIED for grasp in tried.grasps)
         outcomes.append([(g.score, g.trials, dict(g.metrics or {})) for g in (*tried.grasps, *ranked)])
     assert outcomes[0] == outcomes[1] == outcomes[2]
-    # As many data as threads, kept for all of it.
-    assert 1 <= len(context.trials.alone.spare) <= 3
+    # Trials and the measuring beside them have as many data as threads each, kept for all of it.
+    assert 1 <= len(context.trials.alone.spare) <= 6
 
 
 @pytest.mark.parametrize("number", [1, 2])

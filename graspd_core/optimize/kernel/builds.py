@@ -31,6 +31,7 @@ _ARGUMENTS = {
     "graspd_settle": [_AT, _AT, _INT, _AT, _AT, _INT, POLL],
     "graspd_nearest_features": [_AT, _INT, _AT, _AT, _AT, _AT, _INT],
     "graspd_self_overlap": [_AT, _INT, _AT, _AT, _INT],
+    "graspd_wrench_hull": [_INT, _AT, _AT],
     "graspd_run_steps": [_AT, _AT, _AT, _INT, _INT, _INT, _INT, POLL],
 }
 

@@ -1,6 +1,7 @@
 // The C interface. Functions return 0, or 1 where memory is short; they never throw, and write only where told.
 #include "stages.hpp"
 #include "threads.hpp"
+#include "wrench_hull.hpp"
 
 using namespace graspd;
 
@@ -107,6 +108,18 @@ int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints,
         for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
             depth[row] = self_overlap(*p, joints + row * p->hand.joints, s);
         });
+    });
+}
+
+// The convex hull of joggled wrenches (count x 6, at most 256). `out`: distance and unit normal of the facet nearest the
+// origin, volume, and error of the planes, which is infinite where there is no hull.
+int32_t graspd_wrench_hull(int32_t count, const double* wrenches, double* out) {
+    return guarded([&] {
+        WrenchHull hull(wrenches, count);
+        out[8] = INFINITY;
+        if (!hull.build()) return;
+        out[0] = hull.nearest(out + 1);
+        out[7] = hull.volume(out + 8);
     });
 }
 }
