@@ -98,8 +98,8 @@ _ROWS = (
     ),
     Metric(
         "intersection_volume", "cm³", 1e6, lambda g: g.shared_volume,
-        "IV: volume shared by hand and object, in 1 mm voxels of a lattice fixed in the hand's base frame; an octree "
-        "finds them, so that no overlap is too small to be visited",
+        "IV: volume shared by hand and object, in 1 mm voxels of a lattice fixed in the hand's base frame; an overlap "
+        "thinner than a voxel may count as nothing",
     ),
     Metric(
         "contact_per_volume", "1/cm", 1e-2, _contact_per_volume,

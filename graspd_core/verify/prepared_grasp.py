@@ -220,8 +220,9 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
     """Volume of the hand inside the object [m³], counted in 1 mm voxels of a lattice fixed in the hand's base frame.
 
     An octree of each solid finds them: a cell is dropped when its centre is farther outside solid or object than its
-    half diagonal, and known to be wholly inside the object when it is that far inside; no overlap is too small or too
-    thin to be visited. Cells have integer coordinates in voxels, so that what solids share is counted once.
+    half diagonal, and known to be wholly inside the object when it is that far inside. A voxel counts by its centre, so
+    that an overlap thinner than a voxel may count as nothing. Cells have integer coordinates in voxels, so that what
+    solids share is counted once.
     """
     solids = _placed_solids(context.hand, placed)
     cells, which = _root_cells(solids, placed)
