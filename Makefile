@@ -51,7 +51,7 @@ cell: setup  ## a simulated arm, hand and camera empty a bin, in a browser; a li
 	$(RUN)/graspd cell --view --film results/cell.png
 
 BENCH := $(RUN)/graspd bench --processes 2
-PAGES := README.md $(addprefix docs/,bench.md hands.md clouds.md stress.md metrics.md usage.md arms.md)
+PAGES := README.md $(addprefix docs/,bench.md hands.md clouds.md stress.md metrics.md usage.md arms.md tables/bench.md tables/stress.md)
 
 bench: setup  ## every study: the charts and tables of README and docs/ anew (under 90 minutes on two cores; resumable)
 	@mkdir -p results
@@ -66,7 +66,7 @@ bench-rgbd: setup  ## the table of docs/clouds.md anew: shapes on a table, rende
 	$(BENCH) $(if $(FRAMES),frames --objects $(FRAMES) --out results/frames,rgbd) --readme docs/clouds.md
 
 bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of where methods stop working
-	$(BENCH) maps --chart docs/figures/bench --readme docs/stress.md
+	$(BENCH) maps --chart docs/figures/bench --readme docs/tables/stress.md
 
 soak: setup  ## ten minutes of mixed load on the node: memory, latencies, answers
 	$(RUN)/python benchmarks/soak.py --minutes 10

@@ -95,7 +95,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_000,
     "graspd_viewer": 2_300,
     "graspd_cell": 3_800,
-    "test": 32_425,
+    "test": 33307,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
@@ -327,7 +327,7 @@ def test_the_checker_sees_a_metaphor():
 
 
 def test_the_prose_is_plain():
-    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / "benchmarks").glob("*.py"), *sources()]
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *(ROOT / "benchmarks").glob("*.py"), *sources()]
     assert len(pages) > 200
     found = [line for page in pages for line in private_phrases(str(page.relative_to(ROOT)), page.read_text())]
     assert not found, "\n".join(found)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import re
 import shlex
 import subprocess
@@ -18,7 +19,10 @@ import pytest
 
 import graspd_core
 from graspd_core.cli import build_parser
+from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.optimize.plan_config import load_preset
+from graspd_core.verify.early_stop import CREEPING
 
 ROOT = Path(__file__).parents[1]
 
@@ -41,7 +45,8 @@ def test_the_reference_lists_every_public_name_once():
 
 README = (ROOT / "README.md").read_text()
 USAGE = (ROOT / "docs" / "usage.md").read_text()
-DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *sorted(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))]
+PAGES = sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/**/*.md"))
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *PAGES]
 
 
 @pytest.mark.parametrize("page", [README, USAGE], ids=["README", "usage"])
@@ -68,6 +73,21 @@ def test_links_lead_to_files(name: str):
     targets = re.findall(r"\]\(((?!https?:)[^)#]+)", document.read_text())
     missing = [target for target in targets if not (document.parent / target).exists()]
     assert not missing
+
+
+def test_the_numbers_of_the_pages_are_those_of_the_code():
+    method, metrics = ((ROOT / "docs" / f"{page}.md").read_text() for page in ("method", "metrics"))
+    settings, published = ClosedFormConfig(), Graspd2022Config()
+    names = {"task": "wrench_resistance", "self-collision": "self_collision"}
+    for title in ("task", "distance", "penetration", "self-collision", "posture", "obstacle"):
+        name = names.get(title, title)
+        weights = (f"{getattr(part, name):g}" for part in (settings.weights, settings.polish_weights))
+        assert re.search(rf"^\| {title} \|.*\| {', '.join(weights)} \|$", method, re.MULTILINE), title
+    task, limit, weights = published.constraints.task_bound, published.constraints.limit_bound, published.weights
+    assert f"L_task < C_task = {task:g},  L_limit < C_limit = {limit:g} rad" in method
+    assert f"min {weights.physics:g} L_phys + {weights.range:g} L_range + L_inter " in method
+    rest = f"{CREEPING.speed * 1e3:g} mm/s, {math.degrees(CREEPING.spin):.1f}°/s"
+    assert f"| at rest below | not asked | {rest} |" in metrics
 
 
 def test_presets_named_in_the_documents_exist(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import runpy
 import signal
 import subprocess
@@ -33,16 +34,25 @@ PAGES = {
     "rgbd": ("rgbd", "docs/clouds.md"),
     "cameras": ("cameras", "docs/clouds.md"),
     "piles": ("piles", "docs/clouds.md"),
-    "robust": ("robust", "docs/stress.md"),
+    "robust": ("robust", "docs/tables/stress.md"),
     "steered": ("steered", "docs/usage.md"),
-    "early": ("early-ends", "docs/bench.md"),
-    "throughput": ("throughput", "docs/bench.md"),
+    "early": ("early-ends", "docs/tables/bench.md"),
+    "throughput": ("throughput", "docs/tables/bench.md"),
     "reach": ("inverse-kinematics", "docs/arms.md"),
     "simulators": ("simulators", "docs/metrics.md"),
-    "stress": ("stress", "docs/stress.md"),
-    "decades": ("decades", "docs/stress.md"),
+    "stress": ("stress", "docs/tables/stress.md"),
+    "decades": ("decades", "docs/tables/stress.md"),
     "hands": ("bench-hands", "docs/hands.md"),
 }
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_the_page_of_a_study_has_its_section_and_is_filled(name: str):
+    marker, page = PAGES[name]
+    assert f"\n<!-- {marker}:begin -->\n" in (ROOT / page).read_text()
+    if STUDIES[name].usual:
+        makefile = (ROOT / "Makefile").read_text().partition("PAGES := ")[2].partition("\n")[0]
+        assert page.removeprefix("docs/") in re.findall(r"[\w/]+\.md", makefile)
 
 
 @pytest.mark.parametrize("name", [name for name, study in STUDIES.items() if study.usual])
