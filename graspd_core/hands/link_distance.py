@@ -133,8 +133,8 @@ def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
 
 
-# Distances at once; each takes some hundred bytes on the way.
-_AT_ONCE = 2**21
+# Distances at once, on a CPU and on an accelerator. Each takes some hundred bytes on the way.
+_AT_ONCE, _AT_ONCE_ELSEWHERE = 2**21, 2**25
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,8 @@ def solid_bound(
 
 
 def _in_parts(whole: Callable[[SE3, Tensor], Tensor], solids: int, links: SE3, points: Tensor) -> Tensor:
-    most = max(1, _AT_ONCE // max(1, solids * points.shape[1]))
+    at_once = _AT_ONCE if points.device.type == "cpu" else _AT_ONCE_ELSEWHERE
+    most = max(1, at_once // max(1, solids * points.shape[1]))
     if len(points) <= most:
         return whole(links, points)
     parts = [slice(i, i + most) for i in range(0, len(points), most)]

@@ -136,9 +136,12 @@ def assemble(
     Poses whose fingers press deep into the object are kept: some methods press deep and their grasps hold.
     """
     grasps: list[Grasp] = []
-    for first in range(0, len(poses.translation), _AT_ONCE):
-        rows = torch.arange(first, min(first + _AT_ONCE, len(poses.translation)))
-        some = staged(problem, hand, poses[rows.to(poses.translation.device)], config, stop)
+    device, total = poses.translation.device, len(poses.translation)
+    # An accelerator takes as long for one as for all of them.
+    at_once = _AT_ONCE if device.type == "cpu" else max(total, 1)
+    for first in range(0, total, at_once):
+        rows = torch.arange(first, min(first + at_once, total), device=device)
+        some = staged(problem, hand, poses[rows], config, stop)
         grasps += [grasp for grasp in finished(problem, hand, some) if grasp.score > _WORST]
     return _best_first(grasps)
 
