@@ -19,7 +19,7 @@ EXIT_FAULTS = 1
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("bench", help="measure presets and methods on objects; tables and charts")
+    parser = commands.add_parser("bench")
     parser.set_defaults(run=run)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or others of docs/bench.md")
     parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="the same")

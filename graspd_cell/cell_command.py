@@ -27,7 +27,7 @@ _PATIENCE = 20.0
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("cell", help="a simulated arm, hand and camera empty a bin")
+    parser = commands.add_parser("cell")
     parser.set_defaults(run=run)
     parser.add_argument("--arm", default="ur5e_like", metavar="NAME|PATH", help="default: ur5e_like")
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="default: allegro_right")

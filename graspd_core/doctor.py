@@ -131,7 +131,7 @@ def format_checks(checks: Iterable[Check]) -> str:
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    commands.add_parser("doctor", help="check the installation").set_defaults(run=lambda options: main())
+    commands.add_parser("doctor").set_defaults(run=lambda options: main())
 
 
 def main() -> int:

@@ -27,7 +27,7 @@ _LINES, _RECORDS = 10.0, 30.0
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("dataset", help="make a data set of grasps, or look at one (docs/dataset.md)")
+    parser = commands.add_parser("dataset")
     parser.set_defaults(run=run)
     parser.add_argument(
         "words",

@@ -25,7 +25,7 @@ _MOVED = 1e-4
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("import", help="grasps of others (.npy, .yaml, .json) into grasps.json")
+    parser = commands.add_parser("import")
     parser.set_defaults(run=run)
     parser.add_argument(
         "place", metavar="PATH", type=Path, help="DexGraspBench .npy, isaac_grasp .yaml, GraspGen .json"

@@ -27,7 +27,7 @@ _PATIENCE = 60.0
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("view", help="look at grasps in a browser, or plan there")
+    parser = commands.add_parser("view")
     parser.set_defaults(run=run)
     parser.add_argument(
         "path", metavar="PATH", type=Path, nargs="?", default=None,

@@ -7,12 +7,13 @@ by entry points of the group `graspd.commands`: view, bench, dataset, import and
 from __future__ import annotations
 
 import argparse
+import difflib
 import gc
 import importlib
 import sys
 import time
 from collections.abc import Sequence
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, version
 from typing import NoReturn
 
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
@@ -31,8 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own_process:
         gc.set_threshold(_YOUNG)
     try:
-        words = sys.argv[1:] if arguments is None else list(arguments)
-        options = build_parser(*words[:1]).parse_args(words)
+        words = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
+        options = (_overview() if words[0].startswith("-") else build_parser(words[0])).parse_args(words)
         options.began = began
         return int(options.run(options))
     except (GraspdError, OSError) as error:
@@ -63,23 +64,53 @@ _COMMANDS = {
     "hands": "graspd_core.cli.hands_command",
     "doctor": "graspd_core.doctor",
 }
+# What `graspd --help` says, which imports no command. Commands of other packages are listed by name.
+_SUMMARIES = {
+    "synthesize": "plan grasps on a mesh, a cloud or a boxed shape",
+    "replay": "plan grasps on the clouds or depth images of a rosbag2 recording",
+    "reconstruct": "turn a point cloud into a closed mesh",
+    "library": "keep verified grasps of known objects in a file",
+    "hands": "list the built-in hands, or inspect one",
+    "doctor": "check the installation",
+    "view": "show hands, grasps and results in a browser",
+    "bench": "measure presets and methods on objects, with tables and charts",
+    "dataset": "make a data set of grasps, or look at one",
+    "import": "turn grasps of other tools into grasps.json",
+    "cell": "let a simulated arm, hand and camera empty a bin",
+}
 
 
-def build_parser(command: str = "") -> argparse.ArgumentParser:
-    """Build the parser of `command` alone, or of all commands if there is no such command.
-
-    Raises ConfigError: the parser meets options that it does not know.
-    """
-    parser = _Parser(prog="graspd", description="Verified grasps for multi-fingered hands.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    modules = {command: _COMMANDS[command]} if command in _COMMANDS else _with_siblings(command)
-    for module in modules.values():
-        importlib.import_module(module).add_command(commands)
+def _overview() -> argparse.ArgumentParser:
+    """Build a parser that knows the commands by name only, for `--help` and `--version`."""
+    parser = _parser()
+    parser.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
+    commands = parser.add_subparsers(metavar="COMMAND", dest="command")
+    for name in _modules():
+        commands.add_parser(name, help=_SUMMARIES.get(name, ""))
     return parser
 
 
-def _with_siblings(command: str) -> dict[str, str]:
-    registered = {point.name: point.value for point in entry_points(group="graspd.commands")}
-    if command in SIBLINGS and command not in registered:
-        raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
-    return {command: registered[command]} if command in registered else _COMMANDS | registered
+def build_parser(command: str = "") -> argparse.ArgumentParser:
+    """Build the parser of `command`, or of all commands if there is no name.
+
+    Raises ConfigError: the command is unknown, or the parser meets options that it does not know.
+    """
+    parser, modules = _parser(), _COMMANDS if command in _COMMANDS else _modules()
+    if command and command not in modules:
+        if command in SIBLINGS:
+            raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
+        near = difflib.get_close_matches(command, modules, 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(modules)}"
+        raise ConfigError(f"unknown command {command!r}; {hint}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    for name in [command] if command else modules:
+        importlib.import_module(modules[name]).add_command(commands)
+    return parser
+
+
+def _parser() -> _Parser:
+    return _Parser(prog="graspd", description="Verified grasps for multi-fingered hands.")
+
+
+def _modules() -> dict[str, str]:
+    return _COMMANDS | {point.name: point.value for point in entry_points(group="graspd.commands")}

@@ -19,7 +19,7 @@ from graspd_core.hands.model import HandModel, all_joint_names
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    hands = commands.add_parser("hands", help="list the built-in hands, or inspect one")
+    hands = commands.add_parser("hands")
     hands.set_defaults(run=run)
     actions = hands.add_subparsers(metavar="inspect", dest="action")
     inspect = actions.add_parser("inspect", help="the tree, joints, palm and postures of a hand")

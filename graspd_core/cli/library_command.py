@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("library", help="verified grasps of known objects, kept in a file")
+    parser = commands.add_parser("library")
     actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
     build = actions.add_parser("build", help="plan for meshes and add what holds; what is there already is kept")
     build.set_defaults(run=_build)

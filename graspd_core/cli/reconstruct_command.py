@@ -21,7 +21,7 @@ from graspd_core.cli.running import EXIT_OK
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("reconstruct", help="turn a point cloud into a closed mesh")
+    parser = commands.add_parser("reconstruct")
     parser.set_defaults(run=run)
     parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="cloud, depth image; of a bag its first cloud")
     add_camera_option(parser)

@@ -55,7 +55,7 @@ class _Job:
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("replay", help="plan grasps on the clouds or depth images of a rosbag2 recording")
+    parser = commands.add_parser("replay")
     parser.set_defaults(run=run)
     parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
     add_bag_options(parser)

@@ -37,7 +37,7 @@ _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 
 def add_command(commands: Any) -> None:
     """Add this command to the parser's."""
-    parser = commands.add_parser("synthesize", help="plan grasps on a mesh, a cloud or a boxed shape")
+    parser = commands.add_parser("synthesize")
     parser.set_defaults(run=run)
     parser.add_argument("object", metavar="OBJECT", help="mesh, cloud or depth image, or shape:NAME")
     add_planning_options(parser)

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -99,13 +100,32 @@ def test_an_unwritable_result_is_refused_before_the_run(
         assert culprit in line
 
 
-def test_no_command_is_bad_input_and_help_is_not(capsys: pytest.CaptureFixture[str]):
-    assert main([]) == EXIT_BAD_INPUT
-    assert "COMMAND" in the_line(capsys)
+@pytest.mark.parametrize(
+    ("words", "said"), [([], "reconstruct"), (["--help"], "doctor"), (["--version"], "graspd 0."),
+                        (["synthesize", "--help"], "--friction")]
+)  # fmt: skip
+def test_help_and_version_are_no_errors(capsys: pytest.CaptureFixture[str], words: list[str], said: str):
     with pytest.raises(SystemExit) as left:
-        main(["synthesize", "--help"])
+        main(words)
     assert left.value.code == 0
-    assert "--friction" in capsys.readouterr().out
+    assert said in capsys.readouterr().out
+
+
+def test_an_unknown_command_is_named_with_the_one_that_was_meant(capsys: pytest.CaptureFixture[str]):
+    assert main(["synthesise"]) == EXIT_BAD_INPUT
+    assert the_line(capsys) == "graspd: unknown command 'synthesise'; did you mean 'synthesize'?\n"
+    assert main(["frobnicate"]) == EXIT_BAD_INPUT
+    assert "valid: synthesize, replay, " in the_line(capsys)
+
+
+def test_the_overview_names_every_command_and_imports_none(capsys: pytest.CaptureFixture[str]):
+    code = "import sys, graspd_core.cli as c; c._overview(); print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    out = capsys.readouterr().out
+    for point in entry_points(group="graspd.commands"):
+        assert f"    {point.name} " in out or f"    {point.name}\n" in out
 
 
 def test_hands_lists_the_boxed_hands(capsys: pytest.CaptureFixture[str]):
