@@ -33,10 +33,10 @@ _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 
 
 def read_pickle(path: Path) -> Any:
-    """What a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+    """Return what a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
     Raises:
-        HandError: no such file, too large, not a pickle, or one that names anything but `ADMITTED`; names the culprit.
+        HandError: no such file, too large, not a pickle, or it names anything but `ADMITTED`.
     """
     try:
         return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")
@@ -45,12 +45,12 @@ def read_pickle(path: Path) -> Any:
 
 
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
-    """The dense array of numbers that a value of the file stands for, native byte order.
+    """Return the dense array of numbers that a value of the file stands for.
 
     `depth` counts the expressions around it.
 
     Raises:
-        ValueError: it stands for none; says why.
+        ValueError: the value holds no numbers. Says why.
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
@@ -151,7 +151,7 @@ def read_mano(path: Path) -> ManoData:
     """Read and check a MANO file (.pkl), as downloaded.
 
     Raises:
-        HandError: it cannot be read, asks for code to be run, or an entry is missing or wrong; names file and entry.
+        HandError: it cannot be read, asks for code to be run, or has a missing or wrong entry. Names file and entry.
     """
     content = read_pickle(path)
     if not isinstance(content, Mapping):
@@ -185,7 +185,7 @@ def read_mano(path: Path) -> ManoData:
 
 
 def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An entry as float64 of a shape in which None is any positive number."""
+    """Return an entry as float64. A None in `shape` stands for any positive number."""
     if key not in content:
         known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
         raise HandError(f"{path}: {key} is missing; the file has {known}")
