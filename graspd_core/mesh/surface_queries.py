@@ -1,8 +1,10 @@
-"""Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64. No grid, no gradient.
+"""Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64.
 
-Signed distances are what metrics are measured with: negative where the generalised winding number (Barill et al. 2018)
-says inside. It needs no closed, oriented or single surface: open, overlapping, doubled and inverted ones have an inside
-too. Rays alone go by Open3D (Embree), which takes half a second to import: no plan on a mesh needs it.
+No grid, no gradient.
+
+Signed distances, which metrics use, are negative inside by the generalised winding number (Barill et al. 2018). Open,
+overlapping, doubled and inverted surfaces have an inside too. Only rays use Open3D (Embree), which takes half a second
+to import. No plan on a mesh needs them.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from graspd_core.types import TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class DistanceQuery:
-    """A mesh prepared for questions of distance; safe to ask from several threads."""
+    """A mesh prepared for queries of distance, safe to use from several threads."""
 
     surface: Surface
     tree: WindingTree
@@ -33,7 +35,7 @@ def make_distance_query(mesh: TriangleMesh) -> DistanceQuery:
 def signed_distance(
     query: DistanceQuery, points: Float[np.ndarray, "n 3"], *, reach: float = np.inf
 ) -> Float[np.ndarray, "n"]:
-    """Distance [m] to the nearest triangle, negative where the winding number says inside.
+    """Return the distance [m] to the nearest triangle, negative inside by the winding number.
 
     Points farther than `reach` [m] from the bounding box get their distance to the box, a lower bound above `reach`.
     """
@@ -45,12 +47,12 @@ def signed_distance(
 
 
 def inside(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Whether the winding number says inside; needs no distance."""
+    """Return which points are inside by the winding number, without a distance."""
     return is_inside(query.tree, points)
 
 
 def unsigned_distance(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Distance [m] to the nearest triangle on either side; needs no winding number."""
+    """Return the distance [m] to the nearest triangle on either side, without a winding number."""
     return surface_distance(query.surface, points)
 
 
@@ -93,7 +95,7 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
 
 
 def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """Whether points lie inside: a winding number beyond one half, of either sign; outside the bounding box, never."""
+    """Return which points lie inside: a winding number beyond one half, of either sign, within the bounding box."""
     inside = np.all((points >= tree.low) & (points <= tree.high), axis=1)
     asked = points[inside] - tree.centre
     number = _numbers(tree, asked, _COARSE)
@@ -104,7 +106,7 @@ def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[
 
 
 def winding_inside(mesh: TriangleMesh, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """`is_inside` for one set of points; for several, keep the mesh's tree."""
+    """Return `is_inside` for one set of points. For several, keep the mesh's tree."""
     return is_inside(make_winding_tree(mesh), points)
 
 
@@ -124,7 +126,7 @@ class Surface:
 
     Attributes:
         mesh: its arrays as libigl takes them: contiguous, float64 [m] and int64.
-        normals: of the faces, unit; zero where a face has no area.
+        normals: of the faces, unit, zero for a face without area.
         hierarchy: the `igl.AABB`.
     """
 
@@ -147,14 +149,14 @@ def make_surface(mesh: TriangleMesh) -> Surface:
 
 
 def surface_distance(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Unsigned distance to the nearest triangle [m]; infinite for a point that is not finite."""
+    """Return the unsigned distance to the nearest triangle [m], infinite for a point that is not finite."""
     return np.sqrt(_nearest(surface, points)[0])
 
 
 def closest_points(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The closest surface points [m] and the unit normals of their faces; NaN of points that are not finite."""
+    """Return the closest surface points [m] and the unit normals of their faces, NaN for points that are not finite."""
     squared, faces, closest = _nearest(surface, points)
     # libigl leaves the face and the point unset where no distance is finite.
     found = np.isfinite(squared)
@@ -176,10 +178,9 @@ _AROUND = _AROUND[np.abs(_AROUND).any(1)] / np.linalg.norm(_AROUND[np.abs(_AROUN
 def pressed_points(
     surface: Surface, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The surface points next to `points` [m], and outward unit normals of the surface there, as near to `normals` as
-    can be.
+    """Return the closest surface points [m], and the outward unit normals there that are nearest to `normals`.
 
-    On a face this is the face's own normal. On an edge or a corner every direction between those of its faces is one.
+    On a face this is the face's own normal. On an edge or a corner every direction between those of its faces counts.
     """
     closest, own = closest_points(surface, points)
     around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]
@@ -201,7 +202,10 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Of rays from the origin: how many `directions` long until they hit (infinite: never), face index, unit normal."""
+    """Cast rays from the origin.
+
+    Returns how many `directions` long they are (infinite: no hit), faces and unit normals.
+    """
     import open3d as o3d
 
     # Embree counts in float32: about the mesh's centre it need not be near the origin.
@@ -217,7 +221,7 @@ def first_hits(
 def _nearest(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Integer[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Squared distance [m²], face and point of the surface nearest to each point."""
+    """Return squared distance [m²], face and point of the surface nearest to each point."""
     vertices, faces = surface.mesh.vertices, surface.mesh.faces
     points = np.ascontiguousarray(points, dtype=float)
     # One call at least: without points, too, the arrays have their shapes.
