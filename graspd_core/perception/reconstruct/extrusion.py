@@ -1,4 +1,4 @@
-"""What joins an object to the support it stands on: walls beneath the outline seen from above, skirt and base."""
+"""Surfaces between an object and its support: walls beneath the outline seen from above, skirt and base."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ MIN_ENCLOSED_SHARE = 0.6
 
 
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Walls from the outline of what was seen from above, down to the support.
+    """Return walls from the outline of what was seen from above, down to the support.
 
-    Only beneath outlines that are proven: outwards of them the cameras saw nothing; and only walls that they do not
-    contradict.
+    An outline counts only if the cameras saw nothing beyond it. Walls that they contradict are left out.
     """
     from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
     from scipy.spatial import KDTree
@@ -67,12 +66,12 @@ def _contradicted(
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the surfels, and where the object stands what joins it to the support."""
+    """Return the surfels, with their connection to the support if the object stands."""
     return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """What joins walls that end just above the support to it, and the base between them."""
+    """Return the walls between the lowest seen points and the support, and the base between them."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
@@ -92,9 +91,10 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Walls beneath the outlines of what was seen high above the support, where something hides what it rests on.
+    """Return walls beneath the outlines of an object that was seen only high above the support.
 
-    The outline of all goes down to the support, and what is high above the rest, as a bottle's cap, to the rest.
+    The outline of all points goes down to the support. A part high above the rest, as a bottle's cap, goes down to the
+    rest.
     """
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
@@ -109,7 +109,7 @@ def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 def _walls(
     surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
 ) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
-    """Walls beneath the outline seen from above, down to the height `bottom` [m], and where they stand."""
+    """Return walls beneath the outline seen from above, down to the height `bottom` [m], and their feet."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(surfels.points[:, :2])
@@ -132,7 +132,7 @@ def _walls(
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
-    """The support within the feet's outline, facing down, where it is hidden."""
+    """Return the support within the feet's outline, facing down, where it is hidden."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(feet)
