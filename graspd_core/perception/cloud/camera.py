@@ -273,7 +273,7 @@ def depth_from_compressed(data: memoryview, told: str) -> DepthImage:
 
     Args:
         data: the message's bytes.
-        told: its `format`, as "16UC1; compressedDepth png".
+        told: its `format`, an encoding and "compressedDepth png".
 
     Raises:
         CloudError: a format that is no depth, or bytes that are not what it says.
