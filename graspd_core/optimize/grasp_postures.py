@@ -327,7 +327,7 @@ class Squeeze:
     Attributes:
         joints: position targets [rad] or [m].
         forces: on the object, one per link [N].
-        imbalance: norm of the net wrench over the sum of forces; one where there is no balance to be had.
+        imbalance: norm of the net wrench over the sum of forces, one without a balance.
     """
 
     joints: Float[Tensor, "batch joints"]

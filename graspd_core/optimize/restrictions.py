@@ -34,7 +34,7 @@ class Roll:
 
     Attributes:
         side: unit vector square to the hand's approach, base frame.
-        zero: unit vector that `side` points along at a roll of 0, once made square to the approach; object frame.
+        zero: unit vector that `side` points along at a roll of 0, once made square to the approach, object frame.
         angle: wanted, right-handed about the approach [rad].
         tolerance: either way [rad].
     """
@@ -57,10 +57,10 @@ class Aim:
     """Where starts are wanted.
 
     Attributes:
-        direction: unit direction of approach, object frame; None: any.
+        direction: unit direction of approach, object frame. None: any.
         angle: greatest angle between it and a hand's approach [rad].
-        roll: about the approach; None: any.
-        places: points of the surface that the palm is to face [m]; None: any.
+        roll: about the approach. None: any.
+        places: points of the surface that the palm is to face [m]. None: any.
     """
 
     direction: Float[np.ndarray, "3"] | None = None
