@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-PROBE_TIMEOUT = 60.0  # seconds; a cold disk takes several for torch or Open3D
+PROBE_TIMEOUT = 60.0  # Seconds. A cold disk takes several for torch or Open3D.
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
 # distribution: module

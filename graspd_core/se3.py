@@ -134,7 +134,7 @@ def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype)
 
 def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
     """Return rotations that turn unit vector `source` onto each unit target (any roll), through a Householder pair."""
-    # Two reflections make a rotation; the first maps source to its mirror, the second maps that to the target.
+    # Two reflections make a rotation. The first maps source to its mirror, the second maps that to the target.
     helper = torch.eye(3, dtype=targets.dtype)[source.abs().argmin()]
     middle = torch.linalg.cross(source, helper)
     middle = middle / middle.norm()

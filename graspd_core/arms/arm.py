@@ -85,7 +85,7 @@ def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, 
     along = local @ axis
     away = np.linalg.norm(local - np.outer(along, axis), axis=1)
     radius = float(away.max())
-    # The caps reach past the ends; a point beside the axis needs them to reach less far than one on it.
+    # The caps reach past the ends. A point beside the axis needs them to reach less far than one on it.
     slack = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     low, high = float((along + slack).min()), float((along - slack).max())
     if low > high:

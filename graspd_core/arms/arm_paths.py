@@ -64,7 +64,7 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
 
 # No joint moves farther between two waypoints [rad].
 LARGEST_JUMP = 0.2
-# Starts of each grasp, of which so many postures are followed along the way; steps of the one and of the other.
+# Starts of each grasp, and postures of each that are followed along the path. Steps of inverse kinematics for both.
 _STARTS, _FOLLOWED = 8, 2
 _STEPS, _WAY_STEPS = 8, 5
 # Joint values nearer than this are one posture [rad].

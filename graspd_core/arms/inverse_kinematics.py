@@ -59,7 +59,7 @@ _WEIGHTS = [1.0, 1.0, 1.0, RADIAN, RADIAN, RADIAN]
 _DAMPING, _LEAST_DAMPING = 0.05, 1e-7
 # No joint turns farther in one step [rad].
 _LONGEST_STEP = 0.6
-# Entries of a rotation matrix whose differences are the axis; a sine that rounding could make.
+# Entries of a rotation matrix whose differences are the axis, and a sine that rounding could make.
 _ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-7
 _HALF_TURN = (torch.pi, 0.0, 0.0)
 

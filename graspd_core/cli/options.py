@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Metrics in the summary of a run.
 _SHOWN = ("payload", "least_friction", "penetration", "contact_area", "epsilon", "robustness")
-# Grasps that it lists; the others it counts.
+# Grasps that it lists. It counts the others.
 _FIRST = 3
 
 

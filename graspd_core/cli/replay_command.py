@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
                 result = _planned(job, options, hand, config, {**request, "settings": settings, "stop": interrupt.came})
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
-                # An empty table is an answer; a cloud that cannot be used is bad input.
+                # An empty table is an answer. A cloud that cannot be used is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
             print(_outcome_line(job, result, options.count), flush=True)

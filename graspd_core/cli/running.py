@@ -35,7 +35,7 @@ class Interrupt:
         self._event = threading.Event()
 
     def __enter__(self) -> Interrupt:
-        # Signals belong to the main thread; in another one, who runs us keeps them.
+        # Signals belong to the main thread. In another thread, the caller keeps them.
         self._mine = threading.current_thread() is threading.main_thread()
         if self._mine:
             self._before = {number: signal.signal(number, self._handle) for number in _ENDS}
@@ -157,7 +157,7 @@ def process_began() -> float:
     """Return the start of this process, a `time.perf_counter()` value. If the system does not say it, now."""
     now = time.perf_counter()
     try:
-        # The 22nd field; the second, the program's name in brackets, may hold blanks.
+        # The 22nd field. The second, the program's name in brackets, may hold blanks.
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
     except (OSError, AttributeError, ValueError, IndexError):

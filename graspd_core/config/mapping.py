@@ -92,7 +92,7 @@ def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
 
 
-# Entries of a mapping once what it merges is in it; each `<<` may take in all of another mapping, twice and again.
+# Entries of a mapping once what it merges is in it. Each `<<` may take in all of another mapping, twice and again.
 _MOST_MERGED = 10_000
 
 

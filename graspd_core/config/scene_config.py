@@ -10,7 +10,7 @@ from typing import Any, Literal
 from graspd_core.config.mapping import from_mapping, read_yaml
 from graspd_core.errors import ConfigError
 
-# Below these nothing is left to work with; every other number is above zero.
+# Below these nothing is left to work with. Every other number is above zero.
 _MINIMA = {"max_voxels": 1000, "neighbours": 4, "max_points": 1000, "max_faces": 100}
 
 

@@ -15,7 +15,7 @@ from graspd_core.hands.surface_points import surface_points
 # Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
 # the fourth leave a half, three around a circle or two against one leave a third or less.
 _ALIKE = 0.42
-# Directions within this cosine of each other are the same; a thumb's are not those of the fingers.
+# Directions within this cosine of each other are the same. A thumb's are not those of the fingers.
 _SAME_WAY = 0.7
 # From this cosine to the normal of a plane on, a finger stands up from it.
 _UPRIGHT = 0.5

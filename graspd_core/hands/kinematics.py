@@ -21,7 +21,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh, joined
 
-# Joint values of one posture; points [m] and the link of each; `T_base_link` of every link, turns and origins [m].
+# Joint values of one posture. Points [m] and their links. `T_base_link` of every link: rotations and origins [m].
 JointValues = Float[np.ndarray, "joints"]
 LinkPoints = Float[np.ndarray, "points 3"]
 LinkNumbers = Int[np.ndarray, "points"]

@@ -24,7 +24,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.se3 import SE3, safe_norm
 
-# Points, and a distance of each; a size of a solid, one for all points or one for each [m].
+# Points and their distances. A size of a solid, one for all points or one for each [m].
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
 _Length = float | Float[Tensor, "*#batch"]
 # Primitives of which planes and bounds are remembered: those of the most crowded hand.
@@ -130,7 +130,7 @@ def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
 
 
-# Distances at once; each takes some hundred bytes on the way.
+# Distances at once. Each takes some hundred bytes on the way.
 _AT_ONCE = 2**21
 
 

@@ -20,9 +20,9 @@ from graspd_core.hands.link_distance import depth_inside
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import dense_samples, kept, parent_groups
 
-# The most spheres of a rigid group of links, and of a hand; one of more groups than that has one for each.
+# The most spheres of a rigid group of links, and of a hand. One of more groups than that has one for each.
 MOST_OF_GROUP, MOST_OF_HAND = 64, 160
-# The finest radius that solids are filled with [m]; they may themselves be smaller.
+# The finest radius that solids are filled with [m]. They may themselves be smaller.
 _FINEST = 0.003
 # What the spheres of a crowded hand leave bare where there are enough, and a disc around its one sphere [m].
 _BARE, _RIM = 0.001, 0.01

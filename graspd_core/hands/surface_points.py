@@ -163,7 +163,7 @@ _MOST_DRAWN = 200
 _MOST_FEATURES = 20_000
 # Of the candidates, the most that may be corners chosen beforehand.
 _CORNER_SHARE = 0.3
-# Spacing of candidates is inversely proportional to these; a surface that faces the grasp has 1.
+# Spacing of candidates is inversely proportional to these. A surface that faces the grasp has 1.
 _TIP_WEIGHT, _EDGE_WEIGHT, _BACK_WEIGHT = 2.0, 1.25, 0.5
 
 

@@ -24,10 +24,10 @@ from graspd_core.mesh.sdf import GridSDF
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
-# Points and hull samples that a bulge is measured on; the parts themselves are hulls of all their points.
+# Points and hull samples that a bulge is measured on. The parts themselves are hulls of all their points.
 TRIAL_POINTS, TRIAL_SAMPLES = 320, 100
 # Cuts lie between so many slices of equal thickness. They are compared on segments between pairs of points, given as
-# shares of the list of points that cover all pairs evenly (Roberts' sequence); the best are compared by their hulls.
+# shares of the list of points that cover all pairs evenly (Roberts' sequence). The best are compared by their hulls.
 SLICES, SHORTLIST = 12, 3
 PAIRS = np.modf(np.arange(1, 2001)[:, None] * [0.7548776662, 0.5698402910])[0]
 # Two clusters are compared on the segments between all pairs of so many points of each.
@@ -137,7 +137,7 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     share = np.arange(1, SLICES) / SLICES
     # Where no segment shows anything, halves are as good as any.
     left = left_below / np.maximum(below, 1) + left_above / np.maximum(above, 1) + 1e-9 * np.abs(share - 0.5)
-    # Fewer than four points a side span no hull; a side thinner than the overlap would get the other side back.
+    # Fewer than four points a side span no hull. A side thinner than the overlap would get the other side back.
     thin = span[:, None] * np.minimum(share, 1 - share) < 2 * OVERLAP
     left[(below < 4) | (above < 4) | thin] = np.inf
     best = left.argmin(1)

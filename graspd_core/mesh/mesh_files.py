@@ -81,7 +81,7 @@ _OTHERS = (
 )
 # What is looked at of either end [bytes].
 _LOOK = 4096
-# A binary STL: its header with the number of triangles, and each triangle [bytes]; more of them nobody writes.
+# A binary STL: its header with the number of triangles, and each triangle [bytes]. Nobody writes more triangles.
 _HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
 
 
@@ -134,7 +134,7 @@ def _is_number(word: str) -> bool:
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
 
 # Points for the volume of a mesh that is not one closed body: about 1 % of volume, 0.3 s. A Sobol sequence, because a
-# lattice aligned with a wall counts its layers wrong; it is evenest at powers of two.
+# lattice aligned with a wall counts its layers wrong. It is evenest at powers of two.
 SPREAD_POINTS = 2**15
 
 
@@ -222,7 +222,7 @@ def check_mesh(
         warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
-    # Simplifying can tear a surface; that is no fault of the input, and the winding number bears it.
+    # Simplifying can tear a surface. That is no fault of the input, and the winding number bears it.
     if not topology.is_closed(clean) and not topology.is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
     return clean, (*_doubted_size(clean, source, scale), *warnings)

@@ -34,7 +34,7 @@ PADDING = 0.015
 
 # Nodes up to this many cells from the surface have the exact distance: all eight nodes of every cell that it crosses.
 BAND = 3**0.5
-# Nodes a side of a block, of which the middle one is exact; how often nodes look at their neighbours' closest points.
+# Nodes a side of a block, whose middle node is exact. Sweeps in which nodes look at their neighbours' closest points.
 _BLOCK, _SWEEPS = 3, 3
 
 
@@ -142,7 +142,7 @@ def sample_sdf(
     channels = sampled.reshape(4, -1)
     phi, gradient = channels[0].reshape(points.shape[:-1]), channels[1:].T.reshape(points.shape)
     # Inside the grid `from_surface` is the gradient times a positive number, so the two lengths cancel exactly
-    # and no branch is needed. Any positive reach does where φ is not; a millimetre keeps float32 clear of zero.
+    # and no branch is needed. Any positive reach does where φ is not. A millimetre keeps float32 clear of zero.
     reach = phi.clamp_min(1e-3)
     from_surface = (unit - clamped) * half + reach[..., None] * gradient
     length = safe_norm(from_surface)

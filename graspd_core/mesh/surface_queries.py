@@ -86,7 +86,7 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
     import igl
 
     low, high, centre = mesh.vertices.min(0), mesh.vertices.max(0), mesh.vertices.mean(0)
-    # Centred, because the tree's expansion loses digits far from the origin; cut up, because the tree sums every face
+    # Centred, because the tree's expansion loses digits far from the origin. Cut up, because the tree sums every face
     # that is long for its distance, which makes slivers ten times slower.
     cut = cut_long_faces(TriangleMesh(mesh.vertices - centre, mesh.faces), float((high - low).max()) / 10)
     tree = igl.FastWindingNumberBVH()

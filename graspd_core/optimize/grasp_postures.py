@@ -47,7 +47,7 @@ _SETTLING = structs.Pregrasp(
 _CONE_EDGES = 8
 # Weights of an even spread of the load and of normal forces that sum to one, against balance.
 _RIDGE, _SUM = 0.5, 10.0
-# Newton's method ends at this squared slope; it takes ten steps at most, but for what is not a number.
+# Newton's method ends at this squared slope. It takes ten steps at most, but for what is not a number.
 _CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
 

@@ -21,7 +21,7 @@ from graspd_core.optimize.loop import Positions, Values
 from graspd_core.perception.scene import Obstacle, Scene, moved_grasp, moved_obstacle
 from graspd_core.types import Grasp
 
-# Initial poses as rows: origins of the base [m], unit quaternions wxyz, joint values; and which of them are allowed.
+# Initial poses as rows: origins of the base [m], unit quaternions wxyz, joint values, and which of them are allowed.
 Places = Float[np.ndarray, "batch 3"]
 Turns = Float[np.ndarray, "batch 4"]
 JointRows = Float[np.ndarray, "batch joints"]

@@ -35,7 +35,7 @@ _TARGET_SAMPLES = 2000
 # about a ball has half of it, a box a quarter too large every way still 0.5, things that only touch have nothing.
 _SAME = 0.3
 _OVERLAP_SAMPLES = 4000
-# Of what is seen of a shape near the object [m²]; and the least and most points of one.
+# Area of a sample of a shape near the object [m²], and the least and most samples of one.
 _AREA_OF_A_SAMPLE = 1e-4
 _FEWEST, _MOST = 200, 4000
 _CORNERS = 200

@@ -25,9 +25,9 @@ from graspd_core.mesh.topology import packed_rows, scaled_normals
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Verdict
 
-# The roughest surface that a trial believes in; see `verify.world.at_friction`.
+# The roughest surface that a trial believes in. See `verify.world.at_friction`.
 _MOST_FRICTION = 0.6
-# Points of the surface; beside them go the middles of all faces, so that no small handle is missed.
+# Points of the surface. Beside them go the middles of all faces, so that no small handle is missed.
 _SAMPLES = 4000
 # Directions that the object's width is looked at along.
 _DIRECTIONS = 400

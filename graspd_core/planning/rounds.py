@@ -34,7 +34,7 @@ from graspd_core.verify.verification import (
     surest_first,
 )
 
-# What torch says where it finds no memory, on the processor and on CUDA; it raises a RuntimeError for both.
+# What torch says where it finds no memory, on the processor and on CUDA. It raises a RuntimeError for both.
 _TORCH_SAYS = ("can't allocate memory", "not enough memory", "out of memory")
 
 

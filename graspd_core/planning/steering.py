@@ -58,7 +58,7 @@ def untouched_part(scene: Scene, region: Region) -> Obstacle:
     )
 
 
-# A contact may lie so far outside the region [m]; rounding of angles [rad].
+# A contact may lie so far outside the region [m]. Angles are rounded by this [rad].
 CONTACT_TOLERANCE = 0.005
 _ROUNDING = 1e-6
 # Points of the surface that tell what part of the object lies in a region, and how many of those are aimed at.

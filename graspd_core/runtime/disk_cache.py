@@ -105,7 +105,7 @@ def cache_path(key: str) -> Path | None:
 
 def _read(path: Path) -> Arrays | None:
     try:
-        # Opening by hand closes the file whatever happens; npz members carry a CRC, so a damaged one is noticed.
+        # Opening by hand closes the file whatever happens. Members of npz carry a CRC, so a damaged one is noticed.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         os.utime(path)

@@ -174,7 +174,7 @@ def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: 
     except _RefusedError as refused:
         told = f"asks for {refused}, which a {what} does not need: refused, and nothing of it was run"
         raise ValueError(told) from None
-    # A file that is no pickle fails in whatever way its bytes happen to; the file is the culprit.
+    # A file that is no pickle fails in whatever way its bytes happen to. The file is the culprit.
     except Exception as error:
         told = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ValueError(f"not the pickle of a {what}: {told[:200]}") from error

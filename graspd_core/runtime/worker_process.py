@@ -152,7 +152,7 @@ class WorkerProcess:
         path = [entry for entry in sys.path if isinstance(entry, str)]
         names = {"module": __name__, "modules": self._modules, "parent": self._parent}
         program = _CHILD.format(path=path, pipe=theirs.fileno(), **names)
-        # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
+        # Ctrl-C reaches every process of the terminal. This one ends when its parent does. It is born with the signal
         # blocked, since it needs a second for its imports before it could ignore it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from graspd_core.verify.world import Protocol
 
-# Steps from one look at a hold to the next; divides `CHECK_EVERY` and every number of steps in a rule.
+# Steps from one look at a hold to the next. This divides `CHECK_EVERY` and every number of steps in a rule.
 LOOK_EVERY = 5
 # Steps from one check of the limits to the next.
 CHECK_EVERY = 25
@@ -42,11 +42,11 @@ class StopRule:
 
 FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
 SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
-# Objects begin to slip as late as 1.9 s; what moves at 1 mm/s until then may let go at once.
+# Objects begin to slip as late as 1.9 s. What moves at 1 mm/s until then may let go at once.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
 # Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
 _FEWEST_FINGERS = 3
-# The least impedance ratio and sliding friction of each, CREEPING below them all; measured at 0.6 and 0.3.
+# The least impedance ratio and sliding friction of each, CREEPING below them all. Measured at 0.6 and 0.3.
 _RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
 

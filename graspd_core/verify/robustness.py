@@ -94,7 +94,7 @@ def results_in_order(
 
 # Of the friction that the scene says.
 _LESS_FRICTION = 2 / 3
-# Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
+# Places that the object may be at instead, the same for all grasps. No benchmark tries them.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
 # How many places must hold a grasp whose trials ask for more than most things weigh, and how many other shapes.
 _LEAST_PLACES, LEAST_SHAPES = 2, 2
@@ -105,7 +105,7 @@ _POLL = 0.02
 # Name of the threads that make other shapes.
 _SHAPES = "graspd-shapes"
 
-# Of trials under some hypotheses, in their order; None where there was none. And how a grasp goes through them.
+# Results of some checks in order, None for an impossible one. And a function that tries a grasp under a stage.
 Results = Generator[TrialResult | None]
 HoldUnder = Callable[["HypothesisStage", Grasp, StopHook], Results]
 

@@ -304,7 +304,7 @@ def rank_by_robustness(
     """
     verified = [grasp for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
     measured: list[Grasp] = []
-    # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
+    # The same errors for all, so that none is ranked by its luck. No benchmark uses them.
     errors = pose_errors((_NOISE, seed), config.trials)
     protocol = replace(context.trials.protocol, hold_time=config.hold_time)
 

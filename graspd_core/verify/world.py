@@ -363,7 +363,7 @@ def build_world(
     """
     import mujoco
 
-    # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
+    # Otherwise MuJoCo writes a log file into the working directory. The trial reads the counts of warnings itself.
     mujoco.set_mju_user_warning(lambda message: None)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False

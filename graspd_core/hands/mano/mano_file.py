@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from graspd_core.errors import HandError
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, is_shape, load_inert, makers, read_bounded
 
-# A sparse matrix's state holds data, indices, indptr and the shape. A leaf of chumpy's has the value `x`; a selection
+# A sparse matrix's state holds data, indices, indptr and the shape. A leaf of chumpy's has the value `x`. A selection
 # is `a` flattened, taken at `idxs`, in `preferred_shape`. Python 2 and 3, old and new scipy have different names for
 # the same.
 ADMITTED = NUMPY_NAMES | makers(
@@ -28,7 +28,7 @@ ADMITTED = NUMPY_NAMES | makers(
     ("rebuilt", ("copy_reg", "copyreg"), ("_reconstructor",)),
     ("object", ("__builtin__", "builtins"), ("object", "set", "frozenset")),
 )
-# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
+# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions. MANO needs 12448 and 2.
 _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 
 
@@ -111,7 +111,7 @@ def _entry(value: Inert, key: str) -> Any:
     return value.state[key]
 
 
-# The sixteen bodies, each named after the bone that it moves; 1 is the knuckle, 3 the last joint. Not the order of a
+# The sixteen bodies, each named after the bone that it moves. 1 is the knuckle, 3 the last joint. Not the order of a
 # hand: the little finger comes before the ring finger.
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 BODIES = ("wrist", *(f"{finger}{number}" for finger in FINGERS for number in (1, 2, 3)))

@@ -50,8 +50,8 @@ HINGES = ("flexion", "abduction", "twist")
 # How far in front of the palm the thumb's tip goes when the thumb is bent [m].
 _OPPOSITION = 0.05
 # Limits of flexion, abduction and twist [deg], from the flat hand. Fingers: Lin, Wu and Huang 2000 (flexion 0 to 90 at
-# the knuckle, 0 to 110, 0 to 90; abduction ±15), knuckles also 20 backwards (Norkin and White: 45 passively). Thumb:
-# flexion of knuckle and tip 50 and 80 (American Academy of Orthopaedic Surgeons 1965); saddle joint 53 of flexion, 42
+# the knuckle, 0 to 110, 0 to 90, abduction ±15), knuckles also 20 backwards (Norkin and White: 45 passively). Thumb:
+# flexion of knuckle and tip 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Saddle joint 53 of flexion, 42
 # of abduction and 17 of twist in all (Cooney et al. 1981), about MANO's rest, which is in their middle. What is no
 # degree of freedom in the literature keeps a little play, as living joints do.
 _LIMITS_DEG = {

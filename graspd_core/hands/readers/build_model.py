@@ -31,7 +31,7 @@ _LARGEST = 1e6
 _STILL = 1e-6
 # An angle beyond this, up to a whole circle in degrees, may be meant in degrees [rad].
 _FULL_TURN, _CIRCLE = 2 * np.pi + 0.05, 360.5
-# Wider limits than this say nothing [rad]; a slide that is longer is in another unit [m].
+# Wider limits than this say nothing [rad]. A slide that is longer is in another unit [m].
 _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 

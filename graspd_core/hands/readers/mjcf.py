@@ -330,7 +330,7 @@ def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
     if kind is None:
         raise fault(parts.path, joint, f"is of type {_type_name(joint)!r}; known: {', '.join(_KINDS)}")
     axis, rotation, translation = np.array(model.jnt_axis[number]), placed.rotation, placed.translation
-    # At `ref` the joint is as drawn; a joint value of zero lies that far back.
+    # At `ref` the joint is as drawn. A joint value of zero lies that far back.
     if kind == "revolute":
         rotation = rotation @ axis_rotation(axis, -_reference(parts, number))
     else:

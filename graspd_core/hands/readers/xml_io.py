@@ -22,7 +22,7 @@ from graspd_core.errors import HandError
 _LONGEST = 1000
 _LARGEST_FILE = 32 * 2**20
 DEEPEST = 150
-# The largest hand known has some 1000 elements; each takes half a kilobyte, however short it is written.
+# The largest hand known has some 1000 elements. Each takes half a kilobyte, however short it is written.
 _MOST_ELEMENTS, _MOST_ATTRIBUTES = 20_000, 200
 # Nothing in a hand is farther than this from the frame that it is given in [m].
 FARTHEST = 10.0

@@ -52,7 +52,7 @@ _REMEDIES = {
     "bgr": "it is a colour picture: name the depth image's topic",
 }
 # CompressedImage of `compressedDepth`: the format of its inverse depth as int32, then the two numbers of its
-# quantisation as float32. A PNG begins with 8 bytes that are always the same; its sizes follow at byte 16.
+# quantisation as float32. A PNG begins with 8 bytes that are always the same. Its sizes follow at byte 16.
 _QUANTISED = struct.Struct("<iff")
 _PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
 _MOST_PIXELS = 2**26
@@ -142,7 +142,7 @@ def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
         return np.array(seen, dtype=float)
     target = np.asarray(seen, dtype=float)
     ideal = target.copy()
-    # Beyond the lens's range the iteration runs off to infinity; such pixels are sorted out below.
+    # Beyond the lens's range the iteration runs off to infinity. Such pixels are sorted out below.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
             image, slope = _lens(ideal, coefficients)

@@ -323,8 +323,8 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
             if unpacked > _MAX_UNPACKED_BYTES:
                 raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are taken")
             return {name: stored[name] for name in stored.files}
-    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals;
-    # one whose header promises more than there is as a lack of memory.
+    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals.
+    # A header that promises more than there is shows as a lack of memory.
     except Exception as error:
         told = _first_line(error)
         if "allow_pickle" in told:
@@ -389,7 +389,7 @@ def _has_commas(path: Path) -> bool:
 def _read_open3d(path: Path) -> Points:
     import open3d as o3d
 
-    # Open3D prints its complaints and returns nothing; the error below says it once.
+    # Open3D prints its complaints and returns nothing. The error below says it once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
             cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)

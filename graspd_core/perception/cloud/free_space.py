@@ -142,7 +142,7 @@ def _occluders(
     """Return the depth of what stands before the object in each cell [m], infinite for nothing."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
-    # Of all that a camera saw little is in the object's image; points that are not finite compare as false.
+    # Of all that a camera saw little is in the object's image. Points that are not finite compare as false.
     x, y, forward = ((whole.points - whole.viewpoint) @ frame).T
     high = low + cell * np.array(depth.shape)
     ahead = (forward > 1e-3) & (x >= low[0] * forward) & (x < high[0] * forward)

@@ -20,7 +20,7 @@ Eyes = Float[np.ndarray, "views 3"]
 MIN_POINTS = 50
 # Points this many times the cloud's size away from its middle are no part of it.
 MAX_DISTANCE_IN_SIZES = 1e3
-# No camera measures what is this near to itself [m]; drivers that have no depth send that.
+# No camera measures what is this near to itself [m]. Drivers that have no depth send that.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
 
 

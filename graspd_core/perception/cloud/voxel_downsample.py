@@ -16,7 +16,7 @@ from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
 
-# Which voxels of a scene, and the thing that each is part of, numbered from the largest; -1: none.
+# A mask of a scene's voxels. The object that each is part of, numbered from the largest, -1 for none.
 Mask = Bool[np.ndarray, "voxels"]
 Labels = Int[np.ndarray, "voxels"]
 

@@ -13,7 +13,7 @@ from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothin
 OUTLINE_STEP_M = 0.008
 # How level the surface must be there, and how much it must face a camera [cosines].
 MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
-# Of the object's lowest points, the share that must be of walls for it to have a base; how steep [cosine] those are.
+# Of the object's lowest points, the share that must be of walls for it to have a base. Their steepness [cosine].
 MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
 # The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
 MAX_FOOT_HEIGHT_M = 0.015
@@ -46,7 +46,7 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     height = maximum_filter(top, 3)[rim]
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
     _, nearest = KDTree(seen.points).query(place)
-    # A surface that turns away from the camera at the outline goes on behind it; one that is level there ends.
+    # A surface that turns away from the camera at the outline goes on behind it. One that is level there ends.
     level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
         facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
     )

@@ -24,7 +24,7 @@ from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
 MIN_VIEW_COSINE = 0.1
-# A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
+# A surface seen from one side rises by less than this many cells over one cell on most lines of sight. With more than
 # this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
 # looked it takes more: from above, a third of the lines may run along the sides of a cup.
 MAX_RISE_CELLS = 4.0

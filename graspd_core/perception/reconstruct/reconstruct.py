@@ -264,7 +264,7 @@ def _is_guessed(
 ) -> bool:
     """Tell whether a good part of a surface was not seen. A foot on the support at z = 0 counts as known."""
     if views > 1:
-        # Whatever a rule filled; and normals of what was seen may cancel though much was not, as of a bottle's sides.
+        # Whatever a rule filled. The normals of the seen part may cancel though much is hidden, as of a bottle's sides.
         return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
     # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
     area = _open_area(mesh, standing)[0]

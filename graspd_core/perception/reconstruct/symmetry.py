@@ -22,7 +22,7 @@ from graspd_core.se3 import perpendicular
 FINE_SAMPLES, COARSE_SAMPLES = 240, 90
 # What a contradiction weighs against a confirmation.
 CONTRADICTION_WEIGHT = 3.0
-# Directions of mirror planes that are tried of an object that stands, and of one that does not; places of each.
+# Directions of mirror planes that are tried for a standing object and for others, and places of each.
 UPRIGHT_DIRECTIONS, SPHERE_DIRECTIONS, PLANE_OFFSETS = 30, 70, 29
 
 UP = np.array([0.0, 0.0, 1.0])
