@@ -69,8 +69,7 @@ class TransformBuffer:
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
         """Return `T_target_source` at `stamp` [ns], or at the newest time that every link between the two knows.
 
-        Raises:
-            TransformError: an unknown frame, frames that no chain connects, or a time outside what is known.
+        Raises TransformError: an unknown frame, frames that no chain connects, or a time outside what is known.
         """
         target, source = _name(target), _name(source)
         with self._lock:

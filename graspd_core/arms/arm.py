@@ -111,9 +111,8 @@ def segment_distance(
 ) -> Float[Tensor, "*batch"]:
     """Return the distance [m] of the segments from a to b and from c to d.
 
-    Each may be a point.
-
-    C. Ericson, Real-Time Collision Detection, 5.1.9: the nearest points of the lines are clamped to their segments.
+    Each may be a point. C. Ericson, Real-Time Collision Detection, 5.1.9: the nearest points of the lines are clamped
+    to their segments.
     """
     along, other, between = b - a, d - c, a - c
     aa, ee = (along * along).sum(-1), (other * other).sum(-1)
@@ -163,10 +162,7 @@ class Arm:
 
 
 def tip_hand(arm: Arm, hand: HandModel) -> SE3:
-    """Return `T_tip_hand`, the pose of the hand's base link on the tip.
-
-    Raises ConfigError: neither arm nor hand says it.
-    """
+    """Return `T_tip_hand`, the hand's pose on the tip. Raises ConfigError: neither arm nor hand says it."""
     mount = arm.mounts.get(hand.name, hand.mount)
     if mount is None:
         known = ", ".join(arm.mounts) or "none"

@@ -103,9 +103,8 @@ def solve(
 ) -> Solutions:
     """Follow the error from each start to its target, `T_base_tip`.
 
-    Rows that have arrived wait for the others.
-
-    Computed in float32, which is a hundred times finer than the tolerances and takes two thirds of the time.
+    Rows that have arrived wait for the others. Computed in float32, which is a hundred times finer than the tolerances
+    and takes two thirds of the time.
 
     Args:
         steps: the most steps.

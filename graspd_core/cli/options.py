@@ -185,8 +185,7 @@ def check_bag_options(options: argparse.Namespace) -> None:
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
     """Yield the clouds that the options choose, each with its cloud or the reason why it cannot be used.
 
-    Raises:
-        BagError: nothing can be read, or the frame wanted is not in the bag.
+    Raises BagError: nothing can be read, or the frame wanted is not in the bag.
     """
     transforms, place = None, CameraPlace(options.view_point, options.sensor_frame)
     told = set[str]()
@@ -257,8 +256,7 @@ def add_restriction_options(parser: argparse.ArgumentParser) -> None:
 def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
     """Return the restrictions that the options ask for.
 
-    Raises:
-        ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
+    Raises ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
     """
     return (*_steering(options), *_reach(options))
 

@@ -111,9 +111,8 @@ class Deadline:
     def cuts_short(self) -> Iterator[None]:
         """Raise DeadlinePassed in the work inside once the deadline has passed.
 
-        A library's long call ends first.
-
-        Signals belong to the main thread. In another one, DeadlinePassed waits for the work's end.
+        A library's long call ends first. Signals belong to the main thread. In another one, DeadlinePassed waits for
+        the work's end.
         """
         if self._end is None:
             yield

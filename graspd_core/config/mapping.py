@@ -36,10 +36,7 @@ def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | No
 def coerced(
     hints: Mapping[str, Any], values: Any, where: str, starts: Mapping[str, Any] = types.MappingProxyType({})
 ) -> dict[str, Any]:
-    """Return the values of a mapping, each as the type that `hints` names for its key.
-
-    Raises ConfigError: see above.
-    """
+    """Return a mapping's values, each as the type that `hints` names for its key. Raises ConfigError: see above."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
     unknown = sorted(map(shown, set(values) - set(hints)))
@@ -109,9 +106,8 @@ class _Loader(yaml.SafeLoader):
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
     """Return the node tree of a YAML text, which knows its lines, and its value.
 
-    Both are None for an empty text.
-
-    Raises YamlError, a ValueError: the text is not well-formed, or a value is not what its tag or its looks say.
+    Both are None for an empty text. Raises YamlError, a ValueError: the text is not well-formed, or a value is not what
+    its tag or its looks say.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)

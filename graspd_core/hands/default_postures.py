@@ -109,10 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return by how much the fingertips miss their places, and how one-sided they lie: squared, in finger lengths.
-
-    `away` holds the fingertips relative to the ball [m]. With given directions, one-sidedness is zero.
-    """
+    """Return how far the fingertips at `away` [m] miss their places, and how one-sided they lie [finger lengths²]."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -135,7 +132,6 @@ def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
 
 
 def _joined_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    """Return which links are welded to each other, or one joint apart."""
     groups = hand.link_group
     above = np.where(hand.link_parent >= 0, groups[np.maximum(hand.link_parent, 0)], -1)[groups]
     return (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
@@ -209,10 +205,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Return the first joint of each finger that bends it, at a posture, base frame [m].
-
-    A joint that turns the finger about the direction `along` does not bend it.
-    """
+    """Return the first joint of each finger that does not turn it about `along`, at a posture, base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):
@@ -252,7 +245,7 @@ def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips
 def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "tips 3"]:
     """Return the side on which each finger of a gripper stands, in the palm's plane, zero for a finger alone.
 
-    The side comes from the roots, not from the tips at a posture. Fingers may have room to pass through each other.
+    The side comes from the roots. The tips may pass through each other.
     """
     middle = middle_joints(hand, fingers)
     plane = np.eye(3) - np.outer(normal, normal)
@@ -266,10 +259,7 @@ def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return the direction in which each finger of a human-like hand opens, in the palm's plane.
-
-    Fingers that bend together straighten together, normal to the row of their knuckles. The thumb opens the other way.
-    """
+    """Return the opening direction of each finger of a human-like hand in the palm's plane, the thumb's opposite."""
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

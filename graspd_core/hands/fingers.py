@@ -92,10 +92,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the middle of the points farthest from a finger's root, or farthest from the palm's middle.
-
-    The second holds where the first lies amid the points.
-    """
+    """Return the middle of the points farthest from a finger's root, or from the palm if that lies amid the points."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
@@ -129,10 +126,7 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Tell whether two fingers stand on the plane of all three roots, as a gripper's against its third.
-
-    The fingers of a human-like hand with a thumb lie in the plane.
-    """
+    """Tell whether two fingers stand on the plane of all three roots. Those of a human-like hand lie in it."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 

@@ -62,10 +62,7 @@ def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3
 def within_bounds(
     primitives: Sequence[Primitive], points: Float[np.ndarray, "points 3"], margin: float = 0.0
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points lie within the bounding box of the primitives, grown by `margin` [m].
-
-    All in the link's frame.
-    """
+    """Return which points lie within `margin` [m] of the bounding box of the primitives, in the link's frame."""
     if not primitives:
         return np.zeros(len(points), dtype=bool)
     low, high = _bounds_of_all(tuple(primitives))

@@ -187,8 +187,7 @@ class _Pool:
 def with_candidates(hand: HandModel, count: int) -> HandModel:
     """Return the hand with `count` contact candidates, the hand itself if it has as many.
 
-    Raises:
-        HandError: fewer than one.
+    Raises HandError: fewer than one.
     """
     if count < 1:
         raise HandError(f"candidates={count}: at least 1 is needed")
@@ -283,7 +282,6 @@ def kept(
 def _pool(
     hand: HandModel, parts: Sequence[tuple[np.ndarray, ...]], areas: np.ndarray, corner: Bool[np.ndarray, "points"]
 ) -> _Pool:
-    """Join the points and normals of all primitives of the hand."""
     points, normals = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     counts = [len(part[0]) for part in parts]
     links, source = np.repeat([p.link for p in hand.primitives], counts), np.repeat(np.arange(len(counts)), counts)
@@ -329,9 +327,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 
 
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
-    """Return which points lie inside another solid of their group, on a face glued to one, or flush with an earlier
-    one.
-    """
+    """Return which points lie inside another solid of their group, on a face glued to one, or flush with another."""
     poses = link_poses(hand, hand.open_posture)
     placed = in_base(poses, pool.points, pool.links)
     raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)

@@ -96,8 +96,7 @@ def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
 def read_transforms(path: str | Path) -> TransformBuffer:
     """Read all transforms of a recording (/tf and /tf_static).
 
-    Raises:
-        BagError: not a bag, a broken one, or one without transforms.
+    Raises BagError: not a bag, a broken one, or one without transforms.
     """
     buffer = TransformBuffer(history=None)
     with _opened(path) as reader:
@@ -157,8 +156,7 @@ def read_frames(
 def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
     """Yield recorded messages as stored (CDR) with their time of recording [ns], of all topics or those named.
 
-    Raises:
-        BagError: not a bag, a broken one, or a topic that is not in it.
+    Raises BagError: not a bag, a broken one, or a topic that is not in it.
     """
     with _opened(path) as reader:
         known = {topic.name: topic for topic in _topics(reader)}
@@ -225,10 +223,7 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
 
 
 def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
-    """Return the message, its type as Jazzy defines it, else as the bag does.
-
-    A bag may define other fields for a known type. Such a message could not be read here.
-    """
+    """Return the message, its type as Jazzy defines it, since fields of a bag's own definition could not be read."""
     kind, known = connection.msgtype, jazzy_types()
     types = known if kind in known.fielddefs else reader.typestore
     try:

@@ -207,12 +207,8 @@ def load_document(path: str | Path) -> dict[str, Any]:
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     """Return the grasps of a document that `load_document` read, in rank order.
 
-    The squeeze has the grasp's base pose.
-
-    Joint positions are those of the actuated joints. Metrics that this version does not know are left out.
-
-    Raises:
-        FormatError: a grasp lacks a key, or a value is of the wrong kind or not finite.
+    The squeeze has the grasp's base pose. Joint positions are those of the actuated joints. Metrics that this version
+    does not know are left out. Raises FormatError: a grasp lacks a key, or a value is of the wrong kind or not finite.
     """
     try:
         hand = document["hand"]

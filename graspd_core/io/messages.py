@@ -42,17 +42,13 @@ def stamp_of(message: Any) -> int:
 def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
     """Return the finite points of a sensor_msgs/PointCloud2, in row order, in the cloud's own frame and unit.
 
-    Raises:
-        CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
+    Raises CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
     """
     return points_from_layout(_layout(message))
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Return all points of a sensor_msgs/PointCloud2 in their places, NaN and infinite too.
-
-    Raises CloudError as above.
-    """
+    """Return all points of a PointCloud2 in their places, NaN and infinite too. Raises CloudError as above."""
     return organised_points(_layout(message))
 
 
@@ -110,9 +106,7 @@ def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
 
 
 def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
-    """Return what speaks against a frame's name, empty for nothing.
-
-    The points are seen from the frame's origin.
+    """Return a warning if points, seen from the frame's origin, contradict its name, else an empty text.
 
     By REP 103 cameras look along z in optical frames, along x in body frames.
     """
@@ -156,8 +150,7 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
 def image_size(message: Any) -> tuple[int, int]:
     """Return width and height [pixels] of a depth image, packed or not, or of the images of a CameraInfo.
 
-    Raises:
-        CloudError: a packed image does not say it.
+    Raises CloudError: a packed image does not say it.
     """
     if hasattr(message, "roi"):
         bins = max(message.binning_x, 1), max(message.binning_y, 1)
@@ -200,10 +193,11 @@ def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple
 
 
 def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
-    """Return what a depth image shows, in the camera's optical frame. The arguments are those of `depth_and_camera`.
+    """Return what a depth image shows, in the camera's optical frame.
 
-    Raises:
-        CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
+    The arguments are those of `depth_and_camera`.
+
+    Raises CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
     """
     depth, camera = depth_and_camera(image, info, rectified=rectified)
     cloud = cloud_from_depth(depth, camera)

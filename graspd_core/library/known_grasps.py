@@ -242,10 +242,9 @@ def known_or_planned(
 ) -> GraspResult:
     """Return grasps of the library, and plan the rest of `count`.
 
-    The verified ones are added to the library.
-
-    `wanted` chooses which grasps count, stored and planned ones. `name` is the object's name in the library. All else
-    is as of `plan_grasps`. A library that cannot be written is a warning in the result.
+    The verified ones are added to the library. `wanted` chooses which grasps count, stored and planned ones. `name` is
+    the object's name in the library. All else is as of `plan_grasps`. A library that cannot be written is a warning in
+    the result.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
@@ -291,9 +290,7 @@ def add_planned(
 ) -> int:
     """Add the verified grasps of a run to the library, with the trial of the object alone.
 
-    Returns their number.
-
-    Raises FormatError: the library cannot be written.
+    Returns their number. Raises FormatError: the library cannot be written.
     """
     if verify == "none":
         return 0
@@ -332,10 +329,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return the least distance [m] of each hand to support and obstacles from pregrasp to squeeze, negative inside.
-
-    Infinite without anything in reach.
-    """
+    """Return the least distance [m] of each hand to support and obstacles, pregrasp to squeeze, infinite without."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

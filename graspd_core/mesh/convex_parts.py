@@ -162,10 +162,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching clusters, least bulge first, while that stays in tolerance, and on until `most` are left.
-
-    A pair is ordered by a bulge estimated from segments between the two, and measured when its turn comes.
-    """
+    """Join touching clusters, least bulge first, while that stays in tolerance, and on until `most` are left."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -222,7 +219,6 @@ def _quantile(values: Float[np.ndarray, "_"], share: float) -> float:
 
 
 def _hull(points: Points) -> ConvexHull | None:
-    """Return the convex hull, None if the points are too few or lie in a plane."""
     if len(points) < 4:
         return None
     try:
@@ -232,10 +228,7 @@ def _hull(points: Points) -> ConvexHull | None:
 
 
 def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
-    """Return one point per equal share of the hull's area.
-
-    Faster than `surface_samples`: it is called hundreds of times.
-    """
+    """Return one point per equal share of the hull's area, faster than `surface_samples`."""
     a, b, c = hull.points[hull.simplices].transpose(1, 0, 2)
     # Twice the area, without np.cross: that costs as much as all the rest.
     (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T

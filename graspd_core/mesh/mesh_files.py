@@ -114,7 +114,7 @@ def _cut_stl(head: bytes, tail: bytes, size: int) -> str:
 
 
 def _cut_obj(tail: bytes) -> str:
-    """Return what is missing of an unfinished last line. A file may leave out the last line's end alone."""
+    """Return what is missing of an unfinished last line, empty for a whole one."""
     line = tail.replace(b"\r", b"\n").rpartition(b"\n")[2].decode("utf-8", errors="replace")
     words = line.split()
     if not words or words[0] not in ("v", "vn", "f"):
@@ -229,12 +229,7 @@ def check_mesh(
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """Reduce a mesh to about `faces` triangles by quadric edge collapse.
-
-    A smaller mesh is returned as it is.
-
-    Another `aggressiveness` takes the edges in another order.
-    """
+    """Reduce a mesh to about `faces` triangles by quadric edge collapse, in an order that `aggressiveness` changes."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:
@@ -353,7 +348,7 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
-    """Merge coincident vertices and drop degenerate and repeated faces. Returns the mesh and the number of each."""
+    """Merge coincident vertices, and drop and count degenerate and repeated faces."""
     vertices, faces = topology.merge_vertices(mesh)
     distinct = topology.drop_degenerate(vertices, faces)
     unique = topology.drop_repeated(distinct)

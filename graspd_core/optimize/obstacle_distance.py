@@ -180,9 +180,8 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    An obstacle farther away than `wide` does not count.
-
-    Only links near an obstacle's grid are looked at: in a bin, of a hand and five obstacles, a tenth of all.
+    An obstacle farther away than `wide` does not count. Only links near an obstacle's grid are looked at: in a bin, of
+    a hand and five obstacles, a tenth of all.
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:

@@ -83,8 +83,7 @@ class Restriction(Protocol):
     def bind(self, scene: Scene, hand: HandModel) -> BoundRestriction:
         """Return the restriction for this scene and this hand.
 
-        Raises:
-            ConfigError: it is malformed, or does not fit the scene or the hand.
+        Raises ConfigError: it is malformed, or does not fit the scene or the hand.
         """
         ...
 

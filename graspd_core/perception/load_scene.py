@@ -93,10 +93,7 @@ def load_scene(
 def scaled_views(
     source: str | Path, camera: str | Path | None, scale: float = 1.0, view_point: Sequence[float] | None = None
 ) -> list[PointCloud]:
-    """Return the views of a cloud file or a depth image [m], as `load_scene` takes them.
-
-    Raises CloudError: see there.
-    """
+    """Return the views of a cloud file or a depth image [m]. Raises CloudError: see `load_scene`."""
     if camera is not None:
         if view_point is not None:
             raise CloudError(f"view_point: {source} is a depth image, which tells where its camera stood")

@@ -130,7 +130,6 @@ def plan_any_thing(
 def _in_order(
     things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
-    """Return objects with their failures: fewest failures first, then the highest."""
     rows = [
         (points, [f for f in failures if np.linalg.norm(points.mean(0) - f.place) < _SAME_PLACE]) for points in things
     ]

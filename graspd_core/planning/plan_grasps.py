@@ -137,10 +137,7 @@ def plan_grasps(
 def _prepared(
     run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str, bound: BoundRestrictions
 ) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
-    """Return scene and hand as they are planned on, why nothing can be held there, and the rounds to run.
-
-    A run that is over before it began begins nothing.
-    """
+    """Return scene and hand as planned on, why nothing can be held, and the rounds, none for a run that is over."""
     if run.over():
         return scene, hand, "", []
     scene, run.origin = planning_scene(scene, config.resolution)

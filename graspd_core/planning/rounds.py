@@ -111,7 +111,6 @@ def poses_seen(poses: Poses) -> Snapshot:
 
 
 def _hooks(run: Run, good: int) -> Hooks:
-    """Return the hooks that follow and end one optimiser while `good` grasps are known."""
     return Hooks(
         report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
         # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.

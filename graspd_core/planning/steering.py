@@ -192,10 +192,7 @@ class BoundSteering(BoundRestriction):
         )
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which hands have their palm in no avoided box, there and at the retreat.
-
-        Their aim ensures the rest.
-        """
+        """Return which hands have their palm in no avoided box, there and at the retreat."""
         if not self.steering.avoid:
             return np.ones(len(positions), dtype=bool)
         turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
@@ -264,8 +261,7 @@ def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float[np.ndarray, "places 3"]:
     """Return points of the object's surface in a region [m].
 
-    Raises:
-        ConfigError: there is none, or all of them lie in an avoided box.
+    Raises ConfigError: there is none, or all of them lie in an avoided box.
     """
     mesh = scene.object.mesh
     points = np.vstack([surface_samples(mesh, _SURFACE, seed=0)[0], mesh.vertices])

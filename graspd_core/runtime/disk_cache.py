@@ -74,9 +74,7 @@ def forget() -> None:
 
 
 def digest(values: Iterable[Any]) -> str:
-    """Return the SHA-256 of arrays, tuples, dataclasses and other values by their `repr`, hexadecimal, as part of a
-    key.
-    """
+    """Return the SHA-256 of arrays, tuples, dataclasses and other values by their `repr`, hexadecimal."""
     found = hashlib.sha256()
 
     def add(value: Any) -> None:

@@ -166,8 +166,7 @@ def read_bounded(path: Path, what: str) -> bytes:
 def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
     """Return what a pickle holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises:
-        ValueError: not a pickle, or it names anything but `admitted`. Says why, and names the culprit.
+    Raises ValueError: not a pickle, or it names anything but `admitted`. Says why, and names the culprit.
     """
     try:
         return _Reader(content, admitted).load()

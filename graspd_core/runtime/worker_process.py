@@ -39,11 +39,7 @@ def trim_heap() -> None:
 
 
 def limit_malloc_arenas() -> None:
-    """Let all threads allocate from two arenas, from now on (glibc only).
-
-    Otherwise every thread keeps freed memory of its own that no other thread can use, and a process with many threads
-    grows.
-    """
+    """Let all threads allocate from two arenas (glibc only), since each of its own would keep freed memory."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):
@@ -79,10 +75,7 @@ class WorkerProcess:
         self._start()
 
     def __call__(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
-        """Return or raise what the work does.
-
-        Raises MemoryError: two children died over it, as when memory is short.
-        """
+        """Return or raise what the work does. Raises MemoryError: two children died over it."""
         # pickle's own way with tensors, by value: that of multiprocessing shares memory that outlives nobody's death.
         call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
         with self._lock:

@@ -84,7 +84,7 @@ def step_until_known(
 ) -> str:
     """Simulate `steps` steps, or until it is known that the object stays within the limits.
 
-    `worst` travel [m] and turn [rad] are updated. Returns why the trial is over, empty if it is not.
+    Returns why the trial is over, empty if it is not. `worst` travel [m] and turn [rad] are updated.
     """
 
     rule, done = stop_rule(protocol, world.fingers), 0
@@ -134,11 +134,9 @@ def close_hand(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> str:
-    """Move the hand from the pregrasp over the grasp to the squeeze.
+    """Move the hand from pregrasp to squeeze.
 
-    Returns why the trial is over, empty if it is not.
-
-    `worst` travel [m] and turn [rad] of the object are updated.
+    Returns why the trial is over, if it is. Updates travel and turn in `worst`.
     """
     import mujoco
 
@@ -160,12 +158,7 @@ def close_hand(
 
 
 def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
-    """Return why a grasp is refused before the hand moves: deep in the object, or links in each other.
-
-    Empty if it is not.
-
-    The hand is placed, and MuJoCo's collision detection gives the depths.
-    """
+    """Return why a grasp is refused before the hand moves: deep in the object, or in itself. Empty if it is not."""
     deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
     for name, limit in deepest.items():
         place_hand(world, data, getattr(grasp, name))
@@ -185,10 +178,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Return which links are too deep in each other in the current state, empty for none.
-
-    Adjacent ones never collide.
-    """
+    """Return which non-adjacent links are too deep in each other in the current state, empty for none."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]

@@ -77,10 +77,8 @@ def lift_trial(
 ) -> TrialResult:
     """Run one lift trial in a world built with a support or neighbours.
 
-    It ends at the first breach.
-
-    Until the hand first touches the object, the object rests as it was seen, because a reconstructed bottom may not
-    stand. From then on it is free.
+    It ends at the first breach. Until the hand first touches the object, the object rests as it was seen, because a
+    reconstructed bottom may not stand. From then on it is free.
 
     The object has to stay within the protocol's limits (5 cm, 15°) of its start, as carried along by the lift, at all
     times. Without a support there is no gravity, and the hand takes the object back the way it came.
@@ -122,10 +120,7 @@ def _raise(
     worst: np.ndarray,
     stop: Callable[[], bool],
 ) -> str:
-    """Carry out the lift: come, close, squeeze, raise.
-
-    Returns why the trial is over, empty if it is not. Updates `worst`.
-    """
+    """Come, close, squeeze and raise the hand. Returns why the trial is over, empty if it is not. Updates `worst`."""
 
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
@@ -155,7 +150,7 @@ def _said(reason: str, stage: str) -> str:
 def _stages(
     begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
 ) -> tuple[tuple[str, Posture, Posture, float], ...]:
-    """Return name, first and last posture and duration [s] of every stage but the last, the hold, in order."""
+    """Return name, ends and duration [s] of every stage but the last, the hold, in order."""
     return (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
         (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),

@@ -244,9 +244,8 @@ def try_hypotheses(
 ) -> tuple[TrialResult, float]:
     """Try a grasp under each check in turn, until enough hold or too many fail.
 
-    Returns result and probability.
-
-    The result holds the greatest travel and turn of the passed trials. `hold_under` is given a stage at a time.
+    Returns result and probability. The result holds the greatest travel and turn of the passed trials. `hold_under` is
+    given a stage at a time.
     """
     travel = turn = 0.0
     if hypotheses.doubts:

@@ -166,7 +166,6 @@ def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tu
 
 
 def _measured(trials: TrialContext, context: MetricsContext, friction: bool, grasp: Grasp) -> GraspMetrics:
-    """Return the metrics of a grasp that passed its trials, with its payload."""
     found = {**measure(context, grasp.grasp), "payload": payload(trials.alone, grasp, trials.protocol)}
     if friction:
         found["least_friction"] = least_friction(trials.alone, grasp, trials.protocol)
@@ -197,10 +196,8 @@ def run_trials(
 ) -> TriedGrasps:
     """Try candidates in rank order until `count` are verified.
 
-    `before` are already.
-
-    It uses as many threads as torch may use in the calling one. Verdicts and order do not depend on their number.
-    Verified grasps are measured beside the trials of the next.
+    `before` are already. It uses as many threads as torch may use in the calling one. Verdicts and order do not depend
+    on their number. Verified grasps are measured beside the trials of the next.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []

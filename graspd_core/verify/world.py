@@ -173,9 +173,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return xx yy zz xy xz yz in MuJoCo's order, with principal moments raised to `floor` and the triangle inequality
-    kept.
-    """
+    """Return xx yy zz xy xz yz, with principal moments raised to `floor` and the triangle inequality kept."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -311,10 +309,8 @@ def altered(world: World, *, mass: float | None = None, friction: Friction | Non
 def trial_data(world: World) -> Iterator[Any]:
     """Give the `mujoco.MjData` of one trial, at the model's initial state.
 
-    Safe from any thread: each trial has its own.
-
-    Data of an ended trial is used again, since it takes about a millisecond to make. Data that MuJoCo broke off in is
-    not: its memory may be half in use.
+    Safe from any thread: each trial has its own. Data of an ended trial is used again, since it takes about a
+    millisecond to make. Data that MuJoCo broke off in is not: its memory may be half in use.
     """
     import mujoco
 

@@ -35,8 +35,7 @@ _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 def read_pickle(path: Path) -> Any:
     """Return what a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises:
-        HandError: no such file, too large, not a pickle, or it names anything but `ADMITTED`.
+    Raises HandError: no such file, too large, not a pickle, or it names anything but `ADMITTED`.
     """
     try:
         return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")
@@ -47,10 +46,7 @@ def read_pickle(path: Path) -> Any:
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
     """Return the dense array of numbers that a value of the file stands for.
 
-    `depth` counts the expressions around it.
-
-    Raises:
-        ValueError: the value holds no numbers. Says why.
+    `depth` counts the expressions around it. Raises ValueError: the value holds no numbers. Says why.
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
@@ -150,8 +146,7 @@ class ManoData:
 def read_mano(path: Path) -> ManoData:
     """Read and check a MANO file (.pkl), as downloaded.
 
-    Raises:
-        HandError: it cannot be read, asks for code to be run, or has a missing or wrong entry. Names file and entry.
+    Raises HandError: it cannot be read, asks for code to be run, or has a missing or wrong entry. Names file and entry.
     """
     content = read_pickle(path)
     if not isinstance(content, Mapping):

@@ -93,20 +93,14 @@ def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
-    """Return the greatest torques [N·m]: those by which a stretched finger presses with `_TIP_FORCE` at its tip.
-
-    The levers are those of this shape, so a small hand is weaker.
-    """
+    """Return the greatest torques [N·m], with which a stretched finger of this shape presses `_TIP_FORCE`."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
     lever = np.maximum(np.column_stack([reach, reach, np.full(15, _TWIST_LEVER)]), _LEAST_LEVER)
     return (_TIP_FORCE * lever).ravel()
 
 
 def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.ndarray, "3"]:
-    """Return the unit direction out of the palm at rest, model frame.
-
-    The mean pose tells a right hand from a left one.
-    """
+    """Return the unit direction out of the palm at rest, model frame. The mean pose shows the palm's side."""
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)
@@ -211,8 +205,7 @@ class ManoHand:
 def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int = 600) -> ManoHand:
     """Load the hand of a MANO file (.pkl) and a shape, the mean shape without betas.
 
-    Raises:
-        HandError: the file cannot be used, or there are more betas than it has shapes.
+    Raises HandError: the file cannot be used, or there are more betas than it has shapes.
     """
     data = read_mano(Path(path))
     shape = np.zeros(data.shape_directions.shape[-1])
@@ -245,10 +238,7 @@ def _fingertips(
 
 
 def _bare_hand(still: _Rest) -> HandModel:
-    """Return the hand with tree, limits, hulls and masses, without candidates.
-
-    A body hangs from its parent by three hinges: two massless links, then its own.
-    """
+    """Return the hand without candidates. Each body hangs from its parent by two massless links and its own."""
     data, normal = still.data, still.normal
     tree, link_of = _tree(still.joints, still.frames)
     count = len(tree["link_names"])

@@ -83,8 +83,7 @@ def pose_from_components(
 ) -> Float[Tensor, "batch 15 3"]:
     """Return the pose of the first k principal components: axis-angle vectors of bodies 1 to 15 [rad].
 
-    Raises:
-        HandError: more coefficients than the model has components.
+    Raises HandError: more coefficients than the model has components.
     """
     count = coefficients.shape[-1]
     if count > len(data.components):
@@ -97,8 +96,7 @@ def pose_from_components(
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
     """Return the vertices around the opening at the wrist, in the direction of the edges, none for a closed mesh.
 
-    Raises:
-        HandError: the boundary is not one loop, so that the inside is not defined.
+    Raises HandError: the boundary is not one loop, so that the inside is not defined.
     """
     edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
     present = set(map(tuple, edges.tolist()))

@@ -315,12 +315,8 @@ def _too_long(path: Path, joint: str, slide: float) -> HandError:
 def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupling]:
     """Read the couplings of all joints with a `<mimic>`, by name.
 
-    Each leader is an actuated joint.
-
-    The `<mimic>` of a fixed joint is ignored.
-
-    Raises:
-        HandError: a joint follows itself, a missing or a fixed joint, or has a bad number.
+    Each leader is an actuated joint. The `<mimic>` of a fixed joint is ignored. Raises HandError: a joint follows
+    itself, a missing or a fixed joint, or has a bad number.
     """
     moving = {str(joint.get("name")): joint for joint in joints if joint.get("type") != "fixed"}
     direct: dict[str, Coupling] = {}
@@ -341,8 +337,7 @@ def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupli
 def resolved_couplings(path: Path, direct: Mapping[str, Coupling]) -> dict[str, Coupling]:
     """Return the couplings, each led back to the actuated joint at the end of its chain.
 
-    Raises:
-        HandError: joints follow each other in a circle, or with a factor that no hand has.
+    Raises HandError: joints follow each other in a circle, or with a factor that no hand has.
     """
     return {name: _resolved(path, name, direct) for name in direct}
 

@@ -141,8 +141,7 @@ def _is_number(value: object) -> bool:
 def read_description(path: Path) -> HandDescription:
     """Read and check a hand description.
 
-    Raises:
-        HandError: not YAML, an unknown or missing key, or a wrong value. Names file, line and key.
+    Raises HandError: not YAML, an unknown or missing key, or a wrong value. Names file, line and key.
     """
     try:
         node, data = parse_yaml(path.read_text(encoding="utf-8"))

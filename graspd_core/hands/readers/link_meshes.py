@@ -144,7 +144,6 @@ def _package_folders(package: str, parents) -> list[Path]:
 
 
 def _package_name(folder: Path) -> str | None:
-    """Return the name in a folder's package.xml, None if there is none."""
     try:
         text = (folder / "package.xml").read_text(encoding="utf-8", errors="replace")
     except (OSError, ValueError):

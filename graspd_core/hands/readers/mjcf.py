@@ -85,7 +85,6 @@ def _place(element: Any) -> Element:
 
 
 def _type_name(element: Any) -> str:
-    """Return the type of a geom or joint as MJCF writes it."""
     return element.type.name.partition("_")[2].lower()
 
 
@@ -106,8 +105,7 @@ def check_type(path: Path, geom: Any, assets: Mapping[str, _MeshAsset]) -> None:
 def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
     """Return one geom as a primitive of link zero: meshes (`hull`) and ellipsoids as hulls.
 
-    Raises:
-        HandError: it is larger than anything of a hand.
+    Raises HandError: it is larger than anything of a hand.
     """
     rotation, translation = pose(model.geom_pos[geom.id], model.geom_quat[geom.id])
     if hull is not None:
@@ -127,8 +125,7 @@ def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> 
 def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
     """Return the hull of a mesh, of at most `corners` corners [m].
 
-    Raises:
-        HandError: its file is not there or not a mesh, or it is larger than anything of a hand.
+    Raises HandError: its file is not there or not a mesh, or it is larger than anything of a hand.
     """
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
@@ -208,8 +205,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
     """Replace each `<include>` below `parent`, which `holder` holds, by the included elements, as MuJoCo does.
 
-    Raises:
-        HandError: a file is not there, is no MJCF, or is included twice.
+    Raises HandError: a file is not there, is no MJCF, or is included twice.
     """
     children: list[ET.Element] = []
     for child in parent:

@@ -47,10 +47,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Return the shapes of a link, with each cylinder and two balls at its ends as one capsule.
-
-    URDF has no capsule of its own.
-    """
+    """Join each cylinder and two balls at its ends to one capsule, which URDF has no shape for."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
@@ -127,11 +124,9 @@ _HEAVIEST = 1e3
 def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     """Read the hand of a URDF, without candidates.
 
-    Postures are mid-range, the palm is at the base's origin.
-
-    `continuous` joints are kept within ±π. An absent or zero effort or velocity becomes infinite. A link without
-    collision shapes takes its visual ones. A `world` link or a floating joint above the base is dropped. All changes
-    but the second leave a warning.
+    Postures are mid-range, the palm is at the base's origin. `continuous` joints are kept within ±π. An absent or zero
+    effort or velocity becomes infinite. A link without collision shapes takes its visual ones. A `world` link or a
+    floating joint above the base is dropped. All changes but the second leave a warning.
 
     Args:
         path: of the file.
@@ -172,10 +167,8 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
 def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
     """Return the shapes that a viewer draws, placed as `hand.primitives` are.
 
-    A `hull` of them need not be convex.
-
-    Meshes are simplified to about 4000 triangles together, 6000 at most. Links without visuals, and hands without a
-    URDF, get their collision solids.
+    A `hull` of them need not be convex. Meshes are simplified to about 4000 triangles together, 6000 at most. Links
+    without visuals, and hands without a URDF, get their collision solids.
 
     Args:
         hand: any loaded hand.

@@ -40,8 +40,7 @@ class Element(ET.Element):
 def read_xml(path: Path) -> Element:
     """Read the root element of an XML file.
 
-    Raises:
-        HandError: it cannot be read, is not well-formed, has a document type declaration, or is too large.
+    Raises HandError: it cannot be read, is not well-formed, has a document type declaration, or is too large.
     """
     try:
         # By reading, not by the size that the system gives: a device has none, and no end.
@@ -109,10 +108,7 @@ def _decoded(data: bytes) -> str:
 
 
 def _blanked(text: str, start: str, end: str) -> str:
-    """Return the text with everything from `start` to `end` replaced by its line ends, so that line numbers stay right.
-
-    It searches in linear time. A regular expression would scan to the end for every start without an end.
-    """
+    """Replace everything from `start` to `end` by its line ends, in linear time, so that line numbers stay right."""
     pieces, at = [], 0
     while (first := text.find(start, at)) >= 0 and (last := text.find(end, first + len(start))) >= 0:
         pieces += [text[at:first], "\n" * text.count("\n", first, last)]
@@ -166,8 +162,7 @@ def _parsed(path: Path, text: str) -> Element:
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Return rotation and translation [m] of an element's `<origin>`, the identity if it has none.
 
-    Raises:
-        HandError: it holds no numbers, or is farther away than anything in a hand.
+    Raises HandError: it holds no numbers, or is farther away than anything in a hand.
     """
     origin = element.find("origin")
     if origin is None:

@@ -94,8 +94,7 @@ def camera_from_calibration(
 ) -> PinholeCamera:
     """Return the camera of a CameraInfo's `width`, `height`, `k` (row by row), `d` and `distortion_model`.
 
-    Raises:
-        CloudError: an unknown model, more coefficients than it has, or no calibration at all.
+    Raises CloudError: an unknown model, more coefficients than it has, or no calibration at all.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -114,10 +113,7 @@ def camera_from_calibration(
 
 @lru_cache(maxsize=8)
 def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
-    """Return directions of unit depth through each pixel, camera frame, NaN where this lens shows nothing.
-
-    The array is remembered for each camera, and therefore not writable.
-    """
+    """Return directions of unit depth through each pixel, camera frame, NaN where the lens shows nothing. Read-only."""
     column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     image = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
     rays = np.concatenate([undistort(image, camera.distortion), np.ones((*image.shape[:2], 1))], -1)
@@ -237,8 +233,7 @@ def depth_from_bytes(
 ) -> DepthImage:
     """Return depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
 
-    Raises:
-        CloudError: an encoding that is no depth, an empty image, or sizes that contradict each other.
+    Raises CloudError: an encoding that is no depth, an empty image, or sizes that contradict each other.
     """
     if width == 0 or height == 0:
         raise CloudError(f"the depth image is empty: width={width}, height={height}")

@@ -94,9 +94,8 @@ def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = 
 def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | None:
     """Return the depth image of a view's points.
 
-    Holes of a few cells are filled, since they are missing pixels.
-
-    None for fewer than five points before the camera, or for points all in one line of sight.
+    Holes of a few cells are filled, since they are missing pixels. None for fewer than five points before the camera,
+    or for points all in one line of sight.
     """
     from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
     from scipy.spatial import KDTree

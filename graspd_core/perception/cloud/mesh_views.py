@@ -28,8 +28,8 @@ _MOST_FACES, _STEPS = 20_000, 300
 def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
     """Return the view that a mesh is, seen from the origin, or None if the mesh is not one camera's sheet.
 
-    Raises:
-        MeshError: the mesh is a camera's sheet in another frame than the camera's, which does not say where it stood.
+    Raises MeshError: the mesh is a camera's sheet in another frame than the camera's, which does not say where it
+    stood.
     """
     if len(mesh.vertices) < MIN_VERTICES or len(mesh.faces) < MIN_VERTICES or not np.isfinite(mesh.vertices).all():
         return None
@@ -96,7 +96,6 @@ def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vecto
 
 
 def _edges(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return each edge once, and the number of faces that share it."""
     edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     keys, count = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
     return np.column_stack([keys // len(mesh.vertices), keys % len(mesh.vertices)]), count

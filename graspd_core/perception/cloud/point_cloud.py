@@ -117,8 +117,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
 def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
     """Drop points that are not finite, thin to an even density, drop outliers.
 
-    Raises:
-        CloudError: empty, all NaN, or fewer than 50 points left.
+    Raises CloudError: empty, all NaN, or fewer than 50 points left.
     """
     import open3d as o3d
 

@@ -64,8 +64,7 @@ class VoxelScene:
 def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) -> VoxelScene:
     """Crop all views to the workspace and thin them to one mean point a voxel.
 
-    Raises:
-        CloudError: no view, no point, none measured, too few inside the workspace, or cameras too far apart.
+    Raises CloudError: no view, no point, none measured, too few inside the workspace, or cameras too far apart.
     """
     given = sum(len(view.points) for view in views)
     if given == 0:

@@ -91,11 +91,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls beneath the outlines of an object that was seen only high above the support.
-
-    The outline of all points goes down to the support. A part high above the rest, as a bottle's cap, goes down to the
-    rest.
-    """
+    """Return walls beneath an object seen only high above the support, and beneath parts high above the rest."""
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)

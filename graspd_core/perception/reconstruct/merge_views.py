@@ -77,8 +77,7 @@ def merge_views(
     """Return the oriented points of all views: strays dropped, noise smoothed, one per cube of side `step` and side of
     it.
 
-    Raises:
-        CloudError: fewer than 50 points are left.
+    Raises CloudError: fewer than 50 points are left.
     """
     step, settings = point_step(views) if step is None else step, settings or ReconstructionConfig()
     together = join(*(orient_view(view, step, settings) for view in views))

@@ -127,10 +127,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return points of the support, at z = 0, beneath level surface that is nearly as low as all seen: a cup's floor.
-
-    The hull of the seen points ends at that floor, and would leave a sheet thinner than the grid's cells.
-    """
+    """Return points of the support beneath a cup's low floor, where the hull of the seen points would be too thin."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 

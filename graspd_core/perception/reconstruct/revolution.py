@@ -86,9 +86,8 @@ def meeting_direction(surfels: Surfels) -> Vector:
 def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, "n 4"]]:
     """Turn points about the axis into one half-plane.
 
-    Returns the direction of each point from the axis, and rows.
-
-    Rows hold height along the axis, distance from it [m], and the normal's part along and away from it.
+    Returns the direction of each point from the axis, and rows. Rows hold height along the axis, distance from it [m],
+    and the normal's part along and away from it.
     """
     offset = surfels.points - axis.point
     height = offset @ axis.direction
@@ -107,10 +106,9 @@ def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     """Tilt the axis to make the thinnest profile by Gauss-Newton.
 
-    Its place follows from the normals.
-
-    Points far from the profile, as of a handle, count less and less. The shifts that go with a tilt are not taken. A
-    half seen from one side does not show its place along the line of sight, but its normals do.
+    Its place follows from the normals. Points far from the profile, as of a handle, count less and less. The shifts
+    that go with a tilt are not taken. A half seen from one side does not show its place along the line of sight, but
+    its normals do.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
@@ -250,10 +248,7 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
 
 
 def _foot(rim, way: float, ground: float, step: float) -> Rows:
-    """Return the parabola from an overhanging rim, along its tangent, to where the axis meets the support.
-
-    For a ball cut at 30° below its middle it is off by a hundredth of the radius.
-    """
+    """Return the parabola from an overhanging rim, along its tangent, to where the axis meets the support."""
     height, radius = way * -rim[0] + ground, rim[1]
     along, across = way * rim[2], rim[3]
     if along < 0.15 or height < 2 * step:
