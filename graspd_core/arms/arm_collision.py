@@ -18,7 +18,7 @@ from torch import Tensor
 from graspd_core.arms.arm import Arm, Capsules, arm_links, capsules_about, placed, segment_distance, tip_hand
 from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.sdf import GridSDF, sample_sdf
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3
 
@@ -54,7 +54,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
     found = [hits_of_support(arm, scene, base, placed(arm.capsules, links)[:2])]
     for what, sdf in solids:
-        depth = padded - _distance(sdf, at)
+        depth = padded - sample_sdf(sdf, at.to(sdf.field))[0].to(at)
         worst = _worst_of_each(depth, owner, len(arm.capsules.link))
         found.append(Hits(worst[:, moved], tuple(f"{_name(arm, k)} in {what}" for k in moved.tolist())))
     return joined(*found)
@@ -174,7 +174,3 @@ def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "
     links = torch.as_tensor(arm.capsules.link[owner])
     matrix = placement(arm.chain.num_links, torch.as_tensor(np.concatenate(points)), links)
     return matrix, torch.as_tensor(np.concatenate(radii)), owner
-
-
-def _distance(sdf: GridSDF, points: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch n"]:
-    return sample_sdf(sdf, points.to(sdf.field))[0].to(points)

@@ -113,7 +113,8 @@ def execution_of(
     if grasp.arm is None:
         raise ConfigError("execution: the grasp has no path of an arm; plan it with the restriction Reach")
     pace, path, (retreat, before, closed, lifted) = pace or ExecutionPace(), grasp.arm.positions, grasp.arm.stages
-    limits = np.concatenate([arm_speeds, _finger_speeds(hand, pace)])
+    fingers = np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
+    limits = np.concatenate([arm_speeds, fingers])
     low, high = hand.lower, hand.upper
     open_, touch, press = (np.clip(p.joint_positions, low, high) for p in (grasp.pregrasp, grasp.grasp, grasp.squeeze))
     shares = np.linspace(0.0, 1.0, closed - before + 1)[:, None]
@@ -156,10 +157,6 @@ def squeeze_efforts(
     stages = stages or GraspStagesConfig()
     gain = np.where(hand.slides, stages.slide_stiffness, stages.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
-
-
-def _finger_speeds(hand: HandModel, pace: ExecutionPace) -> Float[np.ndarray, "joints"]:
-    return np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
 
 
 def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:

@@ -249,19 +249,6 @@ _FORMS = "box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"
 
 
 def add_restriction_options(parser: argparse.ArgumentParser) -> None:
-    _add_steering_options(parser)
-    _add_arm_options(parser)
-
-
-def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
-    """Return the restrictions that the options ask for.
-
-    Raises ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
-    """
-    return (*_steering(options), *_reach(options))
-
-
-def _add_steering_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("steering (docs/usage.md)")
     group.add_argument(
         "--approach", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
@@ -278,6 +265,25 @@ def _add_steering_options(parser: argparse.ArgumentParser) -> None:
         "--avoid", type=float, nargs=6, action="append", default=[], metavar=("X", "Y", "Z", "SX", "SY", "SZ"),
         help="a box that no link enters: middle and edges [m]; may be given again",
     )  # fmt: skip
+    parser.add_argument(
+        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
+    )
+    parser.add_argument(
+        "--arm-base",
+        type=float,
+        nargs="+",
+        default=None,
+        metavar="N",
+        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
+    )
+
+
+def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
+    """Return the restrictions that the options ask for.
+
+    Raises ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
+    """
+    return (*_steering(options), *_reach(options))
 
 
 def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
@@ -322,20 +328,6 @@ def _region(words: list[str]) -> Region:
         return Sphere(numbers[:3], numbers[3])
     points = np.concatenate([view.points for view in load_views(kind)])
     return NearPoints(points, *numbers)
-
-
-def _add_arm_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
-    )
-    parser.add_argument(
-        "--arm-base",
-        type=float,
-        nargs="+",
-        default=None,
-        metavar="N",
-        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
-    )
 
 
 def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:

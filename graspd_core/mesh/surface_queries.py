@@ -56,7 +56,7 @@ def unsigned_distance(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) ->
     return surface_distance(query.surface, points)
 
 
-# Points per call: igl holds Python's lock during one, so this bounds how long other threads wait (about 2 ms).
+# Points per call: libigl holds Python's lock during one, so this bounds how long other threads wait (about 2 ms).
 _POINTS_AT_ONCE = 256
 # Accuracy scales of the tree: at the coarse one numbers are off by up to 0.3 at a quarter of the fine one's cost.
 _COARSE, _FINE = 1.0, 2.0
@@ -114,10 +114,6 @@ def _numbers(tree: WindingTree, points: Float[np.ndarray, "n 3"], accuracy: floa
     chunks = [points[i : i + _POINTS_AT_ONCE] for i in range(0, len(points), _POINTS_AT_ONCE)]
     numbers = [np.abs(tree.tree.winding_number(np.ascontiguousarray(chunk), accuracy)) for chunk in chunks]
     return np.concatenate(numbers) if numbers else np.zeros(0)
-
-
-# Questions per call: libigl holds Python's lock during one, so this bounds how long other threads wait (about 1 ms).
-_CHUNK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +221,8 @@ def _nearest(
     vertices, faces = surface.mesh.vertices, surface.mesh.faces
     points = np.ascontiguousarray(points, dtype=float)
     # One call at least: without points, too, the arrays have their shapes.
-    starts = range(0, max(len(points), 1), _CHUNK)
-    parts = [surface.hierarchy.squared_distance(vertices, faces, points[i : i + _CHUNK]) for i in starts]
+    starts = range(0, max(len(points), 1), _POINTS_AT_ONCE)
+    parts = [surface.hierarchy.squared_distance(vertices, faces, points[i : i + _POINTS_AT_ONCE]) for i in starts]
     squared, face, closest = (np.concatenate(part) for part in zip(*parts, strict=True))
     # The wheel says long long, which NumPy holds to be another type.
     return squared, face.astype(np.int64), closest

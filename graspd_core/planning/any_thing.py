@@ -169,14 +169,11 @@ def _thing_plan(
     result = plan_grasps(scene, hand, **plan)
     left = [grasp for grasp in unlike(result.grasps, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
-        return ThingPlan(points, scene, result, None, _why_none(result))
+        reason = result.message or next((g.reason for g in result.grasps if g.reason), "") or result.outcome.value
+        return ThingPlan(points, scene, result, None, reason)
     best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
     reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp is sure enough"
     return ThingPlan(points, scene, result, best, reason)
-
-
-def _why_none(result: GraspResult) -> str:
-    return result.message or next((g.reason for g in result.grasps if g.reason), "") or result.outcome.value
 
 
 def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:

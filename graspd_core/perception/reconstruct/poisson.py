@@ -249,7 +249,9 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     if not slope > 0:
         raise CloudError(f"cloud: the normals of its {len(surfels.points)} points are of no surface")
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
-    _refuse_far(there)
+    near = float((np.abs(there) < 1.0).mean())
+    if near < _MIN_NEAR:
+        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
     for _ in range(_STEPS):
         push, pushed = at_points(spread(-weights * there) * blur / (square + _REACH**-2))
         # As far along it as leaves least at the points.
@@ -257,12 +259,6 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
         field, there = field + share * push, there + share * pushed
     inner = tuple(slice(low, low + count) for low, count in zip(before, counts, strict=True))
     return cell * np.clip(field.reshape(shape)[inner], -BAND_CELLS, BAND_CELLS)
-
-
-def _refuse_far(there: Float[np.ndarray, "points"]) -> None:
-    near = float((np.abs(there) < 1.0).mean())
-    if near < _MIN_NEAR:
-        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
 
 
 def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> Any:
