@@ -1,6 +1,4 @@
-"""Rigid transforms on torch tensors: `T_a_b` maps coordinates in frame b to frame a.
-
-Quaternions are wxyz.
+"""Rigid transforms on torch tensors: `T_a_b` maps coordinates in frame b to frame a. Quaternions are wxyz.
 
 Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is defined as zero.
 """
@@ -88,10 +86,7 @@ def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarra
 def quaternion_between(
     source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, around: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4"]:
-    """Return the shortest turn of one unit vector onto another, wxyz.
-
-    For opposite ones it is half a turn about `around`.
-    """
+    """Return the shortest turn of one unit vector onto another, wxyz. Opposite ones take half a turn about `around`."""
     quaternion = np.array([1.0 + source @ target, *np.cross(source, target)])
     length = np.linalg.norm(quaternion)
     return quaternion / length if length > EPSILON else np.array([0.0, *around])

@@ -115,9 +115,7 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class GraspMetrics(Mapping[str, float | None]):
-    """Static quality of one grasp by metric name, in SI units.
-
-    None: the metric was not measured.
+    """Static quality of one grasp by metric name, in SI units. None: the metric was not measured.
 
     `graspd_core.verify.metrics` lists the metrics, docs/metrics.md defines them.
     """
@@ -266,9 +264,7 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall-clock seconds of a run's stages.
-
-    `first_verified` is None without a verified grasp.
+    """Wall-clock seconds of a run's stages. `first_verified` is None without a verified grasp.
 
     `load` and `sdf` are the times of building the scene. `total` counts them too.
     """

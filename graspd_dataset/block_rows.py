@@ -37,9 +37,7 @@ _loaded: OrderedDict[str, Any] = OrderedDict()
 def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:
     """Load an object and prepare it for optimiser and trials.
 
-    `content` is its file's, if the file lies on another machine.
-
-    Raises GraspdError: it cannot be read or used.
+    `content` is its file's, if the file lies on another machine. Raises GraspdError: it cannot be read or used.
     """
     _one_thread()
     disk_cache.forget()

@@ -64,7 +64,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command. Returns the exit status: 0, 1 if blocks failed or a data set has faults, 130 if interrupted."""
+    """Run the command. Return the exit status: 0, 1 if blocks failed or a data set has faults, 130 if interrupted."""
     from graspd_dataset.dataset_store import DatasetStore
 
     action, places = options.words[0], options.words[1:]

@@ -31,9 +31,7 @@ Row = dict[str, Any]
 
 
 def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
-    """Write files for every hand and object, and the meshes.
-
-    Returns the numbers of such pairs and of grasps.
+    """Write files for every hand and object, and the meshes. Return the numbers of such pairs and of grasps.
 
     Raises:
         ConfigError: no such kind, or a hand that it does not know.

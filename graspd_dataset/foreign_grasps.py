@@ -160,9 +160,7 @@ def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
 def read_dexgraspbench(
     path: Path, content: bytes, hand: HandModel, mesh: str | None, order: Sequence[str]
 ) -> list[ImportedGrasp]:
-    """Read the one grasp of a file, in the frame of the object.
-
-    `mesh` replaces the one that it names.
+    """Read the one grasp of a file, in the frame of the object. `mesh` replaces the one that it names.
 
     Raises:
         ConfigError: the joint order is not known or does not fit the hand.

@@ -113,7 +113,7 @@ class Job:
 
 
 def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits: Limits) -> tuple[Report, bytes]:
-    """Prepare an object and keep its mesh. Returns the report, and what its blocks share, empty for a failure."""
+    """Prepare an object and keep its mesh. Return the report, and what its blocks share, empty for a failure."""
     try:
         ready = call_guarded(limits, ready_of, job.pickled, content)
     except Exception as error:

@@ -41,7 +41,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Import the grasps. Returns the exit status: 0, 3 if no grasp of an object is left."""
+    """Import the grasps. Return the exit status: 0, 3 if no grasp of an object is left."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable, save_result
     from graspd_core.optimize.plan_config import load_preset

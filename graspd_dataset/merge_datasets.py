@@ -18,13 +18,10 @@ _NAMES = ("object_source", "preset", "code")
 
 
 def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]:
-    """Copy all blocks, meshes, records of failures and runs to `out`.
+    """Copy all blocks, meshes, records of failures and runs to `out`. Return the numbers of blocks copied and common.
 
-    Returns the numbers of blocks copied and common.
-
-    Existing files are compared and left, so a stopped merge goes on.
-
-    Raises FormatError: a file is spoilt, or two data sets hold other rows under the same key.
+    Existing files are compared and left, so a stopped merge goes on. Raises FormatError: a file is spoilt, or two data
+    sets hold other rows under the same key.
     """
     there = {path.rpartition("/")[2]: path for path in out.list("grasps")}
     copied = common = 0
@@ -57,9 +54,7 @@ def _refuse_conflict(table: Any, out: DatasetStore, path: str, where: str) -> No
 
 
 def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = None) -> tuple[bytes, int]:
-    """Draw `count` rows evenly into a Parquet file.
-
-    Returns its bytes and their number, equal for equal rows and seed.
+    """Draw `count` rows evenly into a Parquet file. Return its bytes and their number, equal for equal rows and seed.
 
     Raises:
         ConfigError: the count is not valid.

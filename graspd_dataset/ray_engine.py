@@ -148,7 +148,7 @@ class RayEngine:
         return tuple(self._prepare.remote(object_job(thing, config), content, self._store, self._limits))
 
     def submit_block(self, block: Block, shared: Any) -> Any:
-        """Submit a block. Returns a handle of the report."""
+        """Submit a block. Return a handle of the report."""
         if block.hand_content not in self._hands:
             self._hands[block.hand_content] = self._ray.put(pickled_hand(block))
         return self._run.remote(block_job(block), self._hands[block.hand_content], shared, self._store, self._limits)

@@ -179,9 +179,7 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Run blocks and yield each with its report as it ends.
-
-    Objects too: a failed one drops its blocks.
+    """Run blocks and yield each with its report as it ends. Objects too: a failed one drops its blocks.
 
     Raises StorageError: a file could not be written. Earlier files stay.
     """

@@ -1,6 +1,4 @@
-"""The list of grasps beside the scene: filter, order and figures.
-
-Pure text and HTML.
+"""The list of grasps beside the scene: filter, order and figures. Pure text and HTML.
 
 Names and reasons come out of files that strangers may have written. None of them reaches the page unescaped.
 """

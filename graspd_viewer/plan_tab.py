@@ -1,6 +1,4 @@
-"""The tab where visitors plan: an object, a hand, a preset, and Plan, Stop and Save.
-
-One run at a time, seen by all.
+"""The tab where visitors plan: an object, a hand, a preset, and Plan, Stop and Save. One run at a time, seen by all.
 
 A visitor's request is checked here, because a forged message may hold anything in any field.
 """

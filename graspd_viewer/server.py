@@ -22,9 +22,7 @@ Work = Callable[[], object]
 
 
 class LatestJobs:
-    """A thread that does the newest job of each kind.
-
-    Replaced jobs are never done.
+    """A thread that does the newest job of each kind. Replaced jobs are never done.
 
     Args:
         failed: called with the exception of a job.

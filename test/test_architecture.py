@@ -66,21 +66,21 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test. What inputs are checked for, which
 # came after it, took 1,700, 500 and 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 26_603,
+    "graspd_core": 26_497,
     "graspd_ros": 5_200,
     "graspd_bench": 8_800,
-    "graspd_dataset": 2_961,
-    "graspd_viewer": 2_294,
+    "graspd_dataset": 2_948,
+    "graspd_viewer": 2_288,
     "graspd_cell": 3_800,
     "test": 32_374,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 21_528, "graspd_ros.node": 25_469}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 21_444, "graspd_ros.node": 25_402}
 
 # Docstrings with a semicolon, by path prefix, at most. The longest prefix of a path counts, all other files have none.
 MAX_SEMICOLONS = {
-    "graspd_ros/": 100,
+    "graspd_ros/inputs/request_builder.py": 11,
     "graspd_bench/": 116,
     "graspd_cell/": 21,
     "graspd_core/perception/segment/": 19,

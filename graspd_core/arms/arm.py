@@ -275,7 +275,7 @@ def from_robot_description(entries: ArmFile) -> bool:
 
 
 def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
-    """Read an arm's description. Returns its path and entries. Raises ConfigError: see `load_arm`."""
+    """Read an arm's description. Return its path and entries. Raises ConfigError: see `load_arm`."""
     text = str(name_or_path)
     if not text.endswith((".yaml", ".yml")):
         if text not in arm_names():

@@ -24,7 +24,7 @@ _YOUNG = 20_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
+    """Run the command line. Return the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
     # With arguments of its own this is a call within a process that began long ago.
     own_process = arguments is None
     began = process_began() if own_process else time.perf_counter()

@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Plan for all objects. Returns the exit status: 0, 3 if an object got too few grasps, 130 if interrupted."""
+    """Plan for all objects. Return the exit status: 0, 3 if an object got too few grasps, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources
@@ -58,7 +58,7 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan what an object lacks and add it. Returns the number of its grasps then."""
+    """Plan what an object lacks and add it. Return the number of its grasps then."""
     from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
     from graspd_core.perception.load_scene import load_scene

@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Reconstruct a mesh and write it. Returns the exit status."""
+    """Reconstruct a mesh and write it. Return the exit status."""
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
     from graspd_core.perception.cloud.depth_files import is_depth_image

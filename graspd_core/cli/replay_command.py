@@ -66,10 +66,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on every cloud.
-
-    Returns the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no usable cloud.
-    """
+    """Plan on every cloud. Return the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no usable one."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 

@@ -27,9 +27,7 @@ _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """A context in which the first Ctrl-C or SIGTERM ends a run with its result so far, and the second ends the
-    process.
-    """
+    """A context in which the first Ctrl-C or SIGTERM ends a run with its result so far, the second the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -91,10 +89,7 @@ _AGAIN = 0.5
 
 
 class DeadlinePassed(BaseException):
-    """The end of work by a deadline.
-
-    It is no Exception, because readers of files catch every Exception as their own.
-    """
+    """The end of work by a deadline. It is no Exception, because readers of files catch all of those as their own."""
 
 
 class Deadline:

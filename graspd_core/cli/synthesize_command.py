@@ -54,7 +54,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on one object. Returns the exit status."""
+    """Plan on one object. Return the exit status."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.perception.load_scene import load_scene

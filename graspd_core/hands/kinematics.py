@@ -1,6 +1,4 @@
-"""Forward kinematics, batched over postures and parallel over links of equal depth.
-
-A hand at a posture as a mesh.
+"""Forward kinematics, batched over postures and parallel over links of equal depth. A hand at a posture as a mesh.
 
 All functions of tensors are differentiable in the joint values with exact gradients. Formula: Rodrigues' rotation `R =
 I + sin(q) K + (1 - cos(q)) K²`, multiplied into each joint's constant offset beforehand. So a link's local transform is
@@ -152,10 +150,7 @@ def points_in_base(
     points: Float[Tensor, "points 3"],
     links: Int[Tensor, "points"],
 ) -> Float[Tensor, "batch points 3"]:
-    """Return link-frame points at joint values q, base frame [m].
-
-    For a fixed set of points keep its `placement` instead.
-    """
+    """Return link-frame points at joint values q, base frame [m]. For a fixed set of points keep its `placement`."""
     poses = forward(kinematics, q)
     return place_points(placement(poses.translation.shape[1], points, links), poses)
 

@@ -1,6 +1,4 @@
-"""Spheres that fill the links, for a cheap differentiable self-collision term.
-
-Overlap of links at a posture.
+"""Spheres that fill the links, for a cheap differentiable self-collision term. Overlap of links at a posture.
 
 The spheres approximate: they bulge out of the flat faces of long boxes by up to a fifth of the half thickness. Metrics
 use signed distances instead. The term looks at every pair of spheres, so their number is bounded. Thin solids get

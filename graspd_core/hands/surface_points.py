@@ -185,10 +185,7 @@ class _Pool:
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates, the hand itself if it has as many.
-
-    Raises HandError: fewer than one.
-    """
+    """Return the hand with `count` contact candidates, itself if it has as many. Raises HandError: fewer than one."""
     if count < 1:
         raise HandError(f"candidates={count}: at least 1 is needed")
     if count == len(hand.candidate_link):

@@ -58,9 +58,7 @@ class BagFrame:
     def view(
         self, transforms: TransformBuffer | None = None, target: str | None = None, place: CameraPlace = ORIGIN
     ) -> PointCloud:
-        """Return what the camera saw, in its own frame or in `target`.
-
-        The camera of a cloud stood at `place`.
+        """Return what the camera saw, in its own frame or in `target`. The camera of a cloud stood at `place`.
 
         Raises:
             CloudError: the message is broken or shows nothing.

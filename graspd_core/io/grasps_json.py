@@ -101,10 +101,7 @@ def save_result(
     frame: str = "",
     stamp: float | None = None,
 ) -> None:
-    """Write a result.
-
-    The file appears whole or not at all. `frame` and `stamp` [s] name the frame and time of its poses.
-    """
+    """Write a result, whole or not at all. `frame` and `stamp` [s] name the frame and time of its poses."""
     document = result_document(result, target, hand, config)
     document |= {"frame": frame} if frame else {}
     document |= {"stamp": stamp} if stamp is not None else {}

@@ -77,9 +77,7 @@ class CameraPlace:
     sensor_frame: str = ""
 
     def cloud(self, message: Any, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]) -> PointCloud:
-        """Return a sensor_msgs/PointCloud2 as its camera saw it.
-
-        `lookup` gives `T_target_source` of two frames.
+        """Return a sensor_msgs/PointCloud2 as its camera saw it. `lookup` gives `T_target_source` of two frames.
 
         Raises:
             CloudError: as `points_from_message`, or the pixels show that the camera stood at another place.
@@ -193,9 +191,7 @@ def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple
 
 
 def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
-    """Return what a depth image shows, in the camera's optical frame.
-
-    The arguments are those of `depth_and_camera`.
+    """Return what a depth image shows, in the camera's optical frame. The arguments are those of `depth_and_camera`.
 
     Raises CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
     """
@@ -207,7 +203,7 @@ def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) 
 
 
 def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
-    """Put a tf2_msgs/TFMessage into a buffer. Returns a line for each invalid transform, which is left out."""
+    """Put a tf2_msgs/TFMessage into a buffer. Return a line for each invalid transform, which is left out."""
     refused = []
     for item in message.transforms:
         try:

@@ -197,9 +197,7 @@ class GraspLibrary:
     def add(
         self, entry: LibraryEntry, target: ObjectModel, hand: HandModel, config: PlanConfig, grasps: Sequence[Grasp]
     ) -> int:
-        """Append verified grasps to an entry.
-
-        Returns the number that it has then.
+        """Append verified grasps to an entry. Return the number that it has then.
 
         Args:
             entry: of `target` and `hand`.

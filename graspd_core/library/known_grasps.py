@@ -1,6 +1,4 @@
-"""Grasps of a known object in the present scene.
-
-Missing ones are planned and added to the library.
+"""Grasps of a known object in the present scene. Missing ones are planned and added to the library.
 
 A name or a mesh file says which object is meant. An error says what the library has instead. Stored grasps are as good
 as when they were tried if nothing stands near. Otherwise a hand that would collide is refused, one that comes near is
@@ -50,10 +48,7 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """What grasps are to hold under: mass [kg] and friction of the object, and the trials.
-
-    A mass of None accepts any.
-    """
+    """What grasps must hold under: mass [kg] and friction of the object, and the trials. A mass of None accepts any."""
 
     mass: float | None
     friction: float
@@ -107,9 +102,7 @@ def entry_by_file(
     *,
     required: bool = True,
 ) -> LibraryEntry | None:
-    """Return the entry of a mesh file, or shape:NAME, at a scale.
-
-    None if it is missing and not required.
+    """Return the entry of a mesh file, or shape:NAME, at a scale. None if it is missing and not required.
 
     Raises:
         ConfigError: the content is unknown, or not at this scale, with this hand or this physics.
@@ -329,7 +322,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return the least distance [m] of each hand to support and obstacles, pregrasp to squeeze, infinite without."""
+    """Return the least distance [m] of each hand to support and obstacles, retreat to squeeze, infinite without."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

@@ -1,6 +1,4 @@
-"""Pieces of one mesh.
-
-Tiny floating pieces are dropped, and separate bodies are reported.
+"""Pieces of one mesh. Tiny floating pieces are dropped, and separate bodies are reported.
 
 Scanners and careless exports leave floating pieces. A hand grasps separate bodies as if they were one rigid body.
 """

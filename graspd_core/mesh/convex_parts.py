@@ -1,6 +1,4 @@
-"""Convex parts that fill an object and leave its hollows hollow, by greedy planar cuts.
-
-Metres, in the object's frame.
+"""Convex parts that fill an object and leave its hollows hollow, by greedy planar cuts. Metres, in the object's frame.
 
 A cluster of surface points stands for the convex hull of its points. The cluster whose hull reaches farthest outside
 the object, by the signed distance grid, is cut by the plane that leaves the least bulge. This goes on until no hull

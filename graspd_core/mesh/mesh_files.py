@@ -1,6 +1,4 @@
-"""Meshes in and out: reading, checking, cleaning, measuring.
-
-Lengths in metres.
+"""Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres.
 
 Files that hold no mesh, or half of one, are refused by what they are. A guess at the unit of a file goes into a message
 and is never applied.
@@ -139,9 +137,7 @@ SPREAD_POINTS = 2**15
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
-    """Read a mesh file.
-
-    Parts of a scene are joined in place, and coordinates multiplied by `scale`.
+    """Read a mesh file. Parts of a scene are joined in place, and coordinates multiplied by `scale`.
 
     Raises:
         MeshError: the file is missing, a directory, of an unknown ending, no mesh, cut off, unreadable, or holds no

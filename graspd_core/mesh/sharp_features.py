@@ -59,7 +59,7 @@ def _is_thin(query: DistanceQuery, points: Points, normals: Points, probe: float
 
 
 def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray, "points 3"]:
-    """Return `count` points evenly along the edges where faces meet at more than 20°, or end [m].
+    """Return `count` points evenly along the edges where faces meet at over 20°, or end [m].
 
     None without such edges.
     """

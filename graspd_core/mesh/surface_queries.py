@@ -1,6 +1,4 @@
-"""Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64.
-
-No grid, no gradient.
+"""Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64. No grid, no gradient.
 
 Signed distances, which metrics use, are negative inside by the generalised winding number (Barill et al. 2018). Open,
 overlapping, doubled and inverted surfaces have an inside too. Only rays use Open3D (Embree), which takes half a second
@@ -198,10 +196,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin.
-
-    Returns how many `directions` long they are (infinite: no hit), faces and unit normals.
-    """
+    """Cast rays from the origin. Return the lengths in `directions` (infinite: no hit), faces and unit normals."""
     import open3d as o3d
 
     # Embree counts in float32: about the mesh's centre it need not be near the origin.

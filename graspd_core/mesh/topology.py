@@ -113,9 +113,9 @@ def orient(vertices: Vertices, faces: Faces) -> Faces:
 
 
 def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
-    """Return the same surface with no edge above `longest` [m], by halving longest edges.
+    """Return the same surface with no edge above `longest` [m].
 
-    Faces no longer share corners.
+    Longest edges are halved. Faces share no corners then.
     """
     corners = mesh.vertices[mesh.faces]
     done = []

@@ -85,12 +85,11 @@ def draw_starts(
     """Draw `count` seeded starts with the palm on the object's convex hull, at places that the hand can span.
 
     This follows the published initialisation of Grasp'D (a random surface point, palm towards it, random roll). Points
-    are on the hull, so that no palm starts inside a hollow. Place and roll favour narrow cross-sections.
-    A share `fingertips` of the starts has half-closed fingers, and the middle between the fingertips in place of the
-    palm: an open hand does not reach what is small or low on a table.
-    Hands that would reach into obstacles, or could not have come there, are drawn last.
-    With restrictions, starts are drawn until enough are allowed, or `_MOST_POOLS` times as many were drawn: then there
-    are fewer than `count`, perhaps none.
+    are on the hull, so that no palm starts inside a hollow. Place and roll favour narrow cross-sections. A share
+    `fingertips` of the starts has half-closed fingers, and the middle between the fingertips in place of the palm: an
+    open hand does not reach what is small or low on a table. Hands that would reach into obstacles, or could not have
+    come there, are drawn last. With restrictions, starts are drawn until enough are allowed, or `_MOST_POOLS` times as
+    many were drawn: then there are fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)

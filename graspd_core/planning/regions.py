@@ -1,11 +1,4 @@
-"""Regions of space: boxes, balls and neighbourhoods of points.
-
-And whether a link enters a box.
-
-Entering is exact for solids that are the hull of balls, which all but finely cut hulls are. Frank and Wolfe's steps
-(Naval Research Logistics 1956) lead to the point of a solid's core that is nearest to the box. On their way they give a
-lower bound of the distance. An undecided pair counts as entered.
-"""
+"""Regions of space: boxes, balls and neighbourhoods of points. Also checks whether a link enters a box."""
 
 from __future__ import annotations
 

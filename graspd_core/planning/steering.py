@@ -75,9 +75,7 @@ _PROBES, _TOO_DEEP = 8, 0.06
 
 @dataclass(frozen=True)
 class Steering:
-    """What is asked of a grasp's place and direction, in the object frame.
-
-    None: not asked for.
+    """What is asked of a grasp's place and direction, in the object frame. None: not asked for.
 
     A hand's approach is the direction in which it moves from the retreat over the pregrasp to the grasp:
     `HandModel.approach`, by default the palm's normal.

@@ -59,9 +59,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
-    """A child process that calls functions.
-
-    It starts at once and ends with this process, however that ends.
+    """A child process that calls functions. It starts at once and ends with this process, however that ends.
 
     Calls come one at a time. Before the first the child imports `modules`. A child that has died is replaced. Functions
     must be importable by their names. Arguments, results and errors are pickled. With `killed_with_thread` the child

@@ -80,9 +80,7 @@ def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
 def answer_known(
     rule: StopRule, protocol: Protocol, states: Sequence[ObjectState], moved: tuple[float, float], left: int
 ) -> bool:
-    """Tell whether a hold need not go on.
-
-    False if anything is not finite.
+    """Tell whether a hold need not go on. False if anything is not finite.
 
     Args:
         rule: of the hold.

@@ -136,7 +136,7 @@ def close_hand(
 ) -> str:
     """Move the hand from pregrasp to squeeze.
 
-    Returns why the trial is over, if it is. Updates travel and turn in `worst`.
+    Return why the trial is over, if it is. Updates travel and turn `worst`.
     """
     import mujoco
 
@@ -219,7 +219,7 @@ def set_joints(world: World, data: Any, values: np.ndarray) -> None:
 
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
-    """Move the targets linearly from start to end. Returns why the trial is over, empty if it is not."""
+    """Move the targets linearly from start to end. Return why the trial is over, empty if it is not."""
 
     steps = round(protocol.stage_time / protocol.timestep)
     way = straight_way(start, end, np.arange(1, steps + 1) / steps)
@@ -271,7 +271,7 @@ def diverged(data: Any) -> bool:
 
 
 def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
-    """Update the worst travel and turn. Returns the broken limit, if any."""
+    """Update the worst travel and turn. Return the broken limit, if any."""
     travel, turn = moved(world, object_state(world, data))
     if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
         worst[:] = np.inf

@@ -120,7 +120,7 @@ def _raise(
     worst: np.ndarray,
     stop: Callable[[], bool],
 ) -> str:
-    """Come, close, squeeze and raise the hand. Returns why the trial is over, empty if it is not. Updates `worst`."""
+    """Come, close, squeeze and raise the hand. Return why the trial is over, empty if it is not. Updates `worst`."""
 
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):

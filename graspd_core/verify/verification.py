@@ -336,9 +336,7 @@ _UNIT_TOLERANCE = 0.01
 def verify_grasps(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], *, verify: str = "standard", measure: bool = True
 ) -> tuple[Grasp, ...]:
-    """Try and measure given grasps, in their order.
-
-    None is dropped.
+    """Try and measure given grasps, in their order. None is dropped.
 
     Args:
         scene: what is grasped. With a support or obstacles the lift trial runs too.

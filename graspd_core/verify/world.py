@@ -112,7 +112,7 @@ def add_object(
 
 
 def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tuple[str, ...]:
-    """Add free bodies about the object. Returns the names of their bodies."""
+    """Add free bodies about the object. Return the names of their bodies."""
     names = tuple(f"other {index + 1}" for index in range(len(others)))
     for name, other in zip(names, others, strict=True):
         add_object(spec, other.model, other.parts, friction, name=name, pose=other.pose)

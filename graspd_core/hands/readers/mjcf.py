@@ -222,7 +222,7 @@ def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], dept
 
 
 def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path]) -> tuple[Path, ET.Element]:
-    """Read the file that an `<include>` names, beside the main file or beside `holder`. Returns its path and root."""
+    """Read the file that an `<include>` names, beside the main file or beside `holder`. Return its path and root."""
     name = place.get("file") or ""
     told = f"<include file={shown(name)}>"
     found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)

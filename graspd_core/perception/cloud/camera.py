@@ -309,9 +309,7 @@ def _png_begins(data: memoryview) -> int:
 def cloud_from_depth(
     depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
-    """Return what a camera saw, in its own frame or, with its pose, in that frame.
-
-    Pixels without depth give no point.
+    """Return what a camera saw, in its own frame or, with its pose, in that frame. Pixels without depth give no point.
 
     Args:
         depth: along the optical axis [m]. 0, NaN and infinite mean none.

@@ -78,9 +78,7 @@ class FreeSpace:
 
 
 def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = ()) -> tuple[ViewDepth, ...]:
-    """Return the depth images of the views' points of the object.
-
-    Views with too few points make none.
+    """Return the depth images of the views' points of the object. Views with too few points make none.
 
     Args:
         views: the object's points alone.

@@ -63,9 +63,7 @@ def image(symmetry: Symmetry, surfels: Surfels) -> Surfels:
 
 
 def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
-    """Return how useful symmetries are.
-
-    One whose images all fall on seen surface is true and useless.
+    """Return how useful symmetries are. One whose images all fall on seen surface is true and useless.
 
     Args:
         agree, wrong: share of judged images that the cameras confirm and contradict.
