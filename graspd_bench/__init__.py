@@ -1,1 +1,1 @@
-"""The benchmark: studies, charts and tables, and what only they need."""
+"""The benchmark: studies, charts and tables, and code that only they use."""

@@ -1,4 +1,4 @@
-"""`graspd bench`: one runner for every study, resumable, to figures, tables, charts and pages."""
+"""`graspd bench`: runs every study, resumes it, and writes figures, tables, charts and pages."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 1 where something is wrong, 130 after Ctrl-C; finished cases are kept either way."""
+    """Run the command. Return the exit status: 0, 1 if something is wrong, 130 after Ctrl-C. Finished cases stay."""
     from graspd_bench.result_store import read_results, write_results
     from graspd_bench.run_studies import faults_of, make_plan, records_of, run_plan, studies_of
     from graspd_bench.study import Request
@@ -136,7 +136,7 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
 
 
 class Lines:
-    """Progress over cases: a bar on a terminal, elsewhere a line a case; first, how long it will take."""
+    """Progress over cases: a bar on a terminal, elsewhere a line for each case. The first line tells the duration."""
 
     def __init__(self, plan: Plan, processes: int) -> None:
         self.plan, self.processes = plan, processes

@@ -30,7 +30,7 @@ from graspd_bench.study import Record
 from graspd_bench.suites import SWEEPS
 from graspd_core.optimize.plan_config import method_row
 
-# Colours of Okabe and Ito (2008), which the colour-blind can tell apart; a marker's shape says the same.
+# Colours of Okabe and Ito (2008), which the colour-blind can tell apart. A marker's shape says the same.
 FRONT = "#222222"
 _STYLE: Any = {
     "font.size": 9,
@@ -46,14 +46,14 @@ _STYLE: Any = {
 }
 # The line from a label that stands far off to its point.
 _LEADER = {"arrowstyle": "-", "lw": 0.5, "alpha": 0.6, "shrinkA": 0, "shrinkB": 3}
-# Where a label may stand about its point, in points of print; the nearest free place is taken.
+# Where a label may stand about its point, in points of print. The nearest free place is taken.
 _ANGLES = np.deg2rad([0, 180, 90, 270, 45, 135, 315, 225, 22, 158, 202, 338, 67, 113, 247, 293])
 _DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
 
 
 @contextmanager
 def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
-    """A figure and its axes in the common style [inches]; closed at the end."""
+    """Yield a figure and its axes in the common style [inches], and close it at the end."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -68,7 +68,7 @@ def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]
 
 
 def save(made: Any, path: Path) -> Path:
-    """Write PNG and SVG, the same bytes for the same data; returns the PNG's path."""
+    """Write PNG and SVG, the same bytes for the same data. Return the PNG's path."""
     png, svg = path.with_name(f"{path.name}.png"), path.with_name(f"{path.name}.svg")
     png.parent.mkdir(parents=True, exist_ok=True)
     made.savefig(png, dpi=160, metadata={"Software": None})
@@ -81,7 +81,7 @@ def place_labels(
 ) -> None:
     """Write a label beside each point of an axes, clear of the points, of other labels and of the frame.
 
-    Call it last: it needs the final layout.
+    Call it last, because it needs the final layout.
     """
     from matplotlib.patheffects import withStroke
 
@@ -116,7 +116,7 @@ def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -
 
 
 def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
-    """Area that a label would share with what is there, or have outside the frame; ties go to the first place."""
+    """Return the area that a label would share with taken places or have outside the frame. The first wins ties."""
     low, high = place - half, place + half
     shared = 0.0
     for x0, y0, x1, y1 in taken:
@@ -137,15 +137,15 @@ _SUCCESS, _TIME = method_row("closed_form").colour, method_row("graspd2022").col
 
 @dataclass(frozen=True)
 class Panel:
-    """What a panel shows against time.
+    """One figure against time.
 
     Attributes:
         figure: of `figures.Row`.
         label: of its axis.
         factor: from the figure's unit to the label's.
-        less_is_better: or more is.
-        mean: the marker is the mean over objects, because a share's median hides failures; or the median.
-        log: of the axis.
+        less_is_better: whether less is better, not more.
+        mean: whether the marker is the mean over objects, not the median. A share's median hides failures.
+        log: whether the axis is logarithmic.
     """
 
     figure: str
@@ -167,7 +167,7 @@ _LEAST = 0.01
 
 @dataclass(frozen=True)
 class Point:
-    """One preset on one panel: middle and quartiles over objects on both axes, and whether any grasp of it held."""
+    """One preset on one panel: middle and quartiles over objects on both axes, and whether any of its grasps held."""
 
     name: str
     method: str
@@ -179,7 +179,7 @@ class Point:
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     """Draw what the records have figures for: PATH.png and .svg, PATH_short, PATH_planned, PATH_ladder.
 
-    Returns the PNGs drawn, by "speed", "short", "planned" and "ladder".
+    Return the PNGs drawn, by "speed", "short", "planned" and "ladder".
     """
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]
@@ -195,7 +195,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
-    """Seconds per verified grasp against seconds to the first, both as planned. None where there is nothing to draw."""
+    """Draw seconds per verified grasp against seconds to the first, both as planned. None if there is nothing."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:
@@ -212,7 +212,7 @@ def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
 
 
 def draw_speed(presets: dict[str, list[Row]], path: Path) -> Path | None:
-    """A panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw."""
+    """Draw a panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw."""
     panels = [(panel, points) for panel in PANELS if (points := points_of(presets, "cpu_per_grasp", panel))]
     if not panels:
         return None
@@ -228,7 +228,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path) -> Path | None:
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """A point for every preset that has both figures, in the panel's unit."""
+    """Return a point for every preset that has both figures, in the panel's unit."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)
@@ -284,7 +284,7 @@ def _legend(made: Any, methods: Sequence[str]) -> None:
 
 
 def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
-    """Draw a panel for every sweep. Returns the PNG's path."""
+    """Draw a panel for every sweep. Return the PNG's path."""
     sweeps = {name: {} for name in SWEEPS}
     for name, group in by_name(found).items():
         sweep, sweep_value = name.split("=")

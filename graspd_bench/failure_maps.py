@@ -1,6 +1,6 @@
-"""Failure maps: where methods stop working. `MAPS` is the registry.
+"""Failure maps, which show where methods stop working. `MAPS` is the registry.
 
-A case is a planning and the cells that its grasps are tried in: friction and mass, the object's size, a single depth
+A case is one planning and the cells that its grasps are tried in: friction and mass, the object's size, a single depth
 view, or the wall of a cup. The heat maps show the share held in every cell, and where half of it is lost.
 """
 
@@ -47,7 +47,7 @@ NOT_FOUND, NO_SCENE = "no grasp found", "no scene"
 
 @dataclass(frozen=True)
 class MapCase(Case):
-    """A planning, and the cells that its grasps are tried in.
+    """One planning, and the cells that its grasps are tried in.
 
     Attributes:
         map: name of the map.
@@ -55,7 +55,7 @@ class MapCase(Case):
         thing: name of the object.
         across: place of all its cells on the horizontal axis.
         up: places of its cells on the vertical axis.
-        count: raw grasps asked for, each of which is tried in every cell.
+        count: requested raw grasps, each of which is tried in every cell.
         seed: of everything that is drawn.
         hand: by name.
     """
@@ -77,12 +77,12 @@ class MapCase(Case):
 
 @dataclass(frozen=True)
 class MapCell:
-    """What came of one case's grasps in one cell.
+    """The results of one case's grasps in one cell.
 
     Attributes:
         up: its place on the vertical axis.
         held: grasps that passed the hold trial.
-        reasons: why the others did not, and how many each; a grasp that was not found has a reason, too.
+        reasons: why the others failed, and how many for each. A grasp that was not found has a reason, too.
     """
 
     up: Place
@@ -95,7 +95,7 @@ Run = Callable[[MapCase], tuple[MapCell, ...]]
 
 
 def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
-    """The cells of a case; where its scene is refused, all of its grasps are lost for that reason."""
+    """Return the cells of a case. If its scene is refused, all of its grasps are lost for that reason."""
     try:
         return run(case)
     except GraspdError as error:
@@ -105,18 +105,18 @@ def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
 
 @lru_cache(maxsize=4)
 def settings(preset: str) -> PlanConfig:
-    """Settings by name."""
+    """Return settings by name."""
     return load_preset(preset)
 
 
 @lru_cache(maxsize=4)
 def hand_for(name: str, candidates: int) -> HandModel:
-    """A hand with so many contact candidates."""
+    """Return a hand with so many contact candidates."""
     return load_hand(name, candidates=candidates)
 
 
 def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
-    """The hand, and the first of the method's own ranking, none filtered by a trial."""
+    """Return the hand and the first grasps of the method's own ranking, none filtered by a trial."""
     config = settings(case.preset)
     hand = hand_for(case.hand, config.problem.fine_candidates)
     return hand, raw_grasps(scene, hand, config, case.count, case.seed)
@@ -125,7 +125,7 @@ def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
 def try_grasps(
     case: MapCase, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
 ) -> MapCell:
-    """Every grasp in the hold trial on `target`."""
+    """Run the hold trial of every grasp on `target`."""
     if not grasps:
         return MapCell(up, 0, {NOT_FOUND: case.count})
     world = build_world(hand, target, object_parts(target), protocol)
@@ -152,7 +152,7 @@ def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def run_size(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan and try on the shape scaled so that its least width is that share of the hand's span; 0.1 kg throughout."""
+    """Plan and try on the shape, scaled so that its least width is that share of the hand's span, at 0.1 kg."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     scale = width / least_width(make_shape(case.thing))
@@ -162,14 +162,14 @@ def run_size(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def least_width(mesh: TriangleMesh) -> float:
-    """The least extent along the axes of a mesh [m]: of the authored shapes, what a hand has to span."""
+    """Return the least extent along the axes of a mesh [m]. For the authored shapes the hand must span it."""
     return float(np.ptp(mesh.vertices, axis=0).min())
 
 
 def hand_span(hand: HandModel) -> float:
-    """The greatest distance between two fingertips that joints within their limits allow [m].
+    """Return the greatest distance between two fingertips that joints within their limits allow [m].
 
-    The greatest of a few thousand seeded postures: about a millimetre short of the true one.
+    It is the greatest of a few thousand seeded postures, about a millimetre below the true one.
     """
     fingers = find_fingers(hand)
     draw = torch.Generator().manual_seed(0)
@@ -190,7 +190,7 @@ def _span(hand: str, candidates: int) -> float:
 
 
 def run_view(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan on the reconstruction of one view at that elevation [deg]; try on the true object in its place."""
+    """Plan on the reconstruction of one view at that elevation [deg], and try on the true object in its place."""
     (noise,) = case.up
     truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
     hand, grasps = plan(case, scene)
@@ -198,9 +198,9 @@ def run_view(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def noise_at(times: float) -> DepthNoise:
-    """The usual sensor with its errors and losses so many times as large; none at all at zero.
+    """Return the usual sensor with its errors and losses so many times as large, none at all at zero.
 
-    Its resolution, its range and the angles at which it goes blind stay: they are no noise.
+    Its resolution, its range and the angles at which it goes blind stay, because they are no noise.
     """
     if not times:
         return NONE
@@ -211,10 +211,9 @@ def noise_at(times: float) -> DepthNoise:
 
 @lru_cache(maxsize=1)
 def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int) -> tuple[ObjectModel, Scene]:
-    """The true object, and the scene that one view of it makes; the same for every method.
+    """Return the true object and the scene of one view of it, the same for every method.
 
-    Raises:
-        CloudError: the view shows no usable object.
+    Raises CloudError if the view shows no usable object.
     """
     stage = tabletop(thing, yaw=_YAW)
     poses = ring_poses(1, elevation=float(np.deg2rad(elevation)), azimuth=float(_AZIMUTH))
@@ -224,7 +223,7 @@ def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int
 
 
 def run_wall(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan on a grid of that resolution, and no finer, of a cup with walls of so many millimetres."""
+    """Plan on a cup with walls of so many millimetres, on a grid of that resolution and no finer."""
     (wall,) = case.up
     scene = on_grid(cup(float(wall)), int(case.across))
     hand, grasps = plan(case, scene)
@@ -233,12 +232,12 @@ def run_wall(case: MapCase) -> tuple[MapCell, ...]:
 
 @lru_cache(maxsize=1)
 def cup(wall: float) -> Scene:
-    """A cup with walls of so many millimetres."""
+    """Return a cup with walls of so many millimetres."""
     return build_scene(thin_cup(wall * 1e-3), mass=PROTOCOL_MASS, source=f"cup of {wall:g} mm")
 
 
 def on_grid(scene: Scene, resolution: int) -> Scene:
-    """The same scene with the distances of another grid, however much too coarse."""
+    """Return the same scene with the distances of another grid, even if it is much too coarse."""
     return replace(scene, sdf=build_sdf(scene.object.mesh, resolution=resolution))
 
 
@@ -253,7 +252,7 @@ _SIZED = ("sphere", "box", "cylinder")
 
 @dataclass(frozen=True)
 class MapAxis:
-    """What an axis shows, and where its cells lie, from left to right or from the bottom up."""
+    """An axis: what it shows, and the places of its cells, from left to right or from the bottom up."""
 
     label: str
     places: tuple[Place, ...]
@@ -261,13 +260,13 @@ class MapAxis:
 
 @dataclass(frozen=True)
 class Map:
-    """One picture.
+    """One heat map.
 
     Attributes:
         title: what it shows.
         across, up: its axes.
-        things: objects; a cell is of all of them, unless they are what an axis shows.
-        run: what is done for a case.
+        things: objects. A cell is of all of them, unless they are what an axis shows.
+        run: runs a case.
         together: whether one planning serves all cells of a column.
     """
 
@@ -280,7 +279,7 @@ class Map:
 
     @property
     def rows(self) -> bool:
-        """Whether every row has an object of its own."""
+        """Return whether every row has an object of its own."""
         return self.up.places == self.things
 
 
@@ -318,7 +317,7 @@ MAPS: Mapping[str, Map] = {
 
 
 def map_cases(request: Request) -> tuple[MapCase, ...]:
-    """The cases of the maps that are asked for. Raises ConfigError: there is no such map."""
+    """Return the cases of the requested maps. Raises ConfigError: there is no such map."""
     if unknown := [name for name in request.cases if name not in MAPS]:
         raise ConfigError(f"unknown map {unknown[0]!r}; valid: {', '.join(MAPS)}")
     names = request.cases or (tuple(MAPS)[1:2] if request.quick else tuple(MAPS))
@@ -329,7 +328,7 @@ def map_cases(request: Request) -> tuple[MapCase, ...]:
 
 
 def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
-    """All cases of a map with one method and the first seed; those on the same object lie next to each other."""
+    """Return all cases of a map with one method and the first seed, those on the same object side by side."""
     drawn = MAPS[name]
     count = COUNT if drawn.rows else COUNT // len(drawn.things)
     cases = []
@@ -341,13 +340,13 @@ def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
 
 
 def run_map(case: MapCase) -> Record:
-    """The figures of one case."""
+    """Return the figures of one case."""
     cells = [asdict(cell) for cell in run_on(MAPS[case.map].run, case)]
     return {"cells": cells, "held": max(cell["held"] for cell in cells)}
 
 
 def map_seconds(case: MapCase) -> float:
-    """CPU seconds of a case, roughly."""
+    """Return the CPU seconds of a case, roughly."""
     each = {"balanced": 0.1, "graspd2022_short": 0.45}.get(case.preset, 1.0)
     return 0.5 + case.count * (each + 0.05 * len(case.up))
 
@@ -360,9 +359,9 @@ _CELL, _EDGE = 0.52, "#D55E00"
 
 
 def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
-    """One panel a method, by its caption. Returns the PNG's path.
+    """Draw one panel for each method, by its caption. Return the PNG's path.
 
-    Cells without a record stay white; rows and columns in which no panel has any are left out.
+    Cells without a record stay white. Rows and columns in which no panel has any are left out.
     """
     drawn = _known(drawn, methods)
     columns, rows = len(drawn.across.places), len(drawn.up.places)
@@ -412,7 +411,7 @@ def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
 
 
 def _border(axis: Any, grid: Any) -> None:
-    """A line between cells of which one holds at least half of its grasps and the other less."""
+    """Draw a line between cells of which one holds at least half of its grasps and the other less."""
     works, known = grid >= 50, np.isfinite(grid)
     beside = (works[:, 1:] != works[:, :-1]) & known[:, 1:] & known[:, :-1]
     above = (works[1:] != works[:-1]) & known[1:] & known[:-1]
@@ -428,7 +427,7 @@ def _written(place: Place) -> str:
 
 
 def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """A picture a map, under the marker of its name, and all failures by reason."""
+    """Return a picture for each map, under the marker of its name, and all failures by reason."""
     sections: dict[str, list[str | Picture | None]] = {}
     body = []
     for name, drawn in MAPS.items():
@@ -446,7 +445,7 @@ def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
-    """Share of the grasps asked for that held, all objects together, by place across and up."""
+    """Return the share of the requested grasps that held, all objects together, by place across and up."""
     held, asked = Counter[tuple[Place, Place]](), Counter[tuple[Place, Place]]()
     for record in records:
         for cell in record["cells"]:
@@ -456,7 +455,7 @@ def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
 
 
 def reasons(records: Sequence[Record]) -> Counter[str]:
-    """Why grasps failed, and how many each."""
+    """Return why grasps failed, and how many each."""
     return sum((Counter(cell["reasons"]) for record in records for cell in record["cells"]), Counter[str]())
 
 

@@ -1,4 +1,4 @@
-"""Records to figures: by name (a preset, a sweep value) and object, then over objects, then against an earlier run."""
+"""Figures of records: by name (a preset, a sweep value) and object, then over objects, then against an earlier run."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from graspd_core.verify.metrics import METRICS
 
 # Presets of the first page: those that people plan with, the published method, its repaired form and a baseline.
 FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_repaired", "random_closure")
-# The first that fits a name tells its parent; a parent has none.
+# The first that fits a name tells its parent. A parent has none.
 _ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
 
 
 def parent_of(name: str) -> str | None:
-    """The preset that `name` is an ablation of; None for one of its own."""
+    """Return the preset that `name` is an ablation of, or None."""
     return next((parent for prefix, parent in _ABLATIONS if name.startswith(prefix)), None)
 
 
 def hand_row(hand: str) -> str:
-    """The name of the cells by which hands are compared."""
+    """Return the name of the cells by which hands are compared."""
     return f"hand:{Path(hand).stem}"
 
 
 def is_hand(name: str) -> bool:
-    """Whether a name is of cells by which hands are compared, `hand:leap_right` say."""
+    """Return whether a name is of cells by which hands are compared, as `hand:leap_right`."""
     return name.startswith("hand:")
 
 
 def is_preset(name: str) -> bool:
-    """Whether a name is of a preset: neither a sweep value nor a hand."""
+    """Return whether a name is of a preset, neither of a sweep value nor of a hand."""
     return not is_sweep_value(name) and not is_hand(name)
 
 
 def is_sweep_value(name: str) -> bool:
-    """Whether a name is of a sweep value, `steps=90` say, and not of a preset."""
+    """Return whether a name is of a sweep value, as `steps=90`, and not of a preset."""
     return "=" in name
 
 
 def short_name(name: str) -> str:
-    """A label for the chart: an ablation goes by what it lacks."""
+    """Return a label for the chart. An ablation goes by what it lacks."""
     parent = parent_of(name)
     if parent is None:
         return name
@@ -54,7 +54,7 @@ def short_name(name: str) -> str:
     return name.removeprefix(method).replace("_", " ")
 
 
-# Shares of grasps that passed a trial; a grasp that was not found did not pass.
+# Shares of grasps that passed a trial. A grasp that was not found did not pass.
 TRIAL_FIGURES = ("standard", "hard", "noisy")
 # Displacements that trials measured [cm], by figure: which trial.
 _DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
@@ -62,15 +62,15 @@ _DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one name on one object, all seeds together; None where there is none.
+    """Figures of one name on one object, all seeds together. None where there is none.
 
     Attributes:
-        asked: grasps asked for.
+        asked: requested grasps.
         given: grasps found.
         held: grasps that passed the standard hold trial.
         spent: CPU seconds of the optimiser and of those trials.
 
-    `values` has the medians of `_grasp_figures` over the grasps, the shares of `TRIAL_FIGURES` of the grasps asked for,
+    `values` has the medians of `_grasp_figures` over the grasps, the shares of `TRIAL_FIGURES` of the requested grasps,
     and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`, `cpu_per_verified` (`spent` over `held`),
     `first_cpu` and `first_wall` until the first verified grasp.
     """
@@ -97,7 +97,7 @@ class Spread:
 
 
 def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
-    """A row for every name and object, in the order of the records. Cells that raised are left out."""
+    """Return a row for every name and object, in the order of the records. Cells that raised are left out."""
     groups: dict[tuple[str, str], list[Record]] = {}
     # Where nothing was found there is no trace of the trials: those of the other records are meant, and the first.
     ran = {TRIAL_FIGURES[0]}
@@ -118,7 +118,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
         tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
         values[trial] = sum(outcome or 0.0 for outcome in outcomes) / asked if tried else None
-    # Planned runs have one total; raw ones count what a plan would have spent, the best of trials only.
+    # Planned runs have one total. Raw ones count what a plan would have spent, the best of trials only.
     spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)
     values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / asked
     prepared = sum(r["cpu"].get("scene", 0.0) for r in group)
@@ -133,7 +133,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
-    """A figure's spread over objects; None where no object has it."""
+    """Return a figure's spread over objects, or None where no object has it."""
     values = [value for row in rows if (value := row.values.get(figure)) is not None]
     if not values:
         return None
@@ -142,16 +142,16 @@ def spread(rows: Iterable[Row], figure: str) -> Spread | None:
 
 
 def per_verified(rows: Sequence[Row]) -> float | None:
-    """CPU seconds of the optimiser and the trials for each grasp that held, all objects together; None where none did.
+    """Return CPU seconds of optimiser and trials for each grasp that held, all objects together, or None if none did.
 
-    Not a mean over objects: one on which nothing held has cost seconds, too.
+    It is not a mean over objects, because one on which nothing held has cost seconds, too.
     """
     held = sum(row.held for row in rows)
     return sum(row.spent for row in rows) / held if held else None
 
 
 def by_name(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Rows of each name."""
+    """Return the rows of each name."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.name, []).append(row)
@@ -176,9 +176,9 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 
 
 def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
-    """Which points are on the front where less is better on every axis.
+    """Return which points are on the front where less is better on every axis.
 
-    A point is off it when another is no worse on every axis and better on one; equal points are on it together.
+    A point is off it when another is no worse on every axis and better on one. Equal points are on it together.
     """
     no_worse = (points[:, None] <= points[None]).all(-1)
     better = (points[:, None] < points[None]).any(-1)
@@ -200,7 +200,7 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Move:
-    """One figure that is not what it was; None where it is not there."""
+    """One figure that changed. None where it is missing."""
 
     kind: str
     name: str
@@ -211,7 +211,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """What moved: for each name over all objects that both runs have ("all"), then object by object."""
+    """Return what changed: for each name over all objects that both runs have ("all"), then object by object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}
@@ -251,7 +251,7 @@ def _mean(group: Sequence[Row], figure: str) -> float | None:
 
 
 def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
-    """The moves of cells as a table; what only one of the runs has is named below it."""
+    """Return the moves of cells as a table. Names that only one of the runs has are listed below it."""
     old, new = ([record for record in records if "kind" in record] for records in (old, new))
     lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
     for move in moves(old, new):

@@ -1,6 +1,6 @@
-"""One cell: a kind of run, settings, an object, a hand and a seed; and what is run for it.
+"""Cells of the suites: a kind of run, settings, an object, a hand and a seed, and the code that runs them.
 
-Its trials go by the names of `--trials` (docs/metrics.md). Lengths are in the unit of their name, [cm] and [deg].
+Its trials have the names of `--trials` (docs/metrics.md). Lengths are in the unit of their name, [cm] and [deg].
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Trial = Callable[[Grasp], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Tried:
-    """What a trial needs to know: the hand, the object and its convex parts."""
+    """What a trial needs: the hand, the object and its convex parts."""
 
     hand: HandModel
     target: ObjectModel
@@ -136,7 +136,7 @@ class Cell(Case):
         object: a mesh file or shape:NAME.
         hand: name or path.
         seed: of the method.
-        count: grasps asked for.
+        count: requested grasps.
         trials: names of the trials of every raw grasp.
     """
 
@@ -172,12 +172,12 @@ class Cell(Case):
 
 
 def run_cell(cell: Cell) -> Record:
-    """Figures of one cell."""
+    """Return the figures of one cell."""
     return {"raw": run_raw, "verified": run_verified, "pace": run_pace, "start": run_start}[cell.kind](cell)
 
 
 def run_raw(cell: Cell) -> dict[str, Any]:
-    """Figures of one raw cell. Grasps that a method does not find are missing from the list, and count as failed."""
+    """Return the figures of one raw cell. Grasps that a method does not find are not listed, and count as failed."""
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
@@ -214,7 +214,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
 
 
 class _First:
-    """Notes when the first grasp was verified, and how often the optimiser was started."""
+    """A progress hook that notes when the first grasp was verified, and how often the optimiser was started."""
 
     def __init__(self, began: dict[str, float]) -> None:
         self.began, self.first, self.rounds, self._stage = began, None, 0, Stage.LOAD
@@ -228,7 +228,7 @@ class _First:
 
 
 def run_verified(cell: Cell) -> dict[str, Any]:
-    """Figures of one planned run: how many of `count` were verified, and what all of it cost."""
+    """Return the figures of one planned run: how many of `count` were verified, and the cost of all of it."""
     hand = load_hand(cell.hand)
     began = _now()
     told = _First(began)
@@ -252,9 +252,9 @@ def _now() -> dict[str, float]:
 
 
 def run_pace(cell: Cell) -> dict[str, Any]:
-    """CPU seconds of one batch, the least of three after one that is not counted, and what a grasp-step of it costs.
+    """Return CPU seconds of one batch and of a grasp-step, the least of three batches after one that is not counted.
 
-    A grasp-step is one step of one start: what the optimiser does most of.
+    A grasp-step is one step of one start, which is most of the optimiser's work.
     """
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     scene = load_scene(cell.object, mass=PROTOCOL_MASS, resolution=cell.settings.resolution)
@@ -269,7 +269,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
 
 def grasp_steps(cell: Cell) -> int | None:
-    """Steps times starts of one batch of the closed form; None for other methods."""
+    """Return steps times starts of one batch of the closed form, or None for other methods."""
     s = cell.settings.settings
     if not isinstance(s, ClosedFormConfig):
         return None
@@ -278,7 +278,7 @@ def grasp_steps(cell: Cell) -> int | None:
 
 
 def run_start(cell: Cell) -> dict[str, Any]:
-    """Seconds from the start of a process to its first verified grasp, with nothing remembered on disk."""
+    """Return the seconds from the start of a process to its first verified grasp, without caches on disk."""
     environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Records on disk, a file each, kept under everything that was asked for; and all of a run in one results file."""
+"""Records on disk, one file each, whose key is everything that was asked for, and all records of a run in one file."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _COUNTED = ("baselines/*.py", "rendering/*.py", "trials.py")
 
 
 def case_key(study: str, case: Case) -> str:
-    """Hash of everything that a case asks, hexadecimal. The code that answers is recorded beside it."""
+    """Return a hash of everything that a case asks, hexadecimal. The version of the code is recorded beside it."""
     return hashlib.sha256(json.dumps({"study": study, **case.asked()}, sort_keys=True).encode()).hexdigest()
 
 
 def case_file(study: str, case: Case) -> str:
-    """Name of the file that a record is kept in: for the eye, then for certain."""
+    """Return the name of a record's file: readable words, then a part of its key."""
     words = re.sub(r"[^A-Za-z0-9_.=-]+", "_", f"{study}-{case.label}")
     return f"{words[:120]}-{case_key(study, case)[:12]}.json"
 
 
 def head(study: str, case: Case, code: str) -> Record:
-    """The part of a record that is known before the run."""
+    """Return the part of a record that is known before the run."""
     return {
         **case.shown(),
         "study": study,
@@ -48,12 +48,12 @@ def head(study: str, case: Case, code: str) -> Record:
 
 
 def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
-    """Keep a record; its file appears whole or not at all, whatever kills the process."""
+    """Write a record. Its file appears whole or not at all, even if the process is killed."""
     save_text(folder / case_file(study, case), json.dumps(finite(record), indent=1, allow_nan=False) + "\n")
 
 
 def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
-    """The record of a case under `code` (None: under any), where it failed only with `failed`; None: there is none."""
+    """Return the record of a case under `code` (None: under any), or None. Failed ones are left out unless `failed`."""
     try:
         record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -64,12 +64,12 @@ def read_record(folder: Path, study: str, case: Case, code: str | None, *, faile
 
 
 def write_results(path: Path, records: Sequence[Record]) -> None:
-    """All records in one file."""
+    """Write all records to one file."""
     save_text(path, json.dumps({"format": FORMAT, "version": VERSION, "records": records}, allow_nan=False) + "\n")
 
 
 def read_results(path: Path) -> list[Record]:
-    """The records of a results file.
+    """Return the records of a results file.
 
     Raises:
         FormatError: it cannot be read, is of another format, or of an unknown version.

@@ -1,4 +1,4 @@
-"""Studies end to end: what is asked, what has finished before, the rest run, and what came of it onto pages.
+"""Runs of studies: makes the cases, skips finished ones, runs the rest, and writes the results to pages.
 
 Each worker process does one case after the other, so that a death costs one case.
 """
@@ -27,17 +27,17 @@ from graspd_dataset.run_records import failure, finite, forget_peak, peak_mb
 
 # How often a stop is looked for [s].
 _POLL = 0.2
-# One thread each, so that CPU seconds are comparable; nothing remembered on disk, so that every case builds its own.
+# One thread each, so that CPU seconds are comparable. Nothing remembered on disk, so that every case builds its own.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "GRASPD_CACHE": "off"}
 
 
 @dataclass(frozen=True)
 class Job:
-    """A case, what is run for it, and under which study and code its record is kept.
+    """A case, the function that runs it, and the study and code of its record.
 
     Attributes:
         alone: in a process of its own, cold.
-        patience: seconds until it is called hung.
+        patience: seconds until it counts as hung.
     """
 
     study: str
@@ -51,9 +51,9 @@ class Job:
 def run_cases(
     jobs: Sequence[Job], folder: Path, processes: int, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Job, Record]]:
-    """Run jobs on `processes` workers and yield each as it ends; its record is on disk by then.
+    """Run jobs on `processes` workers and yield each as it ends. Its record is on disk by then.
 
-    Ends early, its workers killed, once `stop` is true. A worker that dies (out of memory, say) or hangs is a record
+    Ends early, its workers killed, once `stop` is true. A worker that dies (as out of memory) or hangs gives a record
     with that error, and another takes its place.
     """
     waiting = deque(jobs)
@@ -82,7 +82,7 @@ def run_cases(
 
 
 class _Worker:
-    """A spawned process, the pipe to it, and what it does."""
+    """A spawned process, the pipe to it, and its job."""
 
     def __init__(self, folder: Path, *, warm: bool) -> None:
         context = get_context("spawn")
@@ -103,7 +103,7 @@ class _Worker:
             self.pipe.send(job)
 
     def receive(self, folder: Path) -> Record:
-        """The record that it answers with; where it died, one that says so."""
+        """Return the record that it answers with. If it died, the record says so."""
         try:
             return self.pipe.recv()
         except (EOFError, ConnectionResetError):
@@ -112,7 +112,7 @@ class _Worker:
             return self._write(folder, failure(died, "died"))
 
     def lost(self, folder: Path) -> Record:
-        """Kill it; the record says that it hung."""
+        """Kill it and return a record that says that it hung."""
         self.end()
         return self._write(folder, failure(TimeoutError(f"no end after {self.job.patience:.0f} s"), "hung"))
 
@@ -128,7 +128,7 @@ class _Worker:
 
 def _work(pipe: connection.Connection, folder: Path, warm: bool) -> None:
     """Do jobs until there are no more."""
-    # A Ctrl-C reaches the whole group of processes; the parent decides what it means.
+    # A Ctrl-C reaches the whole group of processes. The parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Libraries greet on stdout, which is the parent's for its tables.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -143,9 +143,9 @@ def _work(pipe: connection.Connection, folder: Path, warm: bool) -> None:
 
 
 def run_job(job: Job) -> Record:
-    """The record of one job, in this process. What it raises is written down in it: one bad case ends no benchmark.
+    """Return the record of one job, run in this process. An exception is recorded, so one bad case ends no benchmark.
 
-    Everything is built anew, so that no case lives on what another left in memory.
+    Everything is built anew, so that no case uses what another left in memory.
     """
     from graspd_core.runtime import disk_cache
 
@@ -168,7 +168,7 @@ def _end_with_parent() -> None:
 
 
 def _prepare(warm: bool) -> None:
-    """One thread; and first-use work of the libraries, which no case is to pay for that runs among others."""
+    """Set one thread, and do first-use work of the libraries, which no case among others is to pay for."""
     import torch
 
     torch.set_num_threads(1)
@@ -197,15 +197,14 @@ class Plan:
         return tuple(job for job in self.jobs if job not in self.done)
 
     def seconds(self, processes: int) -> float:
-        """Seconds that what is missing takes on quiet cores, roughly."""
+        """Return the seconds that the missing cases take on quiet cores, roughly."""
         return sum(STUDIES[job.study].seconds(job.case) for job in self.missing) / processes
 
 
 def studies_of(names: Sequence[str]) -> dict[str, Study]:
-    """Studies by their names, each once, `all` being those that need nothing from the user.
+    """Return studies by their names, each once. `all` are those that need nothing from the user.
 
-    Raises:
-        ConfigError: there is no such study; the message lists the valid ones.
+    Raises ConfigError, which lists the valid names, if there is no such study.
     """
     if unknown := [name for name in names if name not in (*STUDIES, ALL)]:
         raise ConfigError(f"unknown suite {unknown[0]!r}; valid suites: {', '.join(STUDIES)}, {ALL}")
@@ -223,7 +222,7 @@ def make_plan(
         failed: so do those of cases that failed.
 
     Raises:
-        GraspdError: the request names something unknown, or something that no study looks at.
+        GraspdError: the request names something unknown, or something that no study uses.
     """
     taken = {field for study in studies.values() for field in study.takes}
     for field, usual in vars(Request()).items():
@@ -241,14 +240,14 @@ def make_plan(
 
 
 def run_plan(plan: Plan, processes: int, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Job, Record]]:
-    """Run what is missing; yield each job as it ends, and add it to those that are done."""
+    """Run what is missing. Yield each job as it ends, and add it to those that are done."""
     for job, record in run_cases(plan.missing, plan.folder, processes, stop):
         plan.done[job] = record
         yield job, record
 
 
 def records_of(plan: Plan) -> dict[str, list[Record]]:
-    """Records by study, in the order of the cases."""
+    """Return the records by study, in the order of the cases."""
     found: dict[str, list[Record]] = {job.study: [] for job in plan.jobs}
     for job in plan.jobs:
         if job in plan.done:
@@ -257,7 +256,7 @@ def records_of(plan: Plan) -> dict[str, list[Record]]:
 
 
 def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Picture]]:
-    """Sections of all studies that have records, by marker; charts are drawn where a path is given."""
+    """Return sections of all studies that have records, by marker. Charts are drawn where a path is given."""
     sections: dict[str, Sequence[str | Picture]] = {}
     for name, records in records_of(plan).items():
         study = STUDIES[name]
@@ -268,7 +267,7 @@ def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Pictur
 
 
 def faults_of(plan: Plan) -> list[str]:
-    """What is wrong, a line each."""
+    """Return what is wrong, a line for each fault."""
     return [
         f"{job.study} {job.case.label}: {fault}"
         for job in plan.jobs

@@ -1,4 +1,4 @@
-"""What a benchmark is: cases, what is run for one of them, and what is made of the records."""
+"""Benchmarks: their cases, the function that runs one of them, and the use of the records."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ Sections = Mapping[str, Sequence[str | Picture | None]]
 
 @dataclass(frozen=True)
 class Case:
-    """One run. Its fields called `object`, `hand` and `preset`, where there are such, count by their content."""
+    """One run. Its fields called `object`, `hand` and `preset`, where it has such, count by their content."""
 
     @property
     def label(self) -> str:
-        """What it is called in progress and in the name of its file: the fields that are not empty."""
+        """Return its name in progress and in the name of its file, from the fields that are not empty."""
         values = (getattr(self, field.name) for field in fields(self))
         return " ".join(thing_name(value) for value in values if isinstance(value, str | int | float) and value != "")
 
     def asked(self) -> Record:
-        """Everything that the run depends on but the code, JSON-ready: runs that ask for the same share a record."""
+        """Return all that the run depends on but the code, JSON-ready. Runs that ask for the same share a record."""
         said = asdict(self)
         if "object" in said:
             said["object"] = [thing_name(said["object"]), object_hash(said["object"])]
@@ -59,13 +59,13 @@ class Case:
         return said
 
     def shown(self) -> Record:
-        """What the record says of the case."""
+        """Return what the record says of the case."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a caller wants run; empty and None mean the study's own choice.
+    """What a caller wants to run. Empty and None stand for the study's own choice.
 
     Attributes:
         presets: names or files.
@@ -76,12 +76,12 @@ class Request:
         hand: name or path.
         trials: of raw grasps.
         quick: a small run that takes minutes.
-        imported: file or folder of somebody else's grasps.
+        imported: file or folder of imported grasps.
         joint_order: of the joints in its npy files, by name.
         checkout: folder of DexGraspBench.
         python: program that runs it.
         armature: try its hand with our armature, too.
-        grasps: file of our grasps that are taken instead of planned.
+        grasps: file of our grasps to use instead of planned ones.
     """
 
     presets: tuple[str, ...] = ()
@@ -107,7 +107,7 @@ class Request:
                 raise ConfigError(f"seed: {seed}; valid: 0 to 2^31 - 1")
 
     def preset(self, usual: str = "balanced") -> str:
-        """The only preset. Raises ConfigError: there are several, or it is unknown."""
+        """Return the only preset. Raises ConfigError: there are several, or it is unknown."""
         if len(self.presets) > 1:
             raise ConfigError(f"presets: {', '.join(self.presets)}; this study takes one at a time")
         name = (self.presets or (usual,))[0]
@@ -116,12 +116,12 @@ class Request:
 
 
 def error_of(record: Record) -> tuple[str, ...]:
-    """The error that a case ended in."""
+    """Return the error that a case ended in."""
     return (record["error"],) if record["error"] else ()
 
 
 def held_of(record: Record) -> str:
-    """What came of a case, in a few words."""
+    """Return the results of a case, in a few words."""
     return f"{record['held']}/{record['count']} held" if "held" in record else "measured"
 
 
@@ -130,19 +130,19 @@ class Study:
     """One benchmark.
 
     Attributes:
-        about: what it asks, one line.
-        cases: of a request. Raises GraspdError: the request names what there is not.
-        run: a case to its figures, in a process that does one case after another; a function of a module.
-        sections: records, and the path that charts begin with (None: draw none), to what pages hold of them.
-        failures: the sections are of records of cases that failed, too.
+        about: its question, one line.
+        cases: makes the cases of a request. Raises GraspdError: the request has unknown names.
+        run: runs a case and returns its figures, in a process that does one case after another. A function of a module.
+        sections: makes of records, and the path that charts begin with (None: draw none), the sections of pages.
+        failures: whether the sections need records of failed cases, too.
         sources: files of graspd_bench, by glob, that figures depend on beside graspd_core.
-        takes: names of the fields of `Request` that it looks at.
+        takes: names of the fields of `Request` that it uses.
         seconds: CPU seconds of a case, roughly.
-        faults: what is wrong with a record, a line each.
-        came: what came of a record that has no fault, in a few words.
-        alone: every case in a process of its own, cold.
-        patience: seconds until a case is called hung.
-        usual: part of `graspd bench all`, because it needs nothing that is not shipped.
+        faults: returns what is wrong with a record, a line each.
+        came: returns the results of a record that has no fault, in a few words.
+        alone: whether every case has a process of its own, cold.
+        patience: seconds until a case counts as hung.
+        usual: whether it is part of `graspd bench all`, because it needs only shipped files.
     """
 
     about: str
@@ -161,12 +161,12 @@ class Study:
 
 
 def all_shapes() -> tuple[str, ...]:
-    """The authored shapes as objects."""
+    """Return the authored shapes as objects."""
     return tuple(f"shape:{name}" for name in SHAPES)
 
 
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
-    """As `object_sources`; raises MeshError also where two of them go by the same name."""
+    """Return the same as `object_sources`. Raises MeshError also where two of them have the same name."""
     found = object_sources(sources)
     names = [thing_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -189,13 +189,13 @@ class ObjectCase(Case):
         return load_preset(self.preset)
 
     def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
-        """The hand and the scene."""
+        """Return the hand and the scene."""
         hand = load_hand(self.hand, candidates=self.config.problem.fine_candidates)
         return hand, load_scene(self.object, mass=PROTOCOL_MASS, resolution=self.config.resolution, friction=friction)
 
 
 def object_cases(request: Request, objects: Sequence[str], count: int, quick_count: int = 2) -> tuple[ObjectCase, ...]:
-    """One an object and seed; of a small run the first object, with fewer grasps."""
+    """Return a case for each object and seed. A small run has only the first object, with fewer grasps."""
     things = find_objects(request.objects or objects[: 1 if request.quick else None])
     count, hand = request.count or (quick_count if request.quick else count), request.hand or "allegro_right"
     seeds = request.seeds or (0,)
@@ -203,5 +203,5 @@ def object_cases(request: Request, objects: Sequence[str], count: int, quick_cou
 
 
 def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:
-    """The first of a method's own ranking, none filtered by a trial."""
+    """Return the first grasps of a method's own ranking, none filtered by a trial."""
     return find_candidates(PlannerInput(scene, hand, count, seed, config, Hooks())).grasps[:count]

@@ -1,4 +1,4 @@
-"""All studies, a row each: `graspd bench NAME` runs one. To add one, write its file and its row.
+"""All studies, a row each. `graspd bench NAME` runs one. To add one, write its file and its row.
 
 Packages that graspd_bench does not know add theirs by entry points of the group `graspd.studies`.
 """

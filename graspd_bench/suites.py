@@ -1,4 +1,4 @@
-"""The suites of cells: presets on objects, settings swept, hands compared; and the counts that they are made of."""
+"""The suites of cells: presets on objects, settings swept, hands compared, and the counts that they are made of."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _QUICK_COUNT = 4
 # The others take minutes a cell.
 _QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
 
-# CPU seconds of one grasp by method, on a quiet core; of long settings, and of other methods, below.
+# CPU seconds of one grasp by method, on a quiet core. Of long settings, and of other methods, below.
 _SECONDS = {"closed_form": 0.05, "graspd2022": 1.2, "annealing": 3.3, "random_closure": 0.3}
 
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
-# Sweep values: what is changed, and to what; all else stays at `balanced`.
+# Sweep values: what is changed, and to what. All else stays at `balanced`.
 SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
     "candidates": [{"problem.candidates": n} for n in (32, 64, 128, 256, 512)],
     "directions": [{"problem.directions": n} for n in (6, 12, 24, 48, 96)],
@@ -49,7 +49,7 @@ SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
         for share in (0.2, 0.5, 1.0, 2.0, 4.0)
     ],
 }
-# Three decades: title, preset, setting and its values; the preset's own is among them.
+# Three decades: title, preset, setting and its values. The preset's own is among them.
 DECADES = (
     (
         "Grasp'D, stiffness [N/m]",
@@ -64,7 +64,7 @@ DECADES = (
 
 
 def main_suite(request: Request) -> tuple[Cell, ...]:
-    """Every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
+    """Return every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
     names = (name for name in preset_names() if name != _RANKED)
     defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
@@ -76,7 +76,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
             cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
-        # The closed form's own presets are what `plan_grasps` is used with; the others are only compared raw.
+        # The closed form's own presets are what `plan_grasps` is used with. The others are only compared raw.
         for name, config in planned.items():
             cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
     if not request.objects:
@@ -88,7 +88,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def sweep_suite(request: Request) -> tuple[Cell, ...]:
-    """Each of four settings from poor to rich, one at a time."""
+    """Return each of four settings from poor to rich, one at a time."""
     base = load_preset(_SWEEP_PRESET)
     count, trials = _count(request, base), _trials(request, _SWEEP_TRIALS)
     return tuple(
@@ -101,7 +101,7 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def decades_suite(request: Request) -> tuple[Cell, ...]:
-    """Stiffness and friction over three decades: how far they can be wrong before a method stops working."""
+    """Return stiffness and friction over three decades, to show how far they can be wrong before a method fails."""
     count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
     return tuple(
         cell
@@ -121,7 +121,7 @@ def decades_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def hands_suite(request: Request) -> tuple[Cell, ...]:
-    """Every built-in hand with one preset."""
+    """Return every built-in hand with one preset."""
     base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
     trials = _trials(request, _SWEEP_TRIALS)
     return tuple(
@@ -133,12 +133,12 @@ def hands_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
-    """Name of a sweep value's cells: the sweep and its value (steps: all of them together)."""
+    """Return the name of a sweep value's cells: the sweep and its value (steps: all of them together)."""
     return f"{sweep}={sum(changes.values()):g}"
 
 
 def cell_seconds(cell: Cell) -> float:
-    """CPU seconds of a cell, roughly; measured on one thread of a quiet core."""
+    """Return the CPU seconds of a cell, roughly, as measured on one thread of a quiet core."""
     if cell.kind != "raw":
         return {"verified": 1.5, "pace": 8.0, "start": 6.0}[cell.kind]
     each = _SECONDS.get(cell.settings.method, 1.0)

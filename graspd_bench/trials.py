@@ -1,17 +1,16 @@
-"""The displacement trial's numbers in MuJoCo: does the figure come from the grasp, or from the engine?
+"""Trials beside the hold trial: displacement and drop in MuJoCo, and things that lie free on a table.
 
-The same frozen hand, 1 kg, 35 steps of 1/240 s under 9.8 m/s². What MuJoCo knows in another way: friction is per pair
-here and is what Bullet makes of two 3s, and nothing bounces, as in Bullet, where a hand of restitution 0 stops that.
+The displacement trial shows whether the figure comes from the grasp or from the engine. It has the same frozen hand, 1
+kg, 35 steps of 1/240 s under 9.8 m/s². MuJoCo's friction is per pair and is here what Bullet makes of two 3s. Nothing
+bounces, as in Bullet, where a hand of restitution 0 stops that.
 
-The drop trial: how far gravity moves an object in a hand that squeezes it, after 2 s in MuJoCo.
+The drop trial measures how far gravity moves an object in a hand that squeezes it, after 2 s. The papers' displacement
+knows neither motors nor effort limits. Its hand is frozen, and its 0.15 s are over before a slow slip shows. Hand,
+object and physics are those of the hold trial.
 
-Stands beside the papers' displacement (`displacement`), which knows neither motors nor effort limits: its hand is
-frozen, and 0.15 s are over before a slow slip shows. Same hand, object and physics as the hold trial.
-
-Things that lie free on a table: dropped until they rest, and one of them lifted out by a hand.
-
-The lift is the lift trial in a world where nothing is simplified: the object rests on the support and on the others,
-which are as free as it is. Where all of them are afterwards is kept, so that the next lift goes on from there.
+Things on a table are dropped until they rest, and a hand lifts one of them out. This is the lift trial in a world
+without simplifications. The object rests on the support and on the others, which are as free as it is. The poses of all
+of them afterwards are kept, so that the next lift continues from there.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class FrozenWorld:
     """A hand without joints and a free object of 1 kg, compiled.
 
     Attributes:
-        model: the `mujoco.MjModel`; every link of the hand is a body that is put where a posture says.
+        model: the `mujoco.MjModel`. Every link of the hand is a body that is put where a posture says.
         hand: the hand.
         object_body: body id of the object.
         center_of_mass: of the object, in its own frame [m].
@@ -77,7 +76,7 @@ class FrozenWorld:
 
 
 def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh]) -> FrozenWorld:
-    """Compile the world of one hand and one object; `parts` are the object's convex parts, object frame [m]."""
+    """Compile the world of one hand and one object. `parts` are the object's convex parts, object frame [m]."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -99,7 +98,7 @@ def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
 def displacement_trial(
     world: FrozenWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
 ) -> float:
-    """Displacement of the object's centre of mass [m] after 35 steps of 1/240 s, mean over gravity's directions."""
+    """Return how far the object's centre of mass moves [m] in 35 steps of 1/240 s, mean over gravity's directions."""
     import mujoco
 
     moved = []
@@ -133,18 +132,19 @@ DROP_GRAVITY, DURATION = 9.8, 2.0
 LOST = 0.1
 # A direction ends when its displacement is known to this [m].
 TOLERANCE = 1e-4
-# Checks that a speed is taken over; how many times the change of what it foretells has to fit into the tolerance.
+# Checks that a speed is taken over. How many times the change of what it foretells has to fit into the tolerance.
 _WINDOW, _SAFETY = 2, 4
 
 
 def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False) -> float:
-    """Displacement [m] of the object's centre of mass from the start of the trial, mean over six gravity directions.
+    """Return the displacement [m] of the object's centre of mass from the trial's start, mean over six gravity
+    directions.
 
-    The hand closes and squeezes as in the hold trial; then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
-    At most 10 cm: an object that moved so far is lost, and one that the hold trial would refuse is lost from the start.
-    A direction ends when what its speed foretells for 2 s no longer changes, to 0.1 mm, and the figure is what it
-    foretells, unless the protocol asks for the full length.
-    Directions that `stop` cut short count with what they came to.
+    The hand closes and squeezes as in the hold trial. Then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
+    The result is at most 10 cm. An object that moved so far is lost, and one that the hold trial would refuse is lost
+    from the start. A direction ends when the displacement that its speed predicts for 2 s no longer changes, to 0.1 mm.
+    The result is that prediction, unless the protocol asks for the full length. Directions that `stop` cut short count
+    with what they reached.
     """
     import mujoco
 
@@ -163,7 +163,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
 
 
 def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool]) -> float:
-    """Simulate 2 s, or until the displacement is known or the object lost; returns the displacement then [m]."""
+    """Simulate 2 s, or until the displacement is known or the object lost. Return the displacement then [m]."""
     import mujoco
 
     checks, states = round(DURATION / protocol.timestep / CHECK_EVERY), list[ObjectState]()
@@ -182,7 +182,7 @@ def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool])
 
 
 def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | None:
-    """Where the centre of mass will be at the end, as soft contacts creep evenly; None where that is not known."""
+    """Return where the centre of mass will be at the end, as soft contacts creep evenly, or None if that is unknown."""
     recent = states[-2 * _WINDOW - 1 :]
     if len(recent) <= 2 * _WINDOW or not all(s.speed < CREEPING.speed and s.spin < CREEPING.spin for s in recent):
         return None
@@ -199,7 +199,7 @@ def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | Non
 _FLOOR, _WALL = "floor", "wall"
 _GRAVITY = 9.81
 # What falls slowly neither bounces nor passes through thin walls: as in honey, it falls at 0.6 m/s [1/s], and turns as
-# slowly [1/s]; what has fallen is left in thinner honey, or balls would roll for minutes.
+# slowly [1/s]. What has fallen is left in thinner honey, or balls would roll for minutes.
 _FALLING, _RESTING = (16.0, 16.0), (1.0, 4.0)
 # At rest for so many steps in a row, all of them slower than this [m/s], [rad/s].
 _SPEED, _SPIN, _STILL = 0.002, 0.05, 50
@@ -208,12 +208,12 @@ Pose = Float[np.ndarray, "4 4"]
 
 @dataclass(frozen=True)
 class Lifted:
-    """What came of a lift.
+    """The result of a lift.
 
     Attributes:
         result: of the lift trial.
         poses: of all things afterwards, in their order, seen from the table [m].
-        hand: where the hand ended, likewise; None where it never moved.
+        hand: where the hand ended, likewise. None where it never moved.
     """
 
     result: TrialResult
@@ -228,7 +228,7 @@ def settle(
 
     Args:
         bodies: where they begin, not in each other.
-        wall: half the side of a square fence about the origin, within which they fall slowly; without it they lie
+        wall: half the side of a square fence about the origin, within which they fall slowly. Without it they lie
             where they are and come to rest [m].
         seconds: the most of simulated time.
         protocol: physics.
@@ -272,13 +272,13 @@ def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
 
 
 def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: bool = False) -> tuple[FreeBody, ...]:
-    """Return things at rest on the table z = 0 that fell one above the other into a fence, which is taken away then.
+    """Return things at rest on the table z = 0 that fell one above the other into a fence, which is then removed.
 
     Args:
         models: the things, in the order of their fall.
         seed: of their turns and places.
         wall: half the side of the fence about the origin [m].
-        stays: the fence is not taken away.
+        stays: the fence is not removed.
     """
     generator = torch.Generator().manual_seed(seed)
     turns = random_rotations(len(models), generator, torch.float64).numpy()
@@ -321,7 +321,7 @@ def lift_out(
 
 
 class _Watch:
-    """Remembers where all was at the last step, seen from the table, which sinks in a lift (lift_trial.py)."""
+    """A hook that keeps the last step's poses, seen from the table, which sinks in a lift (lift_trial.py)."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -338,7 +338,7 @@ class _Watch:
 
 
 def placed(body: FreeBody) -> tuple[ObjectModel, tuple[TriangleMesh, ...]]:
-    """A thing with its parts as it lies, in the world frame."""
+    """Return a thing with its parts as it lies, in the world frame."""
     turn, place = body.pose[:3, :3], body.pose[:3, 3]
 
     def there(mesh: TriangleMesh) -> TriangleMesh:

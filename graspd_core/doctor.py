@@ -1,7 +1,7 @@
-"""`graspd doctor`: what works on this machine, and what to do about what does not.
+"""`graspd doctor`: what works on this machine, and the remedy for what does not.
 
-Libraries are tried in processes of their own, so that one which aborts on import is reported instead of taking the
-report with it, and the ROS probe keeps rclpy out of this process.
+Libraries are tried in processes of their own. One that aborts on import is then reported and does not end the report.
+The ROS probe keeps rclpy out of this process.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-PROBE_TIMEOUT = 60.0  # seconds; a cold disk takes several for torch or Open3D
+PROBE_TIMEOUT = 60.0  # Seconds. A cold disk takes several for torch or Open3D.
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
 # distribution: module
@@ -92,7 +92,7 @@ class Check:
 
 
 def run_checks() -> list[Check]:
-    """Try everything graspd stands on; takes a few seconds."""
+    """Try everything that graspd depends on, in a few seconds."""
     probes = [
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
@@ -108,7 +108,7 @@ def run_checks() -> list[Check]:
 
 
 def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
-    """Run Python code in a process of its own: its last line is the detail, its failure the check's."""
+    """Run Python code in a process of its own. Its last line is the detail, its failure that of the check."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -119,7 +119,7 @@ def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
 
 
 def format_checks(checks: Iterable[Check]) -> str:
-    """The report as lines: a verdict, what was tried, what came out, and the remedy under what failed."""
+    """Return the report as lines: a verdict, what was tried, the result, and the remedy under a failure."""
     lines = []
     for check in checks:
         verdict = "ok  " if check.ok else "FAIL" if check.needed else "-   "
@@ -130,12 +130,12 @@ def format_checks(checks: Iterable[Check]) -> str:
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     commands.add_parser("doctor").set_defaults(run=lambda options: main())
 
 
 def main() -> int:
-    """Print the report; 0 when all that is needed works, else 1."""
+    """Print the report. Returns 0 when all that is needed works, else 1."""
     checks = run_checks()
     sys.stdout.write(format_checks(checks) + "\n")
     return 0 if all(check.ok for check in checks if check.needed) else 1

@@ -1,4 +1,4 @@
-"""Wrong use raises one of these; failing to find a grasp is an `Outcome`, never an exception."""
+"""Errors of wrong use. Failing to find a grasp is an `Outcome`, never an exception."""
 
 import reprlib
 
@@ -8,7 +8,7 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 def shown(value: object) -> str:
-    """A value for a message, short whatever it holds: by its aliases one page of YAML can stand for gigabytes."""
+    """Return a value as short text for a message, whatever it holds. One page of YAML can stand for gigabytes."""
     try:
         return _SHORT.repr(value)
     # An integer of more than 4300 digits has no decimal form.
@@ -29,7 +29,7 @@ class CloudError(GraspdError):
 
 
 class NoObjectError(CloudError):
-    """A scene was seen well enough, and what was asked for is not in it."""
+    """A scene was seen well enough, but does not hold the object asked for."""
 
 
 class BagError(GraspdError):

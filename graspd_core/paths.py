@@ -1,4 +1,4 @@
-"""Where graspd finds what it ships with, in a checkout and when installed."""
+"""The directories of what graspd ships with, in a checkout and when installed."""
 
 from __future__ import annotations
 
@@ -13,14 +13,11 @@ _INSTALLED = Path("share") / "graspd" / "config"
 
 
 def config_dir() -> Path:
-    """The directory that holds `hands/`, `presets/` and the node parameters.
+    """Return the directory that holds `hands/`, `presets/` and the node parameters.
 
-    Looked up in order: the environment variable GRASPD_CONFIG, the checkout that this file lies in, then
-    `share/graspd/config` under the prefix that this file is installed to (a virtual environment, `~/.local`, a colcon
-    workspace) and under `sys.prefix`.
-
-    Raises:
-        ConfigError: GRASPD_CONFIG names no directory, or the installation is incomplete.
+    The order is: the environment variable GRASPD_CONFIG, the checkout of this file, then `share/graspd/config` under
+    the installation's prefix (a virtual environment, `~/.local`, a colcon workspace) and under `sys.prefix`. Raises
+    ConfigError: GRASPD_CONFIG names no directory, or the installation is incomplete.
     """
     named = os.environ.get(ENVIRONMENT_VARIABLE)
     if named:

@@ -1,4 +1,4 @@
-"""Rigid transforms on torch tensors: `T_a_b` maps coordinates in frame b to frame a; quaternions are wxyz.
+"""Rigid transforms on torch tensors: `T_a_b` maps coordinates in frame b to frame a. Quaternions are wxyz.
 
 Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is defined as zero.
 """
@@ -18,13 +18,13 @@ EPSILON = 1e-12
 
 
 def perpendicular(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """A unit vector square to a direction of any length but zero; any, but always the same."""
+    """Return a unit vector normal to a direction of any length but zero, always the same one."""
     side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     return side / np.linalg.norm(side)
 
 
 def safe_norm(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
-    """Euclidean norm over the last axis, with gradient zero (not NaN) at the origin."""
+    """Return the Euclidean norm over the last axis, with gradient zero (not NaN) at the origin."""
     squared = (x * x).sum(-1)
     is_zero = squared <= EPSILON**2
     return torch.where(
@@ -33,12 +33,12 @@ def safe_norm(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
 
 
 def normalize(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-    """Unit vectors along the last axis; zero stays zero."""
+    """Return unit vectors along the last axis. Zero stays zero."""
     return x / safe_norm(x).clamp_min(EPSILON)[..., None]
 
 
 def rotation_from_quaternion(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of wxyz quaternions of any non-zero length."""
+    """Return the rotation matrices of wxyz quaternions of any non-zero length."""
     w, x, y, z = normalize(q).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -49,7 +49,7 @@ def rotation_from_quaternion(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*ba
 
 
 def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit wxyz quaternions with w ≥ 0 (Shepperd's method: the largest component is the divisor)."""
+    """Return unit wxyz quaternions with w ≥ 0 (Shepperd's method: the largest component is the divisor)."""
     m = rotation
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)
@@ -72,13 +72,13 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Ten
 def rotation_from_axis_angle(
     axis: Float[Tensor, "*#batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Rotations about unit axes by angles [rad], through quaternions of half the angle."""
+    """Return rotations about unit axes by angles [rad], through quaternions of half the angle."""
     half = 0.5 * angle[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), half.sin() * axis], -1))
 
 
 def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    """The rotation about a unit axis by an angle [rad]."""
+    """Return the rotation about a unit axis by an angle [rad]."""
     turn = torch.tensor(angle, dtype=torch.float64)
     return rotation_from_axis_angle(torch.as_tensor(axis, dtype=torch.float64), turn).numpy()
 
@@ -86,7 +86,7 @@ def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarra
 def quaternion_between(
     source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, around: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4"]:
-    """The shortest turn of one unit vector onto another, wxyz; half a turn `around` an axis if they are opposite."""
+    """Return the shortest turn of one unit vector onto another, wxyz. Opposite ones take half a turn about `around`."""
     quaternion = np.array([1.0 + source @ target, *np.cross(source, target)])
     length = np.linalg.norm(quaternion)
     return quaternion / length if length > EPSILON else np.array([0.0, *around])
@@ -105,7 +105,7 @@ class SE3:
     translation: Float[Tensor, "*batch 3"]
 
     def __getitem__(self, index: Any) -> SE3:
-        """The transforms at an index of the batch: `poses[:, links]`."""
+        """Return the transforms at an index of the batch: `poses[:, links]`."""
         return SE3(self.rotation[index], self.translation[index])
 
     def apply(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 3"]:
@@ -117,19 +117,19 @@ class SE3:
         return (points - self.translation[..., None, :]) @ self.rotation
 
     def compose(self, other: SE3) -> SE3:
-        """`T_a_c` of this `T_a_b` and `T_b_c`, whose batch may be larger."""
+        """Return `T_a_c` of this `T_a_b` and `T_b_c`, whose batch may be larger."""
         turned = (self.rotation @ other.translation[..., None]).squeeze(-1)
         return SE3(self.rotation @ other.rotation, turned + self.translation)
 
 
 def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "count 3 3"]:
-    """Uniform random rotations (normalised Gaussian quaternions)."""
+    """Draw uniform random rotations (normalised Gaussian quaternions)."""
     return rotation_from_quaternion(torch.randn(count, 4, generator=generator, dtype=dtype))
 
 
 def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Rotations that turn unit vector `source` onto each unit target (any roll), through a Householder pair."""
-    # Two reflections make a rotation; the first maps source to its mirror, the second maps that to the target.
+    """Return rotations that turn unit vector `source` onto each unit target (any roll), through a Householder pair."""
+    # Two reflections make a rotation. The first maps source to its mirror, the second maps that to the target.
     helper = torch.eye(3, dtype=targets.dtype)[source.abs().argmin()]
     middle = torch.linalg.cross(source, helper)
     middle = middle / middle.norm()
@@ -139,7 +139,7 @@ def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 
 
 
 def reflection_onto(a: Float[Tensor, "batch 3"], b: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Householder reflections that swap unit vectors a and b; the identity's mirror where they agree."""
+    """Return Householder reflections that swap unit vectors a and b, for equal ones any that keeps them."""
     v = a - b
     same = v.norm(dim=-1, keepdim=True) < 1e-9
     # Where a = b any mirror plane that contains a will do.

@@ -1,8 +1,8 @@
-"""Where frames stand relative to each other over time: the tree of /tf and /tf_static, without any node.
+"""Frames over time: the tree of /tf and /tf_static, without any node.
 
 `T_a_b` maps coordinates in frame b to frame a. Stamps are integer nanoseconds. Between two samples the position is
-interpolated on a line and the rotation on a great circle, as tf2 does; before the first and after the last, nothing is
-known, and asking is an error that says from when to when.
+interpolated on a line and the rotation on a great circle, as tf2 does. A time before the first or after the last sample
+is an error that names the known span.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FARTHEST = 1e8
 
 @dataclass
 class _Link:
-    """Poses of one frame in its parent over time, stamps ascending; a static one has a single pose."""
+    """Poses of one frame in its parent over time, stamps ascending. A static one has a single pose."""
 
     parent: str
     static: bool
@@ -35,10 +35,10 @@ class _Link:
 
 
 class TransformBuffer:
-    """Takes transforms as they come, answers for any two connected frames. Safe to use from several threads.
+    """A buffer of transforms that answers for any two connected frames. Safe to use from several threads.
 
     Args:
-        history: how far behind a frame's newest sample older ones are kept [ns]; None keeps all.
+        history: how far behind a frame's newest sample older ones are kept [ns]. None keeps all.
     """
 
     def __init__(self, history: int | None = HISTORY) -> None:
@@ -49,12 +49,10 @@ class TransformBuffer:
     def add(
         self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"], stamp: int = 0, static: bool = False
     ) -> None:
-        """Learn where `child` stood in `parent` at `stamp` [ns]; a static one stands there always.
+        """Add the pose of `child` in `parent` at `stamp` [ns], for a static one at all times.
 
-        A child that comes under a new parent, or turns static, forgets what was known of it.
-
-        Raises:
-            TransformError: a frame without a name, a frame under itself, a loop, or no rigid transform.
+        A child that gets a new parent, or turns static, loses its earlier poses. Raises TransformError: a frame without
+        a name, a frame under itself, a loop, or no rigid transform.
         """
         parent, child = _name(parent), _name(child)
         pose = _rigid(T_parent_child, parent, child)
@@ -69,10 +67,9 @@ class TransformBuffer:
             self._insert(link, stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
-        """`T_target_source` at `stamp` [ns], or at the newest time that every link between the two knows.
+        """Return `T_target_source` at `stamp` [ns], or at the newest time that every link between the two knows.
 
-        Raises:
-            TransformError: an unknown frame, frames that no chain connects, or a time outside what is known.
+        Raises TransformError: an unknown frame, frames that no chain connects, or a time outside what is known.
         """
         target, source = _name(target), _name(source)
         with self._lock:
@@ -96,7 +93,7 @@ class TransformBuffer:
             return _inverse(self._down(below_target, stamp, asked)) @ self._down(below_source, stamp, asked)
 
     def frames(self) -> tuple[str, ...]:
-        """Every frame heard of, in alphabetical order."""
+        """Return every known frame, in alphabetical order."""
         with self._lock:
             return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
 

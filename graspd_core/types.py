@@ -1,7 +1,7 @@
 """The frozen values that folders pass to each other.
 
-Metres, radians, newtons, kilograms throughout. A transform `T_a_b` maps coordinates in frame b to frame a;
-quaternions are wxyz. The object frame is the frame of the mesh as loaded (after scaling).
+Metres, radians, newtons, kilograms throughout. A transform `T_a_b` maps coordinates in frame b to frame a. Quaternions
+are wxyz. The object frame is the frame of the mesh as loaded (after scaling).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Outcome(Enum):
 
 
 class Stage(StrEnum):
-    """Where a run is, as told by progress reports."""
+    """The stage of a run, as in progress reports."""
 
     LOAD = "load"
     OPTIMISE = "optimise"
@@ -95,7 +95,7 @@ HYPOTHESES = "hypotheses"
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What one trial of one grasp measured; `graspd_core.verify.trial_registry` lists the trials that planning runs.
+    """What one trial of one grasp measured. `graspd_core.verify.trial_registry` lists the trials that planning runs.
 
     Attributes:
         name: of the trial.
@@ -115,7 +115,7 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class GraspMetrics(Mapping[str, float | None]):
-    """Static quality of one grasp by metric name, in SI units; None where a metric was not measured.
+    """Static quality of one grasp by metric name, in SI units. None: the metric was not measured.
 
     `graspd_core.verify.metrics` lists the metrics, docs/metrics.md defines them.
     """
@@ -134,7 +134,7 @@ class GraspMetrics(Mapping[str, float | None]):
 
 @dataclass(frozen=True)
 class Posture:
-    """A hand somewhere: base pose in the object frame and joint values.
+    """A hand's base pose in the object frame and its joint values.
 
     Attributes:
         position: origin of the hand's base link [m].
@@ -166,7 +166,7 @@ class ArmPath:
     stages: tuple[int, int, int, int]
 
     def at(self, stage: str) -> Float[np.ndarray, "joints"]:
-        """Joint values at one of `ARM_STAGES`."""
+        """Return the joint values at one of `ARM_STAGES`."""
         return self.positions[self.stages[ARM_STAGES.index(stage)]]
 
 
@@ -179,12 +179,12 @@ class Grasp:
         grasp: the fingers just touch.
         squeeze: the position targets that press with balanced forces.
         contacts: one per touching link.
-        score: the optimiser's own measure, larger is better; ranks grasps before any trial.
+        score: the optimiser's own measure, larger is better. It ranks grasps before any trial.
         metrics: static quality, None until measured.
-        trials: in the order that they were run; the first failure ends them.
-        probability: of holding on the true object, where cameras saw it (docs/clouds.md); else None.
-        arm: how the arm gets there, where one was given (docs/arms.md); else None.
-        arrival: where a hand that closes only after it has arrived waits, open and clear; None: none was looked for.
+        trials: in the order that they were run. The first failure ends them.
+        probability: of holding on the true object, if cameras saw it (docs/clouds.md), else None.
+        arm: how the arm gets there, if one was given (docs/arms.md), else None.
+        arrival: posture of a hand that closes only after it has arrived, open and clear. None: not looked for.
     """
 
     pregrasp: Posture
@@ -200,7 +200,7 @@ class Grasp:
 
     @property
     def verdict(self) -> Verdict:
-        """Verified if all trials passed, failed if one did not on the likeliest scene; otherwise unverified."""
+        """Verified if all trials passed, failed if one did not on the likeliest scene, otherwise unverified."""
         failed = {trial.name for trial in self.trials if not trial.passed}
         if self.trials and not failed:
             return Verdict.VERIFIED
@@ -213,7 +213,7 @@ class Grasp:
 
     @property
     def reason(self) -> str:
-        """Why the first failed trial failed; empty without one."""
+        """Why the first failed trial failed, empty without one."""
         return next((trial.reason for trial in self.trials if not trial.passed), "")
 
 
@@ -225,10 +225,10 @@ class Progress:
         stage: what is being done.
         step: steps done in this stage.
         of: steps planned in this stage.
-        best: lowest loss so far while optimising; 0 elsewhere.
+        best: lowest loss so far while optimising, 0 otherwise.
         verified: grasps that passed the trial so far.
         elapsed: seconds since the run began.
-        found: the grasp that has just passed, without metrics yet; None in all other reports.
+        found: the grasp that has just passed, without metrics yet, None in all other reports.
     """
 
     stage: Stage
@@ -248,7 +248,7 @@ class Snapshot:
         positions: of their base links [m].
         quaternions_wxyz: of their base links, any non-zero length.
         joint_positions: [rad] or [m].
-        verdicts: of candidates, in their order; those that are not tried yet are unverified. Empty while optimising.
+        verdicts: of candidates, in their order, unverified if not tried yet. Empty while optimising.
     """
 
     positions: Float[np.ndarray, "hands 3"]
@@ -264,9 +264,9 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall-clock seconds of a run's stages; `first_verified` is None when none was.
+    """Wall-clock seconds of a run's stages. `first_verified` is None without a verified grasp.
 
-    `load` and `sdf` are what building the scene took, whenever that was; `total` counts them too.
+    `load` and `sdf` are the times of building the scene. `total` counts them too.
     """
 
     load: float = 0.0
@@ -280,7 +280,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class AuditCount:
-    """Always zero, for readers of version 0.1; goes with version 0.3. `graspd bench early` tries both lengths."""
+    """Zero, kept for readers of version 0.1 until 0.3. `graspd bench early` tries both lengths."""
 
     audited: int = 0
     disagreed: int = 0
@@ -288,13 +288,13 @@ class AuditCount:
 
 @dataclass(frozen=True)
 class GraspResult:
-    """What a run gives back: an outcome, always, and the grasps in rank order, verified ones first.
+    """The result of a run: an outcome, always, and the grasps in rank order, verified ones first.
 
-    `support` is what the object stood on, None where it floated. `audits` is always zero, and goes with 0.3.
-    `next_view` is `T_object_camera` [m] of one more view that would show most of the hidden side, where grasps hold on
-    the likeliest shape and none is sure enough. `refused` counts by reason the candidates that no trial was spent on,
-    because a restriction of the request did not admit them. `mass` is what the object weighed in the trials [kg] where
-    the hand could not hold what was assumed, else None. `tried_mass` is what it weighed in the trials at all [kg].
+    `support` is what the object stood on, None for a floating one. `audits` is always zero, and goes with 0.3.
+    `next_view` is `T_object_camera` [m] of a further view of the hidden side. It is set if grasps hold on the likeliest
+    shape and none is sure enough. `refused` counts by reason the candidates that a restriction did not admit. `mass` is
+    the object's mass in the trials [kg] if the hand could not hold the assumed one, else None. `tried_mass` is its mass
+    in all trials [kg].
     """
 
     outcome: Outcome

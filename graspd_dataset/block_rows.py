@@ -1,4 +1,4 @@
-"""A block in this process: the object made ready once, its grasps planned, and the rows of their file."""
+"""A block in this process: the prepared object, its planned grasps, and the rows of their file."""
 
 from __future__ import annotations
 
@@ -35,10 +35,9 @@ _loaded: OrderedDict[str, Any] = OrderedDict()
 
 
 def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:
-    """Load an object and build what trials and optimiser need of it; `content` is its file's where it lies elsewhere.
+    """Load an object and prepare it for optimiser and trials.
 
-    Raises:
-        GraspdError: it cannot be read or used.
+    `content` is its file's, if the file lies on another machine. Raises GraspdError: it cannot be read or used.
     """
     _one_thread()
     disk_cache.forget()
@@ -58,7 +57,7 @@ def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) 
 
 
 def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
-    """Plan a block's grasps; `hand` is a pickled HandModel, `shared` as `ReadyObject` has it."""
+    """Plan a block's grasps. `hand` is a pickled HandModel, `shared` as `ReadyObject` has it."""
     _one_thread()
     forget_peak()
     began = time.process_time()
@@ -83,18 +82,18 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
 
 
 def all_measured(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Grasps with the metrics of those too that failed."""
+    """Return grasps with metrics, failed ones too."""
     context = make_metrics_context(scene.object, hand)
     return tuple(grasp if grasp.metrics else replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in grasps)
 
 
 def failure_kind(grasp: Grasp) -> str:
-    """What a failed grasp is counted as."""
+    """Return the kind of failure of a failed grasp, for counting."""
     return kind_of_reason(*next((trial.name, trial.reason) for trial in grasp.trials if not trial.passed))
 
 
 def kind_of_reason(trial: str, reason: str) -> str:
-    """The trial that a grasp failed and why, without the numbers: for counting."""
+    """Return the failed trial and its reason without numbers, for counting."""
     words = [word for word in reason.split() if not any(sign.isdigit() for sign in word)]
     return f"{trial}: {' '.join(word for word in words if word not in ('cm', 'mm', 'm', 'N'))}"
 
@@ -106,7 +105,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """What was pickled, the same object each time while it is kept: worlds are remembered by identity."""
+    """Return the unpickled object, the same one while it is kept, because worlds are remembered by identity."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)
@@ -139,7 +138,7 @@ def _table(block: Block, target: ObjectModel, hand: HandModel, grasps: Sequence[
 
 
 def _row(grasp: Grasp, hand: HandModel) -> dict[str, Any]:
-    """What a row says of its grasp; the rest is the same in the whole block."""
+    """Return the columns of a grasp. The rest is the same in the whole block."""
     row: dict[str, Any] = {
         "verdict": str(grasp.verdict),
         "reason": grasp.reason,
@@ -171,7 +170,7 @@ def _object_file(target: ObjectModel) -> bytes:
 
 
 def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str:
-    """Count, hours and bytes of the blocks, as a sentence a line."""
+    """Return count, hours and bytes of the blocks, a line each."""
     if not blocks:
         return "nothing is missing"
     workers = workers or os.cpu_count() or 1

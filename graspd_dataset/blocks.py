@@ -1,4 +1,4 @@
-"""What a data set is made of: blocks of grasps, each known by the content of what it asks for."""
+"""Blocks of grasps, of which a data set consists, each known by the content of its request."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DIGITS = 32
 
 
 def content_key(asked: Any) -> str:
-    """Key of JSON-ready values."""
+    """Return the key of JSON-ready values."""
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
@@ -39,7 +39,7 @@ class DatasetObject:
         source: shape:NAME or a mesh file.
         content: hash of the shape's or the file's content.
         scale: factor on the file's coordinates.
-        mass: [kg]; None: the heavy end of what the volume allows.
+        mass: [kg]. None: the heavy end of what the volume allows.
         friction: Coulomb coefficient.
     """
 
@@ -51,12 +51,12 @@ class DatasetObject:
 
     @property
     def asked(self) -> dict[str, Any]:
-        """What counts of it: not what it is called."""
+        """The content, which does not depend on names."""
         return {"content": self.content, "scale": self.scale, "mass": self.mass, "friction": self.friction}
 
     @cached_property
     def key(self) -> str:
-        """By its content."""
+        """Key of the content."""
         return content_key(self.asked)
 
 
@@ -68,7 +68,7 @@ class Block:
         object: what is grasped.
         hand: name or path.
         hand_content: hash of its files.
-        preset: what the settings are called.
+        preset: name of the settings.
         config: the settings.
         verify: the trials.
         measure: which grasps get their metrics.
@@ -88,12 +88,12 @@ class Block:
 
     @property
     def hand_name(self) -> str:
-        """What the hand's partition is called."""
+        """Name of the hand's partition."""
         return thing_name(self.hand)
 
     @property
     def asked(self) -> dict[str, Any]:
-        """All that the rows depend on but the code, JSON-ready."""
+        """All that the rows depend on except the code, JSON-ready."""
         return {
             "schema": SCHEMA_VERSION,
             "object": self.object.asked,
@@ -107,13 +107,13 @@ class Block:
 
     @cached_property
     def key(self) -> str:
-        """By its content: the name of its file."""
+        """Key of the content, and the name of its file."""
         return content_key(self.asked)
 
 
 @dataclass(frozen=True)
 class DatasetRequest:
-    """What a data set is asked to hold.
+    """The requested content of a data set.
 
     Attributes:
         objects: shape:NAME, mesh files, or folders of them.
@@ -125,7 +125,7 @@ class DatasetRequest:
         scales: factors on every object's coordinates.
         random_scales: how many more factors each object gets, and the range that they are drawn from, evenly in their
             logarithm.
-        mass: [kg]; None assumes the heavy end of what each volume allows.
+        mass: [kg]. None assumes the heavy end of what each volume allows.
         friction: Coulomb coefficient.
         verify: the trials.
         measure: which grasps get their metrics.
@@ -162,10 +162,9 @@ class DatasetRequest:
 
 
 def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
-    """The blocks of a data set, those of an object together.
+    """Return the blocks of a data set, those of an object together.
 
-    Raises:
-        GraspdError: there is no such object, hand or preset.
+    Raises GraspdError: no such object, hand or preset.
     """
     config = load_preset(request.preset)
     hands = {name: hand_hash(name) for name in request.hands}
@@ -180,7 +179,7 @@ def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
 
 
 def by_object(blocks: Sequence[Block]) -> list[tuple[DatasetObject, list[Block]]]:
-    """Blocks by what they grasp, in their order."""
+    """Group blocks by their objects, in their order."""
     groups: dict[str, tuple[DatasetObject, list[Block]]] = {}
     for block in blocks:
         groups.setdefault(block.object.key, (block.object, []))[1].append(block)
@@ -192,7 +191,7 @@ def _split(total: int, most: int) -> list[int]:
 
 
 def _objects(request: DatasetRequest) -> list[DatasetObject]:
-    """Every object at every scale; what is named twice counts once."""
+    """Return every object at every scale, each once."""
     found: dict[str, DatasetObject] = {}
     for source in object_sources(request.objects):
         content = object_hash(source)

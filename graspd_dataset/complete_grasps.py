@@ -1,4 +1,4 @@
-"""Grasps of others made into graspd's own: what their format lacks is found as for a grasp that was planned here."""
+"""Imported grasps completed to graspd's own. Postures that their format lacks are found as for a planned grasp."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BEYOND = 1e-3
 # A hand so deep in the object, or so far off, does not grasp it [m]. The share of grasps that makes a frame doubtful,
 # and the fewest grasps that can.
 _DEEP, _OFF, _NEARLY_ALL, _FEWEST = 0.005, 0.005, 0.8, 5
-# Grasps at once; each takes a megabyte on the way.
+# Grasps at once. Each takes a megabyte on the way.
 _AT_ONCE = 128
 
 
@@ -37,7 +37,7 @@ class CompletedGrasps:
 
     Attributes:
         refused: how many were refused, by reason.
-        frame_doubt: that the poses are hardly those of the hand's base link, a sentence. Empty if they may be.
+        frame_doubt: a sentence if the poses are hardly those of the hand's base link, else empty.
     """
 
     grasps: tuple[Grasp, ...]
@@ -48,11 +48,11 @@ class CompletedGrasps:
 def complete_grasps(
     scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: PlanConfig
 ) -> CompletedGrasps:
-    """Close the hands whose joints are not known, and find each pregrasp and squeeze that is missing.
+    """Close the hands whose joints are not known, and find each missing pregrasp and squeeze.
 
-    What a file has is kept to the digit; squeezes are targets, so that they may be beyond the limits of joints. Refused
-    is what its own file calls no grasp, what is beyond the limits of the hand's joints, and what touches with fewer
-    than two links where a squeeze is to be found.
+    Postures of a file are kept to the digit. Squeezes are targets, so they may exceed the joint limits. Refused are
+    grasps that their own file calls failed, grasps beyond the joint limits, and grasps without a squeeze that touch
+    with fewer than two links.
     """
     faults = [grasp.refused or beyond_limits(grasp, hand) for grasp in imported]
     kept = [grasp for grasp, fault in zip(imported, faults, strict=True) if not fault]
@@ -97,7 +97,7 @@ def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> s
 
 
 def beyond_limits(grasp: ImportedGrasp, hand: HandModel) -> str:
-    """Which joint is beyond its limits at the grasp or the pregrasp; empty where none is."""
+    """Return which joint is beyond its limits at the grasp or the pregrasp, empty for none."""
     for posture in filter(None, (grasp.grasp, grasp.pregrasp)):
         beyond = np.maximum(hand.lower - posture.joint_positions, posture.joint_positions - hand.upper)
         if beyond.max(initial=0.0) > _BEYOND:
@@ -111,7 +111,7 @@ def _poses(problem: Problem, postures: Sequence[Posture]) -> Poses:
 
 
 def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
-    """Our grasp with what a file has, to the digit."""
+    """Return our grasp with the file's postures, to the digit."""
     grasp = theirs.grasp
     if not theirs.closed:
         grasp = replace(grasp, joint_positions=ours.grasp.joint_positions)
@@ -121,7 +121,7 @@ def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
 
 
 def by_object(imported: Sequence[ImportedGrasp]) -> dict[tuple[str, float], tuple[ImportedGrasp, ...]]:
-    """Grasps by their object, mesh and scale, in the order of the first of each."""
+    """Group grasps by their object, mesh and scale, in the order of the first of each."""
     found: dict[tuple[str, float], list[ImportedGrasp]] = {}
     for grasp in imported:
         found.setdefault((grasp.mesh, grasp.scale), []).append(grasp)

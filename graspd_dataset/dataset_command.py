@@ -1,4 +1,4 @@
-"""`graspd dataset`: grasps by the million on Ray, resumable; and what is done with a data set that is there."""
+"""`graspd dataset`: make a data set of grasps on Ray, resumable, or inspect one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LINES, _RECORDS = 10.0, 30.0
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("dataset")
     parser.set_defaults(run=run)
     parser.add_argument(
@@ -64,7 +64,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 1 where blocks failed or a data set has faults, 130 if interrupted."""
+    """Run the command. Return the exit status: 0, 1 if blocks failed or a data set has faults, 130 if interrupted."""
     from graspd_dataset.dataset_store import DatasetStore
 
     action, places = options.words[0], options.words[1:]
@@ -117,7 +117,7 @@ def _run_missing(
     record: RunRecord,
     interrupt: Interrupt,
 ) -> tuple[Lines, RunRecord]:
-    """Run what is missing; the record is written from time to time, so that a run that is killed has one."""
+    """Run the missing blocks. The record is written from time to time, so that a killed run has one."""
     from graspd_dataset.ray_engine import RayEngine, ray_running
     from graspd_dataset.run_dataset import run_blocks, write_run
 
@@ -133,7 +133,7 @@ def _run_missing(
 
 
 def _finish(store: DatasetStore) -> None:
-    """The data card of what is there by now, and the numbers for who ran it."""
+    """Write the data card of the present content, and print the numbers."""
     from graspd_dataset.inspect_dataset import stats_of, stats_table
     from graspd_dataset.run_dataset import data_card
 
@@ -159,7 +159,7 @@ def _request(options: argparse.Namespace) -> DatasetRequest:
 
 
 class Lines:
-    """Progress over blocks: a bar on a terminal, elsewhere a line now and then; what failed at once."""
+    """Progress over blocks: a bar on a terminal, otherwise a line now and then. Failures are printed at once."""
 
     def __init__(self, blocks: int) -> None:
         self.wrong = 0
@@ -204,7 +204,7 @@ class Lines:
         return f"{told}; {reasons}" if reasons else told
 
     def added_to(self, record: RunRecord, wall: float) -> RunRecord:
-        """The record with what this session did."""
+        """Return the record with the work of this session."""
         more = {"done": record.done + self._done, "cpu": record.cpu + self._cpu, "wall": record.wall + wall}
         return replace(record, **more, peak_mb=max(record.peak_mb, self._peak), files=record.files | self._files)
 

@@ -29,7 +29,7 @@ _METADATA = b"graspd"
 
 
 def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
-    """A pyarrow table as the bytes of a Parquet file whose metadata holds JSON-ready values beside the schema."""
+    """Return a pyarrow table as the bytes of a Parquet file, with JSON-ready values in its metadata."""
     import pyarrow.parquet as pq
 
     told = json.dumps({"format": FORMAT, "version": SCHEMA_VERSION, **metadata}, sort_keys=True)
@@ -40,10 +40,9 @@ def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
 
 
 def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = None) -> tuple[Any, dict[str, Any]]:
-    """The table of a file, of all columns or some, and its metadata.
+    """Read the table of a file, of all columns or some, and its metadata.
 
-    Raises:
-        FormatError: it is no Parquet file of graspd, of an unknown version, or its content was changed.
+    Raises FormatError: it is no Parquet file of graspd, of an unknown version, or its content was changed.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -77,7 +76,7 @@ class StorageError(GraspdError):
 
 
 class DatasetStore:
-    """Files by their path below a directory or an address; every failure is a StorageError that names both."""
+    """Files by their path below a directory or an address. Every failure is a StorageError that names both."""
 
     def __init__(self, where: str) -> None:
         self.where = str(where).rstrip("/")
@@ -85,17 +84,17 @@ class DatasetStore:
 
     @property
     def shown(self) -> str:
-        """For messages and records: without keys and options of an address."""
+        """The address without keys and options, for messages and records."""
         kind, there, rest = self.where.partition("://")
         return f"{kind}://{rest.partition('?')[0].rpartition('@')[2]}" if there else self.where
 
     @property
     def local(self) -> Path | None:
-        """The directory; None for an address."""
+        """The directory, None for an address."""
         return None if "://" in self.where else Path(self.where)
 
     def list(self, folder: str) -> list[str]:
-        """Paths of all files below a folder, sorted; none where there is no such folder."""
+        """Return the paths of all files below a folder, sorted, none if there is no such folder."""
         if self.local is not None:
             found = (self.local / folder).rglob("*")
             return sorted(path.relative_to(self.local).as_posix() for path in found if path.is_file())
@@ -107,7 +106,7 @@ class DatasetStore:
         return sorted(item.path.removeprefix(f"{root}/") for item in found if item.type is FileType.File)
 
     def read(self, path: str) -> bytes:
-        """The content of a file."""
+        """Read a file."""
         if self.local is not None:
             local = self.local / path
             return self._once(path, local.read_bytes)
@@ -120,7 +119,7 @@ class DatasetStore:
         return self._tried(path, read)
 
     def write(self, path: str, content: bytes) -> None:
-        """Write a file; one of the same path is replaced."""
+        """Write a file, in place of one of the same path."""
         if self.local is not None:
             local = self.local / path
             return self._once(path, lambda: save_bytes(local, content))
@@ -133,7 +132,7 @@ class DatasetStore:
         return self._tried(path, write)
 
     def _arrow(self) -> tuple[Any, str]:
-        """pyarrow's file system and the path in it."""
+        """Return pyarrow's file system and the path in it."""
         if self._system is None:
             from pyarrow import ArrowException
             from pyarrow.fs import FileSystem
@@ -158,7 +157,7 @@ class DatasetStore:
             raise StorageError(f"{self.shown}: {path}: {error.strerror or error}") from None
 
     def _tried(self, path: str, work: Callable[[], T]) -> T:
-        """What a request gives; a server that is busy is asked again."""
+        """Do a request. A busy server is asked again."""
         for number in range(_TRIES):
             try:
                 return work()
@@ -171,22 +170,22 @@ class DatasetStore:
 
 
 def block_path(hand: str, object_sha256: str, key: str) -> str:
-    """Path of a block's file."""
+    """Return the path of a block's file."""
     return f"grasps/hand={hand}/object={object_sha256[:_SHORT]}/{key}.parquet"
 
 
 def key_of(path: str) -> str:
-    """The key that a file is called by."""
+    """Return the key in a file's name."""
     return PurePosixPath(path).stem
 
 
 def file_hash(content: bytes) -> str:
-    """SHA-256 of a file, as records of runs hold it."""
+    """Return the SHA-256 of a file, as records of runs hold it."""
     return hashlib.sha256(content).hexdigest()
 
 
 def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
-    """The record of a run or a failure. Raises FormatError: it holds no JSON object."""
+    """Read the record of a run or a failure. Raises FormatError: it holds no JSON object."""
     try:
         record = json.loads(store.read(path))
     except ValueError:
@@ -197,5 +196,5 @@ def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
 
 
 def keys_below(store: DatasetStore, folder: str) -> set[str]:
-    """Keys of the files of a folder."""
+    """Return the keys of the files of a folder."""
     return {key_of(path) for path in store.list(folder) if PurePosixPath(path).suffix in (".parquet", ".json")}

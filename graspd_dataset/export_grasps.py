@@ -1,12 +1,8 @@
-"""A data set in the files of others: isaac_grasp 1.0 (Isaac Sim, Isaac ROS), the JSON that GraspGen trains on, and
-DexGraspBench's.
+"""Export of a data set: isaac_grasp 1.0 (Isaac Sim, Isaac ROS), GraspGen's training JSON, and DexGraspBench.
 
-Poses are those of the hand's base link in the object's frame, which is that of the mesh written beside: metres.
-
-A data set as DexGraspBench reads it: a pickled dictionary a grasp, a folder an object.
-
-Its Allegro is Menagerie's right hand: joints in the order of ours, fingers placed in the palm as in our base link; but
-the pose of its qpos is that of a frame in which the palm is turned by the quaternion (0, 1, 0, 1).
+Poses are those of the hand's base link in the object's frame, which is the frame of the mesh written beside, in metres.
+DexGraspBench reads a pickled dictionary a grasp, and a folder an object. Its Allegro is Menagerie's right hand, with
+our order of joints. The pose of its qpos is that of a frame in which the palm is turned by the quaternion (0, 1, 0, 1).
 """
 
 from __future__ import annotations
@@ -35,7 +31,7 @@ Row = dict[str, Any]
 
 
 def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
-    """Write files for every hand and object, and the meshes; numbers of such pairs and of grasps.
+    """Write files for every hand and object, and the meshes. Return the numbers of such pairs and of grasps.
 
     Raises:
         ConfigError: no such kind, or a hand that it does not know.
@@ -63,7 +59,7 @@ def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
 
 
 def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
-    """Verified grasps as isaac_grasp 1.0 has them; of a hand that presses it knows the touching posture only."""
+    """Return verified grasps in isaac_grasp 1.0, which knows the touching posture but no squeeze."""
 
     def joints(row: Row, stage: str) -> dict[str, float]:
         return dict(zip(row["joint_names"], row[f"{stage}_joint_positions"], strict=True))
@@ -84,7 +80,7 @@ def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
 
 
 def graspgen(rows: Sequence[Row], mesh: str) -> str:
-    """Poses of tried grasps and whether each held, those that failed among them."""
+    """Return poses of tried grasps and whether each held, failed ones too."""
     transforms = [_matrix(row["grasp_position"], row["grasp_quaternion_wxyz"]).tolist() for row in rows]
     held = [row["verdict"] == "verified" for row in rows]
     grasps = {"transforms": transforms, "object_in_gripper": held}
@@ -103,7 +99,6 @@ _COLUMNS += tuple(f"{stage}_{part}" for stage in ("pregrasp", "grasp", "squeeze"
 
 
 def _matrix(position: Sequence[float], quaternion_wxyz: Sequence[float]) -> np.ndarray:
-    """`T_object_hand`."""
     from scipy.spatial.transform import Rotation
 
     matrix = np.eye(4)
@@ -119,7 +114,7 @@ def _mesh(store: DatasetStore, target: str) -> TriangleMesh:
 
 
 def refuse_hand(name: str) -> None:
-    """Raises ConfigError: that bench's model of the hand is not known here."""
+    """Raise ConfigError: DexGraspBench's model of the hand is not known here."""
     if name not in PALMS:
         raise ConfigError(f"to dexgraspbench: hand {name!r}; valid: {', '.join(PALMS)}")
 
@@ -129,7 +124,7 @@ def write_dexgraspbench(
 ) -> None:
     """Write the grasps of one hand on one object, and the object: mesh, convex parts, mass and centre of mass.
 
-    That bench takes paths from the folder of its own code: there belong the `objects`, or they are named in full.
+    That bench takes paths from the folder of its own code. The `objects` belong there, or are named in full.
     """
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):
@@ -150,7 +145,7 @@ def write_dexgraspbench(
 
 
 def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
-    """A posture as that bench has it: position, quaternion wxyz, joints."""
+    """Return a posture in that bench's order: position, quaternion wxyz, joints."""
     from scipy.spatial.transform import Rotation
 
     palm = Rotation.from_quat(np.roll(PALMS[row["hand_name"]], -1))
@@ -159,6 +154,6 @@ def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
 
 
 def obj_text(mesh: TriangleMesh) -> str:
-    """A mesh as a Wavefront file, to the last digit."""
+    """Return a mesh as a Wavefront file, to the last digit."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     return "\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist())]) + "\n"

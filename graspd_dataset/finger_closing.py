@@ -1,9 +1,9 @@
 """Closing until contact: every finger turns at its own rate until a link of it touches, as a gripper without sensors.
 
-A solver for the shared loop, without any loss and without gradients: the base stands still, each joint travels from
-where it is towards the limit that lies beyond its closed value. A step that would let a link of a finger sink in is not
-taken and halved instead; at a thirty-second of a step the joints that move that link stop for good, and the finger's
-other joints go on. Links stop at links of the hand as they stop at the object.
+A solver for the shared loop, without loss and gradients. The base stands still. Each joint travels towards the limit
+beyond its closed value. A step that would let a link of a finger sink in is halved instead. At a thirty-second of a
+step the joints that move that link stop, and the finger's other joints go on. Links of the hand stop links as the
+object does.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
 
 # Steps of a closing from open to closed.
 CLOSE_STEPS = 60
-# A finger whose step is halved to this share has arrived; steps are full travels of the closing over `close_steps`.
+# A finger whose step is halved to this share has arrived. Steps are full travels of the closing over `close_steps`.
 _ARRIVED = 1 / 32
 # Overlap of proxy spheres beyond that at the start that counts as a collision of the hand with itself [m].
 _SELF_SLACK = 0.001
@@ -40,7 +40,7 @@ class ClosingState:
     Attributes:
         poses: where they are.
         floor: gaps that count as contact: zero, less where a link sank in already [m].
-        stride: share of a step that each joint tries next; alike for the joints of a finger.
+        stride: share of a step that each joint tries next, equal for the joints of a finger.
         blamed: links that the last refused step would have let sink in.
         stopped: joints that have arrived.
     """
@@ -54,10 +54,10 @@ class ClosingState:
 
 @dataclass(frozen=True)
 class Closing:
-    """Closes until contact; build with `make_closing`. Its loss is the share of joints that no contact has stopped.
+    """A closing until contact, from `make_closing`. Its loss is the share of joints that no contact has stopped.
 
     Attributes:
-        rate: what each joint turns in a full step, signed; zero where closing does not move it [rad] or [m].
+        rate: what each joint turns in a full step, signed, zero for unmoved ones [rad] or [m].
         target: the limits that the joints turn to [rad] or [m].
         moves: which links each joint moves.
         finger_links: links of each joint's finger.
@@ -93,7 +93,7 @@ class Closing:
             return state
         joints = state.poses.joints
         turned = torch.where(state.stopped, joints, joints + state.stride * self.rate)
-        # Nobody closes past the limit; minimum and maximum by the way that each joint turns.
+        # Nobody closes past the limit. Minimum and maximum by the way that each joint turns.
         turned = torch.where(self.rate > 0, turned.minimum(self.target), turned.maximum(self.target))
         turned = torch.where(self.rate == 0.0, joints, turned)
         gaps = link_gaps(problem, replace(state.poses, joints=turned), self.sphere_links)
@@ -117,12 +117,12 @@ class Closing:
         return state.poses, 1.0 - state.stopped.to(state.stride).mean(-1)
 
     def some(self, flags: Bool[Tensor, "batch n"], of: Bool[Tensor, "m n"]) -> Bool[Tensor, "batch m"]:
-        """Whether any flag is set among those that belong to each row of `of`."""
+        """Return whether any flag is set among those that belong to each row of `of`."""
         return flags.to(self.rate) @ of.to(self.rate).T > 0
 
 
 def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing:
-    """The closing of a hand in `close_steps` full steps from its open to its closed posture."""
+    """Build the closing of a hand in `close_steps` full steps from its open to its closed posture."""
     device = problem.hand.lower.device
     travel = hand.closed_posture - hand.open_posture
     # Joints that hardly differ between the two postures shape the hand, they do not close it.
@@ -141,7 +141,7 @@ def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing
 
 
 def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
-    """Which links each joint moves, through couplings or not."""
+    """Return which links each joint moves, through couplings too."""
     moved = np.zeros((hand.num_joints, hand.num_links), dtype=bool)
     for link in range(1, hand.num_links):
         moved[:, link] = moved[:, hand.link_parent[link]]
@@ -151,7 +151,7 @@ def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
 
 
 def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
-    """A number for each joint, alike for joints that move a link in common, directly or through others."""
+    """Return a number for each joint, equal for joints that move a link in common, directly or through others."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -161,9 +161,10 @@ def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
 
 @torch.no_grad()
 def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres"]) -> Float[Tensor, "batch 2 links"]:
-    """Signed distance of every link to the object, and to the rest of the hand (by proxy spheres, zero at most) [m].
+    """Return the signed distance of every link to the object and to the rest of the hand (proxy spheres, at most 0)
+    [m].
 
-    Adjacent links are never near each other; a link without candidates and solids is infinitely far from all.
+    Adjacent links are never near each other. A link without candidates and solids is infinitely far from all.
     """
     placed = hand_forward(problem, problem.hand.fine, poses)
     count = placed.links.translation.shape[1]
@@ -175,7 +176,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
 
 def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
-    """Greatest depth of each proxy sphere in one of a link that is not adjacent, zero where clear [m]."""
+    """Return the greatest depth of each proxy sphere in one of a link that is not adjacent, zero where clear [m]."""
     centers = place_points(problem.hand.spheres.matrix, placed.links)
     reach = problem.hand.spheres.radii[:, None] + problem.hand.spheres.radii[None, :]
     depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.hand.spheres.weight > 0)

@@ -1,18 +1,15 @@
-"""A grasp from somebody else's file, in graspd's terms: joints by the hand's own order, poses of its base link.
+"""Grasps from files of others, in graspd's terms: joints in the hand's own order, poses of its base link.
 
 DexGraspBench's npy: a pickled dictionary a grasp, three postures as position, quaternion wxyz and joints by order.
+`runtime/inert_pickle` reads the pickle and runs none of it.
 
-A pickle is a program: it is read by `runtime/inert_pickle`, which runs none of it.
+isaac_grasp 1.0 (YAML): a pose of the gripper, joints at the grasp and at the pregrasp by name, no squeeze. The
+gripper's frame is a link of the hand by its name, the last word of a path in a stage. Other words mean its base link.
 
-isaac_grasp 1.0 (YAML): a pose of the gripper, joints at the grasp and at the pregrasp by name; no squeeze.
+GraspGen's JSON: poses of the gripper's base, whether each held there, and no joints. The hand closes from its open
+posture until it touches, and presses as graspd's grasps do.
 
-The gripper's frame is a link of the hand by its name, the last word of a path in a stage; other words mean its base
-link. Both postures have the same pose.
-
-GraspGen's JSON: poses of the gripper's base, and whether each held there; no joints. The hand stands open there, closes
-until it touches, and presses as graspd's grasps do.
-
-Grasps of others from a file or a folder: which format it is goes by the ending.
+The ending of a file decides its format.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ from graspd_core.types import Posture
 
 # A coupled joint may be so far from where it follows to [rad] or [m], and a quaternion's length from one.
 _COUPLED, _UNIT = 1e-3, 0.01
-# No position, angle or scale is larger; what is computed of such numbers stays finite.
+# No position, angle or scale is larger. What is computed of such numbers stays finite.
 _LARGEST = 1e6
 
 
@@ -47,13 +44,13 @@ class ImportedGrasp:
 
     Attributes:
         name: the file and the place in it.
-        mesh: file of the object or shape:NAME; in its frame, once it is scaled, the poses are.
+        mesh: file of the object or shape:NAME. The poses are in its frame, once it is scaled.
         scale: factor on the mesh's coordinates.
-        grasp: the touching posture; of a format without joints the open hand, which is to be closed.
-        pregrasp, squeeze: None where the format has none.
+        grasp: the touching posture, of a format without joints the open hand, which is to be closed.
+        pregrasp, squeeze: None if the format has none.
         closed: whether the joints of `grasp` are those of the file.
         squeeze_moved: how far the squeeze's base is from the grasp's [m]: graspd keeps it at the grasp's.
-        refused: why its own file calls it no grasp; empty where it does not.
+        refused: why its own file calls it no grasp, empty if it does not.
     """
 
     name: str
@@ -68,7 +65,7 @@ class ImportedGrasp:
 
 
 def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """A value as numbers of a shape, none of them huge. Raises FormatError: it is something else."""
+    """Return a value as numbers of a shape, none of them huge. Raises FormatError: it is something else."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -82,7 +79,7 @@ def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
 
 
 def entry(values: Any, key: str, where: str) -> Any:
-    """What a mapping has under a key. Raises FormatError: it has no such key, or is no mapping."""
+    """Return a mapping's value of a key. Raises FormatError: it has no such key, or is no mapping."""
     if not isinstance(values, Mapping):
         raise FormatError(f"{where}: {shown(values)}; expected a mapping with the key {key!r}")
     if key not in values:
@@ -92,7 +89,7 @@ def entry(values: Any, key: str, where: str) -> Any:
 
 
 def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
-    """A unit quaternion, wxyz. Raises FormatError: it is none."""
+    """Return a unit quaternion, wxyz. Raises FormatError: it is none."""
     quaternion = numbers_of(value, (4,), where)
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > _UNIT:
@@ -101,10 +98,10 @@ def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
 
 
 def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
-    """Actuated joint values from named ones; coupled joints may be among them.
+    """Return actuated joint values from named ones, which may include coupled joints.
 
-    Raises:
-        FormatError: a name is not of the hand, one of its joints is missing, or a coupled one is not where it follows.
+    Raises FormatError: a name is not of the hand, one of its joints is missing, or a coupled one contradicts its
+    leader.
     """
     if not isinstance(values, Mapping):
         raise FormatError(f"{where}: {shown(values)}; expected joint values by name")
@@ -122,7 +119,7 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
 
 
 def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
-    """A joint order that fits the hand. Raises ConfigError: it names a joint that is not there, or lacks one."""
+    """Return a joint order that fits the hand. Raises ConfigError: an unknown or a missing joint."""
     names = all_joint_names(hand)
     for name in order:
         if name not in names or list(order).count(name) > 1:
@@ -134,7 +131,7 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
 
 
 def find_beside(named: Any, file: Path, where: str) -> str:
-    """A file that another one names, relative to any folder that it lies in. Raises FormatError: it is nowhere."""
+    """Find a file that another one names, relative to any folder above it. Raises FormatError: it is nowhere."""
     if isinstance(named, str) and named and "\0" not in named:
         for folder in file.resolve().parents:
             if (folder / named).is_file():
@@ -150,7 +147,10 @@ _WHAT = "file of DexGraspBench"
 
 
 def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
-    """The order of the joints of a qpos: as given, else known. Raises ConfigError: neither, or it fits no hand."""
+    """Return the joint order of a qpos: as given, else the known one.
+
+    Raises ConfigError: neither, or it does not fit.
+    """
     if not order and hand.name not in PALMS:
         names = ",".join(all_joint_names(hand))
         raise ConfigError(f"joint order: npy files name no joints, that of {hand.name} is not known; such as: {names}")
@@ -160,7 +160,7 @@ def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
 def read_dexgraspbench(
     path: Path, content: bytes, hand: HandModel, mesh: str | None, order: Sequence[str]
 ) -> list[ImportedGrasp]:
-    """The one grasp of a file, in the frame of the object; `mesh` stands for the one that it names.
+    """Read the one grasp of a file, in the frame of the object. `mesh` replaces the one that it names.
 
     Raises:
         ConfigError: the joint order is not known or does not fit the hand.
@@ -178,7 +178,10 @@ def read_dexgraspbench(
 
 
 def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
-    """The dictionary of an npy file: plain values, and `Inert` arrays of numbers. Raises FormatError: it holds none."""
+    """Return the dictionary of an npy file: plain values, and `Inert` arrays of numbers.
+
+    Raises FormatError: it has none.
+    """
     file = BytesIO(content)
     try:
         major = np.lib.format.read_magic(file)[0]
@@ -200,7 +203,7 @@ def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
 
 
 def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
-    """Text, a number, or an array of numbers under a key."""
+    """Return text, a number, or an array of numbers under a key."""
     value = entry(values, key, f"{path}")
     if not isinstance(value, Inert):
         return value
@@ -231,7 +234,7 @@ def _posture(
     order: Sequence[str],
     path: Path,
 ) -> Posture:
-    """A posture of the hand's base link in the frame of the object."""
+    """Return a posture of the hand's base link in the frame of the object."""
     from scipy.spatial.transform import Rotation
 
     where = f"{path}: {stage}_qpos"
@@ -251,7 +254,7 @@ _ROTATION = 1e-3
 
 
 def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """The grasps of one file; `mesh` stands for the one that it names. Raises FormatError: malformed, by key."""
+    """Read the grasps of one file. `mesh` replaces the one that it names. Raises FormatError: malformed, by key."""
     try:
         _, document = parse_yaml(text.decode())
     except ValueError as error:
@@ -287,7 +290,7 @@ def _grasp_of(values: Any, hand: HandModel, frame: str, mesh: str, where: str) -
 def _base_of(
     hand: HandModel, link: str, joints: np.ndarray, position: np.ndarray, quaternion: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position and quaternion of the base link where those of another link are given."""
+    """Return position and quaternion of the base link from those of another link."""
     from scipy.spatial.transform import Rotation
 
     rotations, translations = link_poses(hand, joints)
@@ -297,7 +300,7 @@ def _base_of(
 
 
 def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """The grasps of one file; `mesh` stands for the one that it names. Raises FormatError: malformed, by key."""
+    """Read the grasps of one file. `mesh` replaces the one that it names. Raises FormatError: malformed, by key."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -319,7 +322,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
 
 
 def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
-    """The open hand at a pose `T_object_hand`."""
+    """Return the open hand at a pose `T_object_hand`."""
     from scipy.spatial.transform import Rotation
 
     matrix = numbers_of(pose, (4, 4), f"{where}: transform")
@@ -338,12 +341,12 @@ FORMATS = {".npy": "dexgraspbench", ".yaml": "isaac", ".yml": "isaac", ".json": 
 def read_foreign(
     place: Path, hand: HandModel, *, mesh: str | None = None, order: Sequence[str] = ()
 ) -> tuple[ImportedGrasp, ...]:
-    """All grasps of a file, or of the files of one format below a folder, in the order of their names.
+    """Read all grasps of a file, or of the files of one format below a folder, in the order of their names.
 
     Args:
         hand: whose grasps they are.
         mesh: of the object, instead of what the files name.
-        order: joints of an npy's rows of numbers, by name; () where the hand's is known.
+        order: joints of an npy's rows of numbers, by name, () if the hand's is known.
 
     Raises:
         ConfigError: the order is not known, or does not fit the hand.
@@ -363,7 +366,7 @@ def read_foreign(
 
 
 def foreign_files(place: Path) -> tuple[Path, ...]:
-    """The files of grasps at a place, which share a format. Raises FormatError: there are none."""
+    """Return the files of grasps at a place, which share a format. Raises FormatError: there are none."""
     endings = ", ".join(FORMATS)
     if place.is_file():
         if place.suffix not in FORMATS:

@@ -1,7 +1,7 @@
 """Blocks on a worker of Ray: the work in a child process with limits, its files written whole by the worker.
 
-What a block does, hang, crash, or fill memory, it does to the child; the worker writes down what it was. The worker
-itself loads neither torch nor MuJoCo: what it hands on to the child is pickled.
+A block that hangs, crashes, or fills memory harms the child only, and the worker records it. The worker itself loads
+neither torch nor MuJoCo: it passes pickled values on to the child.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KINDS = {TimeoutError: "hung", MemoryError: "memory", ChildProcessError: "died"
 
 @dataclass(frozen=True)
 class Limits:
-    """What one block, or making one object ready, may take: seconds, and MB of resident memory."""
+    """Limits of one block, or of preparing one object: seconds, and MB of resident memory."""
 
     seconds: float = 1800.0
     most_mb: float = 4096.0
@@ -32,11 +32,11 @@ class Limits:
 
 @dataclass(frozen=True)
 class Report:
-    """What came of a block, or of making an object ready.
+    """The result of a block, or of preparing an object.
 
     Attributes:
         key: of the block or the object.
-        failed: kind of failure (raised, hung, memory, died, lost); empty where it was written.
+        failed: kind of failure (raised, hung, memory, died, lost), empty for a written one.
         error: what failed.
         rows, verified: numbers of candidates.
         failures: numbers of failed candidates by trial and kind of reason.
@@ -60,7 +60,7 @@ class Report:
 
 @dataclass(frozen=True)
 class ReadyObject:
-    """An object made ready: what every process that grasps it needs.
+    """A prepared object, for every process that grasps it.
 
     Attributes:
         sha256: of its cleaned mesh.
@@ -102,7 +102,7 @@ class Job:
     Attributes:
         key: of the block or the object.
         asked: for the record of a failure, JSON-ready.
-        pickled: the block; of an object the pair of it and the settings.
+        pickled: the block, or the pair of an object and the settings.
         hand: of a block, the name of its hand.
     """
 
@@ -113,7 +113,7 @@ class Job:
 
 
 def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits: Limits) -> tuple[Report, bytes]:
-    """Make an object ready and keep its mesh; what its blocks share, or where it failed, the record and nothing."""
+    """Prepare an object and keep its mesh. Return the report, and what its blocks share, empty for a failure."""
     try:
         ready = call_guarded(limits, ready_of, job.pickled, content)
     except Exception as error:
@@ -144,7 +144,7 @@ def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits:
 
 
 def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:
-    """In the child: `make_ready` of an object and settings."""
+    """Call `make_ready` of an object and settings, in the child."""
     from graspd_dataset.block_rows import make_ready
 
     thing, config = pickle.loads(pickled)
@@ -152,14 +152,14 @@ def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:
 
 
 def block_of(pickled: bytes, hand: bytes, shared: bytes) -> MadeBlock:
-    """In the child: `make_block`."""
+    """Call `make_block`, in the child."""
     from graspd_dataset.block_rows import make_block
 
     return make_block(pickle.loads(pickled), hand, shared)
 
 
 def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report:
-    """Write down what failed."""
+    """Record a failure."""
     from graspd_dataset.run_records import failure
 
     record = failure(error, _KINDS.get(type(error), "raised"))

@@ -1,4 +1,4 @@
-"""`graspd import`: somebody else's grasps into grasps.json (docs/dataset.md)."""
+"""`graspd import`: grasps of other projects into grasps.json (docs/dataset.md)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOVED = 1e-4
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("import")
     parser.set_defaults(run=run)
     parser.add_argument(
@@ -41,7 +41,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 3 where no grasp of an object is left."""
+    """Import the grasps. Return the exit status: 0, 3 if no grasp of an object is left."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable, save_result
     from graspd_core.optimize.plan_config import load_preset
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
-    """The grasps of one object as a run gives back its own, verified ones first."""
+    """Return the grasps of one object as a result of a run, verified ones first."""
     from graspd_core.planning.plan_grasps import on_surface
     from graspd_core.verify.run_clock import result_of
     from graspd_core.verify.verification import verify_grasps

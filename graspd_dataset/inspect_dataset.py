@@ -1,4 +1,4 @@
-"""A data set looked through: what it holds, why grasps failed, whether files are whole and no grasp is in it twice."""
+"""Inspection of a data set: its content, why grasps failed, and whether files are whole and no grasp is in it twice."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REASONS = 8
 
 @dataclass
 class HandCount:
-    """Numbers of one hand's rows: by verdict, of blocks, and the objects' hashes."""
+    """Counts of one hand's rows: by verdict, of blocks, and the objects' hashes."""
 
     blocks: int = 0
     size: int = 0
@@ -30,7 +30,7 @@ class HandCount:
 
 @dataclass
 class DatasetStats:
-    """What a data set holds.
+    """Counts of a data set.
 
     Attributes:
         hands: numbers by hand.
@@ -54,10 +54,9 @@ class DatasetStats:
 
 
 def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iterator[tuple[str, bytes, Any, Any]]:
-    """Path, bytes, table and metadata of every block, in the order of their paths.
+    """Yield path, bytes, table and metadata of every block, in the order of their paths.
 
-    Raises:
-        FormatError: there is no block, or one of them is spoilt.
+    Raises FormatError: there is no block, or one of them is spoilt.
     """
     paths = store.list("grasps")
     if not paths:
@@ -68,7 +67,7 @@ def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iter
 
 
 def stats_of(store: DatasetStore) -> DatasetStats:
-    """Count. Raises FormatError: as `tables_of`."""
+    """Count the rows of a data set. Raises FormatError: as `tables_of`."""
     stats, there = DatasetStats(), set[str]()
     for path, content, table, told in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
         there.add(told["block"])
@@ -89,7 +88,7 @@ def stats_of(store: DatasetStore) -> DatasetStats:
 
 
 def stats_table(stats: DatasetStats) -> str:
-    """Numbers by hand, in Markdown."""
+    """Return counts by hand, in Markdown."""
     body = [
         (
             name,
@@ -107,7 +106,7 @@ def stats_table(stats: DatasetStats) -> str:
 
 
 def reason_lines(stats: DatasetStats) -> list[str]:
-    """The most frequent reasons, a line each, and what failed as a whole."""
+    """Return the most frequent reasons, a line each, and the blocks that failed as a whole."""
     lines = [f"{number} {reason}" for reason, number in stats.reasons.most_common(_REASONS)]
     return lines + [f"{record['failed']}: {record['asked']['object']}: {record['error']}" for record in stats.failed]
 
@@ -117,11 +116,7 @@ _UNIT_TOLERANCE = 1e-3
 
 
 def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
-    """What is wrong with a data set, a line each; none where all is well.
-
-    Raises:
-        FormatError: there is no data set.
-    """
+    """Yield the faults of a data set, a line each. Raises FormatError: there is no data set."""
     paths, meshes = store.list("grasps"), {key_of(path) for path in store.list("objects")}
     if not paths:
         raise FormatError(f"{store.shown}: no data set: nothing in grasps/")
@@ -158,7 +153,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
 
 
 def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
-    """The hashes of every file that the records of runs hold, by path. Raises FormatError: a record is spoilt."""
+    """Return the hashes of all files in records of runs, by path. Raises FormatError: a record is spoilt."""
     known: dict[str, set[str]] = {}
     for record in (read_record(store, path) for path in store.list("runs")):
         for path, digest in record.get("files", {}).items():
@@ -172,20 +167,20 @@ def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterat
 
 
 def row_digests(table: Any) -> list[bytes]:
-    """Of every row the hash of its object, hand and grasp, whatever block it is in."""
+    """Return for every row the hash of its object, hand and grasp, whatever block it is in."""
     names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
     rows = zip(*(table[name].to_pylist() for name in names), strict=True)
     return [hashlib.sha256(repr(row).encode()).digest() for row in rows]
 
 
 def count_by_content(store: DatasetStore) -> tuple[int, int]:
-    """Numbers of rows, and of different ones."""
+    """Return the numbers of rows, and of different ones."""
     digests = [digest for _, _, table, _ in tables_of(store) for digest in row_digests(table)]
     return len(digests), len(set(digests))
 
 
 def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) -> Iterator[str]:
-    """What is wrong with one block."""
+    """Yield the faults of one block."""
     import numpy as np
 
     if table.schema.remove_metadata() != arrow_schema():

@@ -1,4 +1,4 @@
-"""Several data sets in one, block by block; and some rows of one in a file."""
+"""Merging of data sets, block by block, and sampling of rows."""
 
 from __future__ import annotations
 
@@ -18,12 +18,10 @@ _NAMES = ("object_source", "preset", "code")
 
 
 def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]:
-    """Copy all blocks, meshes, records of failures and runs to `out`; numbers of blocks copied and of those in common.
+    """Copy all blocks, meshes, records of failures and runs to `out`. Return the numbers of blocks copied and common.
 
-    What is there already is compared and left; so a merge that was stopped goes on.
-
-    Raises:
-        FormatError: a file is spoilt, or two data sets hold other rows under the same key.
+    Existing files are compared and left, so a stopped merge goes on. Raises FormatError: a file is spoilt, or two data
+    sets hold other rows under the same key.
     """
     there = {path.rpartition("/")[2]: path for path in out.list("grasps")}
     copied = common = 0
@@ -56,7 +54,7 @@ def _refuse_conflict(table: Any, out: DatasetStore, path: str, where: str) -> No
 
 
 def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = None) -> tuple[bytes, int]:
-    """A Parquet file of `count` rows drawn evenly, and their number; the same for the same rows and seed.
+    """Draw `count` rows evenly into a Parquet file. Return its bytes and their number, equal for equal rows and seed.
 
     Raises:
         ConfigError: the count is not valid.

@@ -1,4 +1,4 @@
-"""Ray: one of its own on this machine, or a cluster that is there; tasks that it runs again when a worker is lost."""
+"""Ray: one of its own on this machine, or an existing cluster, whose tasks run again when a worker is lost."""
 
 from __future__ import annotations
 
@@ -24,23 +24,22 @@ from graspd_dataset.guarded_calls import Job, Limits, Report, prepare_object, ru
 _OBJECT_STORE = 256 * 2**20
 # How often Ray runs a task again whose worker or node was lost.
 _RETRIES = 4
-# Loopback; of 127.0.0.1 Ray would make the machine's address in its network.
+# Loopback. Of 127.0.0.1 Ray would make the machine's address in its network.
 _LOOPBACK = "127.0.0.2"
 # Until a cluster has answered [s].
 _CONNECT = 10.0
-# Begin of the name of Ray's own folder; the number of the driver's process follows.
+# Begin of the name of Ray's own folder. The number of the driver's process follows.
 _FOLDER = "graspd-ray-"
 
 
 @contextmanager
 def ray_running(address: str | None, workers: int | None, folder: Path | None = None) -> Iterator[Any]:
-    """The module `ray`, connected: to a cluster's address, or to a Ray of this process's own that ends with it.
+    """Connect the module `ray` to a cluster's address, or to a Ray of this process's own that ends with it.
 
-    An own one shows no dashboard, tells nobody of its use, takes commands only of who knows a random token, and keeps
-    its files in `folder` or a temporary one.
+    An own one shows no dashboard, reports no use, takes commands only with a random token, and keeps its files in
+    `folder` or a temporary one.
 
-    Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
+    Raises ConfigError: Ray is not installed, or there is no cluster at the address.
     """
     settings = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     if address is None:
@@ -73,7 +72,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
 
 
 def _refuse_silent(address: str | None) -> None:
-    """Refuse an address where nothing listens: Ray would wait for minutes and then end the process."""
+    """Refuse an address where nothing listens, because Ray would wait for minutes and then end the process."""
     host, _, port = (address or "").removeprefix("ray://").partition(":")
     if not port.isdigit():
         return
@@ -104,25 +103,25 @@ def _ray() -> Any:
 
 
 def pickled_hand(block: Block) -> bytes:
-    """The hand of a block as its process takes it."""
+    """Return the pickled hand of a block."""
     from graspd_core.hands.library import load_hand
 
     return pickle.dumps(load_hand(block.hand, candidates=block.config.problem.fine_candidates))
 
 
 def object_job(thing: DatasetObject, config: PlanConfig) -> Job:
-    """An object as a worker takes it."""
+    """Return an object as a job for a worker."""
     return Job(thing.key, {"object": thing.source, **thing.asked}, pickle.dumps((thing, config)))
 
 
 def block_job(block: Block) -> Job:
-    """A block as a worker takes it."""
+    """Return a block as a job for a worker."""
     asked = {"object": block.object.source, "hand": block.hand, **block.asked}
     return Job(block.key, asked, pickle.dumps(block), block.hand_name)
 
 
 class RayEngine:
-    """Submits blocks and objects to Ray, and says what came of them.
+    """A client that submits blocks and objects to Ray, and returns their reports.
 
     Args:
         ray: the module, connected.
@@ -139,30 +138,29 @@ class RayEngine:
         self._run = ray.remote(**options)(run_block)
 
     def slots(self) -> int:
-        """How many tasks run at a time."""
+        """Return how many tasks run at a time."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def submit_object(self, thing: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
-        """A handle of the report, and one of what the object's blocks share."""
+        """Submit an object. Returns handles of the report, and of what the object's blocks share."""
         shape = thing.source.startswith("shape:")
         content = Path(thing.source).read_bytes() if self._ship and not shape else None
         return tuple(self._prepare.remote(object_job(thing, config), content, self._store, self._limits))
 
     def submit_block(self, block: Block, shared: Any) -> Any:
-        """A handle of the report."""
+        """Submit a block. Return a handle of the report."""
         if block.hand_content not in self._hands:
             self._hands[block.hand_content] = self._ray.put(pickled_hand(block))
         return self._run.remote(block_job(block), self._hands[block.hand_content], shared, self._store, self._limits)
 
     def wait(self, handles: Sequence[Any], seconds: float) -> list[Any]:
-        """Those that have ended, as soon as one has."""
+        """Return the handles that have ended, as soon as one has."""
         return self._ray.wait(list(handles), num_returns=1, timeout=seconds)[0]
 
     def report(self, handle: Any, key: str) -> Report:
-        """What came of it; lost where its workers or nodes were, more often than it is run again.
+        """Return the report of a handle, lost if its workers or nodes were lost more often than it is run again.
 
-        Raises:
-            StorageError: its file could not be written.
+        Raises StorageError: its file could not be written.
         """
         from ray.exceptions import RayError, RayTaskError
 

@@ -61,7 +61,7 @@ _BEFORE = (
 
 
 def columns() -> tuple[Column, ...]:
-    """All columns: one for every metric of the registry among them."""
+    """Return all columns, with one for every metric of the registry."""
     metrics = (
         Column(f"metric_{row.key}", "double", f"{row.name.replace('_', ' ')} (docs/metrics.md); null: not measured")
         for row in METRICS.values()
@@ -70,7 +70,7 @@ def columns() -> tuple[Column, ...]:
 
 
 def arrow_schema() -> Any:
-    """The pyarrow schema."""
+    """Return the pyarrow schema of the rows."""
     import pyarrow as pa
 
     vector = pa.list_(pa.float64(), 3)
@@ -100,7 +100,7 @@ def arrow_schema() -> Any:
 
 
 def object_schema() -> Any:
-    """The pyarrow schema of the files in `objects/`: one row an object, lengths in metres."""
+    """Return the pyarrow schema of the files in `objects/`: one row an object, lengths in metres."""
     import pyarrow as pa
 
     return pa.schema(
@@ -116,7 +116,7 @@ def object_schema() -> Any:
 
 
 def schema_table() -> str:
-    """The columns in Markdown, for docs/dataset.md."""
+    """Return the columns in Markdown, for docs/dataset.md."""
     return markdown_table(
         ("column", "type", "what it holds"), [(f"`{c.name}`", c.kind, c.description) for c in columns()]
     )

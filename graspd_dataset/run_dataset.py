@@ -1,6 +1,6 @@
-"""The blocks that are missing, a bounded number at a time: objects made ready ahead, nothing done twice.
+"""Runs of missing blocks, a bounded number at a time: objects prepared ahead, nothing done twice.
 
-Beside the data: what a command asked for and what it took, and the data card that is made of it.
+Beside the data lie the record of the command, its cost, and the data card made of it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class RunRecord:
 
 
 def command_of(request: DatasetRequest, out: str) -> str:
-    """The command that asks for it, in as few words as it takes."""
+    """Return the command for a request, in as few words as possible."""
     usual, words = DatasetRequest(request.objects), ["graspd", "dataset", *request.objects]
     for item in fields(request):
         value = getattr(request, item.name)
@@ -71,10 +71,9 @@ def command_of(request: DatasetRequest, out: str) -> str:
 
 
 def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_code: bool = False) -> RunRecord:
-    """The record of this command, as earlier sessions left it.
+    """Return the record of this command, as earlier sessions left it.
 
-    Raises:
-        ConfigError: other code made what is there, and that is not wanted.
+    Raises ConfigError: other code made the present content, and that is not wanted.
     """
     code = code_version()
     records = run_records(store)
@@ -89,27 +88,26 @@ def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_
 
 
 def write_run(store: DatasetStore, record: RunRecord) -> None:
-    """Keep it."""
     told = {"format": FORMAT, "version": SCHEMA_VERSION, **asdict(record)}
     store.write(record.path, (json.dumps(told, indent=1) + "\n").encode())
 
 
 def run_records(store: DatasetStore) -> list[RunRecord]:
-    """Those of a data set."""
+    """Read the records of a data set."""
     names = {item.name for item in fields(RunRecord)}
     told = [read_record(store, path) for path in store.list("runs")]
     return [RunRecord(**{key: value for key, value in record.items() if key in names}) for record in told]
 
 
 def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:
-    """The record with the hashes of files that no record holds: of a session that was killed, or of earlier code."""
+    """Return the record with hashes of files that no record holds, as of a killed session or of earlier code."""
     known = recorded_hashes(store).keys() | record.files.keys()
     paths = [path for folder in ("grasps", "objects") for path in store.list(folder) if path not in known]
     return replace(record, files=record.files | {path: file_hash(store.read(path)) for path in paths})
 
 
 def data_card(store: DatasetStore, stats: DatasetStats) -> str:
-    """README.md of a data set: what is in it, how it was made, what may be done with it."""
+    """Return the README.md of a data set: its content, its making, its licence."""
     records = run_records(store)
     own = all(word.startswith("shape:") for record in records for word in _objects(record.command))
     cpu, done = sum(r.cpu for r in records), sum(r.done for r in records)
@@ -172,7 +170,7 @@ _AHEAD = 2
 
 
 def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed: bool = False) -> list[Block]:
-    """The blocks whose file is not there, by listing; those that failed, or whose object did, only where asked for."""
+    """Return the blocks without a file. Failed blocks, or blocks of failed objects, are included on request."""
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
@@ -181,10 +179,9 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Run blocks and yield each with its report as it ends; objects too, of which those that fail drop their blocks.
+    """Run blocks and yield each with its report as it ends. Objects too: a failed one drops its blocks.
 
-    Raises:
-        StorageError: a file could not be written; what was written before stays.
+    Raises StorageError: a file could not be written. Earlier files stay.
     """
     waiting = deque(by_object(blocks))
     preparing: dict[Any, tuple[DatasetObject, list[Block], Any]] = {}

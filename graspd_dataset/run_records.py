@@ -1,4 +1,4 @@
-"""What a record of a run says of the run: the code, the commit, the failure, the cost; and tables in Markdown."""
+"""Records of runs: the code, the commit, the failure, the cost. And tables in Markdown."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Stopwatch:
-    """Seconds by name, added up over all stretches of that name.
+    """Seconds by name, summed over all stretches of that name.
 
-    CPU seconds are of the whole process (`time.process_time`): on one thread they are what the work took, however busy
-    the machine is.
+    CPU seconds are of the whole process (`time.process_time`). On one thread they measure the work, however busy the
+    machine is.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Stopwatch:
 
 
 def forget_peak() -> None:
-    """Start the process's peak of memory anew, where the system can (Linux)."""
+    """Start the process's peak of memory anew, if the system can (Linux)."""
     try:
         _CLEAR.write_text("5")
     except OSError:
@@ -53,7 +53,7 @@ def forget_peak() -> None:
 
 
 def peak_mb() -> float:
-    """Peak of this process's resident memory since `forget_peak` [MB]; since its start where that did nothing."""
+    """Return the peak of this process's resident memory since `forget_peak` or its start [MB]."""
     try:
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
         return int(line.split()[1]) / 1024
@@ -62,7 +62,7 @@ def peak_mb() -> float:
 
 
 def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
-    """What is written of a case that raised, died or hung: the only failure record there is."""
+    """Return the record of a case that raised, died or hung."""
     where = "".join(traceback.format_exception(error))
     told = " ".join(str(error).split())
     return {"failed": kind, "error": f"{type(error).__name__}: {told}", "traceback": where}
@@ -91,7 +91,7 @@ def code_version(sources: tuple[str, ...] = ()) -> str:
 
 @lru_cache
 def commit() -> str:
-    """Short name of the commit that is checked out, with a plus where files differ from it; nothing outside a clone."""
+    """Return the short name of the current commit, with a plus for changed files, empty outside a clone."""
     command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     try:
         done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10)
@@ -101,14 +101,14 @@ def commit() -> str:
 
 
 def thing_name(source: Any) -> str:
-    """What an object goes by: the shape, or the file without its ending; other values as they are."""
+    """Return an object's name: the shape, or the file without its ending. Other values stay as they are."""
     text = f"{source:g}" if isinstance(source, float) else str(source)
     path = Path(text)
     return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def finite(value: Any) -> Any:
-    """The same, with None for every number that JSON does not know."""
+    """Return the same values, with None for every number that JSON does not know."""
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -119,6 +119,6 @@ def finite(value: Any) -> Any:
 
 
 def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; cells must not have bars of their own."""
+    """Return a table in Markdown. Cells must not have bars of their own."""
     lines = [headings, ["---"] * len(headings), *body]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")

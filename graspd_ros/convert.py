@@ -1,4 +1,4 @@
-"""Between messages and core values, both ways: stamps, points, poses, transforms; and results in another frame.
+"""Conversions between messages and core values, and results in another frame.
 
 Quaternions turn from wxyz (core) to xyzw (messages) and back here and nowhere else. `T_a_b` maps coordinates in frame b
 to frame a.
@@ -23,7 +23,7 @@ from graspd_ros.error_codes import bad_request
 
 Matrix = Float[np.ndarray, "4 4"]
 
-_FARTHEST = 1e3  # metres; what is farther away is a mistake, and costs precision
+_FARTHEST = 1e3  # metres. What is farther away is a mistake, and costs precision
 _ROUNDED = 0.05  # quaternions written by hand are off their unit length by this much, those that are wrong by more
 
 
@@ -38,7 +38,7 @@ def set_nanoseconds(stamp: Time | Duration, value: int) -> None:
 
 
 def duration_of(seconds: float) -> Duration:
-    """Return a duration in whole nanoseconds, rounded up: a motion is never faster than allowed."""
+    """Return a duration in whole nanoseconds, rounded up, so that a motion is never faster than allowed."""
     whole, rest = divmod(math.ceil(seconds * 1e9), SECOND)
     return Duration(sec=whole, nanosec=rest)
 
@@ -87,12 +87,12 @@ def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
 
 
 def matrix_of_pose(pose: Pose) -> Matrix:
-    """Return a pose as a matrix. Raises TransformError: not finite, or no rotation."""
+    """Return a pose as a matrix. Raises TransformError if it is not finite or has no rotation."""
     return matrix_of(array_of(pose.position), wxyz_of(pose.orientation))
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return a place [m]; `name` is its field. Raises RequestError: not finite, or not within 1 km."""
+    """Return the point [m] of the field `name`. Raises RequestError if it is not finite or not within 1 km."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
         raise bad_request(f"{name}: {what}{place.tolist()}; it must be finite, within {_FARTHEST:g} m")
@@ -100,7 +100,7 @@ def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return a pose as a matrix; an all-zero quaternion turns nothing. Raises RequestError: no pose within 1 km."""
+    """Return a pose as a matrix. All zeros are no rotation. Raises RequestError if it is no pose within 1 km."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:
@@ -111,18 +111,18 @@ def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
 
 
 def matrix_of_transform(transform: Transform) -> Matrix:
-    """Return a transform as a matrix. Raises TransformError: not finite, or no rotation."""
+    """Return a transform as a matrix. Raises TransformError if it is not finite or has no rotation."""
     place, turn = transform.translation, transform.rotation
     return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 
 
 def matrix_of_posture(posture: Posture) -> Matrix:
-    """Return the pose of the hand's base link as a matrix. Raises TransformError: not finite, or no rotation."""
+    """Return the pose of the hand's base link as a matrix. Raises TransformError if not finite or without rotation."""
     return matrix_of(posture.position, posture.quaternion_wxyz)
 
 
 def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Matrix:
-    """Return a position and a quaternion as a matrix. Raises TransformError: not finite, or no rotation."""
+    """Return a position and a quaternion as a matrix. Raises TransformError if they are not finite or no rotation."""
     px, py, pz = map(float, position)
     w, x, y, z = map(float, quaternion_wxyz)
     # In plain numbers: robots send thousands of transforms a second, and small arrays are slow.
@@ -148,7 +148,7 @@ def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarra
 
 
 def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
-    """Return a result in another frame: postures, contacts, the support and the next view. All else has no frame."""
+    """Return a result with its postures, contacts, support and next view in another frame. Nothing else has a frame."""
     return replace(
         result,
         grasps=tuple(moved_grasp(grasp, T_new_old) for grasp in result.grasps),

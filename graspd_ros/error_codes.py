@@ -1,4 +1,4 @@
-"""What kind of trouble an answer tells of: words for programs, beside the sentences for people."""
+"""Error codes of answers, for programs. People read the sentences beside them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from graspd_core.errors import GraspdError
 
 
 class ErrorCode(StrEnum):
-    """`error_code` of a GraspArray, and `code` of an error or refusal on `~/status`; empty where nothing is wrong."""
+    """`error_code` of a GraspArray, and `code` of an error or refusal on `~/status`. Empty where nothing is wrong."""
 
     NONE = ""
     BAD_REQUEST = "BAD_REQUEST"  # a field is out of range or unknown
@@ -17,7 +17,7 @@ class ErrorCode(StrEnum):
     BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows nothing usable
     BAD_LIBRARY = "BAD_LIBRARY"  # grasp_library is torn, of another version, locked or gone
     NO_OBJECT = "NO_OBJECT"  # the scene was seen, and what was asked for is not in it
-    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD, and none has come; VIEWS, and none is kept
+    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD, and none has come. VIEWS, and none is kept
     STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
     NO_TRANSFORM = "NO_TRANSFORM"  # /tf does not connect the frames
     WRONG_HAND = "WRONG_HAND"  # another hand than the node's
@@ -34,7 +34,7 @@ class ErrorCode(StrEnum):
 
 
 class RequestError(GraspdError):
-    """A request that cannot be worked on; `code` says what kind of trouble it is."""
+    """A request that cannot be worked on. `code` is its error code."""
 
     def __init__(self, code: ErrorCode, message: str) -> None:
         super().__init__(message)
@@ -42,7 +42,7 @@ class RequestError(GraspdError):
 
 
 def bad_request(message: str) -> RequestError:
-    """Return the error about a field or a message that cannot be meant."""
+    """Return the error about a field or a message that is not valid."""
     return RequestError(ErrorCode.BAD_REQUEST, message)
 
 
@@ -61,7 +61,7 @@ _CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
 
 
 def code_of(error: BaseException) -> ErrorCode:
-    """The code of whatever ended a request."""
+    """Return the code of the error that ended a request."""
     if isinstance(error, RequestError):
         return error.code
     if isinstance(error, RuntimeError) and "allocate memory" in str(error):  # torch's way of saying it
@@ -70,7 +70,7 @@ def code_of(error: BaseException) -> ErrorCode:
 
 
 def sentence_of(error: BaseException) -> str:
-    """One line for people; an error that graspd did not raise on purpose is told as internal."""
+    """Return an error as one line for people. One that graspd did not raise on purpose is called internal."""
     if isinstance(error, GraspdError | OSError):
         text = str(error)
     else:

@@ -1,8 +1,7 @@
-"""The node: three-line callbacks that hand requests to the worker, and the worker's reports as messages.
+"""The node. Its callbacks hand requests to the worker and publish the worker's reports as messages.
 
-Every request ends in exactly one GraspArray on `~/grasps`, one terminal event on `~/status`, and one result of its
-goal where it came as one. Callbacks run in the executor's thread, everything heavy in the worker's; rclpy publishes
-from both.
+Every request ends in exactly one GraspArray on `~/grasps` and one terminal event on `~/status`. One that came as a goal
+also ends in one result. Callbacks run in the executor's thread, all heavy work in the worker's. Both threads publish.
 """
 
 from __future__ import annotations
@@ -63,14 +62,13 @@ OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline p
 # A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
 REQUEST_DEPTH = 500
 THINGS_DEPTH = 500  # a planning scene is told of in one burst
-RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result; rclpy's 900 keep a lot in memory
+RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result. The 900 of rclpy keep a lot in memory
 
 
 class GraspNode(Node):
-    """Takes objects, answers with grasps. `on_failure` is called when the node cannot serve at all.
+    """The node that takes objects and answers with grasps. `on_failure` is called when it cannot serve at all.
 
-    Raises:
-        GraspdError: the hand or a parameter is unusable.
+    Raises GraspdError if the hand or a parameter is unusable.
     """
 
     def __init__(self, on_failure: Callable[[], None]) -> None:
@@ -147,9 +145,9 @@ class GraspNode(Node):
         return [*servers, GoalServer(self, GraspPlanning, "~/grasp_planning", make, submit, cancel)]
 
     def close(self, timeout: float) -> bool:
-        """Cancel everything and publish no more; True when the worker ended within `timeout` seconds.
+        """Cancel everything and publish no more. Return whether the worker ended within `timeout` seconds.
 
-        The executor must still spin: goals end there.
+        The executor must still spin, because goals end there.
         """
         ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
         end = time.monotonic() + GOAL_PATIENCE
@@ -234,7 +232,7 @@ class GraspNode(Node):
         return response
 
     def _watch_sensors(self) -> None:
-        """Tell once what does not arrive on the sensors' topics; a client that asks for it is told why, too."""
+        """Log once which sensor topics bring no messages, and tell clients that ask for them."""
         before = self._request_builder.missing
         missing = {sensor.name: told for sensor in self._sensors if (told := sensor.check())}
         for name in missing.keys() - before.keys():  # some publish on demand only: no fault by itself
@@ -346,32 +344,32 @@ def _collision_object() -> type:
 
 
 class SynthesizeMessages:
-    """What one goal of `~/synthesize` tells its client, in the action's own messages."""
+    """Feedback and result of a goal of `~/synthesize`, in the action's messages."""
 
     def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
         return SynthesizeGrasps.Feedback(progress=message)
 
     def found(self, message: Grasp) -> None:
-        """Nothing: the answer holds them all."""
+        """Return nothing, because the answer holds all grasps."""
 
     def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
         return SynthesizeGrasps.Result(result=message)
 
     def succeeded(self, result: SynthesizeGrasps.Result) -> bool:
-        """Return true: the answer's status says what it is worth."""
+        """Return true, because the answer's status says how good it is."""
         return True
 
 
 class GoalServer:
-    """An action server, whose goals go the way of all requests.
+    """An action server whose goals are handled like all other requests.
 
-    A goal that is refused is accepted and aborted at once, so that its client is told why. Nothing here waits: the
-    worker's word starts and ends a goal, and the executor only carries it out.
+    A goal that is refused is accepted and aborted at once, so that its client gets the reason. Nothing here waits. The
+    worker decides when a goal starts and ends, and the executor only carries it out.
 
     Args:
-        make_messages: what a new goal tells its client, as `SynthesizeMessages` does.
-        submit: takes a goal's request for a listener; gives the id that the request goes by.
-        cancel: cancels a request by its id; says whether there was one.
+        make_messages: makes the messages of a new goal, as `SynthesizeMessages`.
+        submit: takes a goal's request with its listener and returns the request's id.
+        cancel: cancels a request by its id and returns whether there was one.
     """
 
     def __init__(
@@ -417,7 +415,7 @@ class GoalServer:
 
 
 class Goal:
-    """A request's listener that tells an action client."""
+    """A request's listener that informs an action client."""
 
     def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node
@@ -428,13 +426,13 @@ class Goal:
         self._begun = False
 
     def progressed(self, message: GraspProgress) -> None:
-        """Feedback; the first that is not of waiting tells that the goal is executed."""
+        """Send feedback. The first that is not of waiting starts the execution of the goal."""
         if message.stage != "queued":
             self._begin()
         self._feed(self.messages.progressed(message))
 
     def found(self, message: Grasp) -> None:
-        """Feedback of those actions that give grasps while others are still tried."""
+        """Send the grasp as feedback if the action gives grasps while others are still tried."""
         self._begin()
         self._feed(self.messages.found(message))
 
@@ -443,7 +441,7 @@ class Goal:
             self._handle.publish_feedback(feedback)
 
     def ended(self, message: GraspArray) -> None:
-        """The goal's end, and its result."""
+        """End the goal and send its result."""
         self._begin()
         self._answer.set_result(message)
         if self._node.executor is not None:

@@ -1,7 +1,7 @@
-"""The standard plug: `grasping_msgs/action/GraspPlanning`, whose objects become requests and whose grasps are MoveIt's.
+"""The action server of the standard action `grasping_msgs/action/GraspPlanning`, which answers with MoveIt's messages.
 
-Of an object the meshes are taken, else the primitives, else the point cluster. The support surface becomes the plane
-that it stands on, towards which no hand may go.
+Of an object the meshes are used, else the primitives, else the point cluster. The support surface becomes the plane
+that the object stands on, and no hand may pass through it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd_ros.request import Listener, Request
 
 
 class PlanningMessages:
-    """What a goal of GraspPlanning tells: the grasps found thus far, then all of them."""
+    """Feedback and result of a goal of GraspPlanning: the grasps found so far, then all of them."""
 
     def __init__(self, hand: HandModel) -> None:
         self._hand = hand
@@ -36,7 +36,7 @@ class PlanningMessages:
         self._up: tuple[str, tuple[float, float, float]] | None = None
 
     def watching(self, request: Request, goal: Any) -> Request:
-        """Return a goal's request; from the goal and from what is loaded for it come what may be touched and up."""
+        """Return a goal's request, which also sets what the hand may touch and which direction is up."""
         self._touch = (goal.object.name,) if goal.object.name else ()
 
         def loaded() -> Scene:
@@ -49,7 +49,7 @@ class PlanningMessages:
         return replace(request, load=loaded, closes_late=True)
 
     def progressed(self, message: GraspProgress) -> None:
-        """Nothing: the action has no word for it."""
+        """Do nothing, because the action has no message for progress."""
 
     def found(self, message: Grasp) -> GraspPlanning.Feedback | None:
         if not message.arrival_joints.name:
@@ -58,19 +58,16 @@ class PlanningMessages:
         return GraspPlanning.Feedback(grasps=list(self._found))
 
     def result(self, message: GraspArray) -> GraspPlanning.Result:
-        """Return those that failed no trial and that MoveIt can reach, best first.
-
-        MoveIt's message cannot say that one is doubted.
-        """
+        """Return the grasps that failed no trial and that MoveIt can reach, best first. None is marked as uncertain."""
         good = [grasp for grasp in message.grasps if all(trial.passed for trial in grasp.trials)]
         return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good if grasp.arrival_joints.name])
 
     def succeeded(self, result: GraspPlanning.Result) -> bool:
-        """Return whether there is a grasp: a goal without any is aborted."""
+        """Return whether there is a grasp. A goal without any is aborted."""
         return bool(result.grasps)
 
     def _grasp(self, message: Grasp) -> Any:
-        """Lift it off what it stands on, or back along the way that the hand came where nobody says where up is."""
+        """Return a grasp in MoveIt's message, with a retreat upwards or, if up is unknown, along its approach."""
         x, y, z = (array_of(message.pregrasp_pose.position) - array_of(message.grasp_pose.position)).tolist()
         back = (x, y, z) if any((x, y, z)) else (0.0, 0.0, 1.0)
         frame, direction = self._up or (message.header.frame_id, back)
@@ -81,7 +78,7 @@ class PlanningMessages:
 def request_from_goal(
     builder: RequestBuilder, hand: str, request_id: str, settings: Settings, goal: Any, listener: Listener | None = None
 ) -> Request:
-    """Return a goal's request. Raises GraspdError: not this node's hand, or the object has no shape to be used."""
+    """Return a goal's request. Raises GraspdError if it is for another hand or its object has no usable shape."""
     if goal.group_name not in ("", hand):
         told = f"group_name: {goal.group_name[:128]!r} is no hand here; this node plans for {hand!r}"
         raise RequestError(ErrorCode.WRONG_HAND, told)

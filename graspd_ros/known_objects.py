@@ -1,4 +1,4 @@
-"""Answers from a library of grasps: at once where nothing stands about the object; what it lacks is planned."""
+"""Answers from a library of grasps, at once where no obstacle is near the object. Missing grasps are planned."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from graspd_ros.request_planner import unlike
 
 
 def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -> LibraryEntry | None:
-    """Return what the library has for a request and a hand (None: any); None where it need not know the object.
+    """Return the library's entry for a request and a hand (None: any), or None where it need not have one.
 
-    Raises GraspdError: the library must know the object and does not, or cannot be read.
+    Raises GraspdError if the library must have one and does not, or cannot be read.
     """
     library = GraspLibrary(Path(settings.grasp_library))
     physics = Physics(settings.mass or None, settings.friction, settings.verify)
@@ -32,14 +32,14 @@ def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -
 
 
 def warm_up_library(settings: Settings, hand: HandModel) -> None:
-    """Do the first-use work of a look-up. Raises FormatError: the library cannot be read."""
+    """Do the first-use work of a look-up. Raises FormatError if the library cannot be read."""
     library = GraspLibrary(Path(settings.grasp_library))
     for entry, _ in library.entries(hand_content=hand_hash(hand))[:1]:
         library.grasps(entry, hand)
 
 
 def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
-    """A function that reads the mesh of an object by its name in the library."""
+    """Return a function that reads the mesh of an object by its name in the library."""
 
     def load() -> Scene:
         entry = find_entry(known, settings, None)
@@ -58,9 +58,9 @@ def answer_known(
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None]:
-    """Return grasps unlike those excluded, of the library and planned where it has too few; and the scene, if read.
+    """Return grasps unlike those excluded, planned where the library has too few, and the scene if it was read.
 
-    Raises GraspdError: see `find_entry`, and what loading and planning raise.
+    Raises GraspdError as `find_entry`, loading and planning do.
     """
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))

@@ -1,7 +1,7 @@
-"""The process: starts the node, waits for a signal, ends cleanly; and what the commands share with it.
+"""The process, which starts the node, waits for a signal and ends cleanly, and code that the commands share with it.
 
 Ctrl-C and SIGTERM are handled here instead of by rclpy, from before the slow imports on, so that neither leaves a
-traceback at any time. Once the node runs the main thread only waits, since Python runs signal handlers nowhere else.
+traceback at any time. Once the node runs, the main thread only waits, since Python runs signal handlers nowhere else.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SWITCH_INTERVAL = 0.001
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises ConfigError for an option that is not valid."""
+    """An argument parser that raises ConfigError for an option that is not valid."""
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see {self.prog} --help)")
@@ -53,9 +53,9 @@ def run_command(
     parse: Callable[[list[str]], argparse.Namespace],
     work: Callable[[argparse.Namespace, threading.Event], None],
 ) -> int:
-    """Run `work` with rclpy initialised until it is done or a signal sets the event; 0 then, 2 for bad input.
+    """Run `work` with rclpy initialised until it is done or a signal sets the event. Return 0 then, or 2 for bad input.
 
-    `args` are without the name (None: of this process); `parse` takes those that are not for ROS.
+    `args` are without the name (None: those of this process). `parse` takes those that are not for ROS.
     """
     if told := foreign_ros():
         sys.stderr.write(f"{name}: {told}\n")
@@ -82,7 +82,7 @@ def run_command(
 
 
 def foreign_ros() -> str:
-    """Return one line about a ROS that comes before the environment's own; empty where there is one ROS only."""
+    """Return one line about a ROS that comes before the environment's own, empty where there is only one ROS."""
     for package in ROS_PACKAGES:
         own = next((Path(sys.prefix) / "lib").glob(f"python3*/site-packages/{package}/__init__.py"), None)
         # Found without being imported: what another Python compiled would only raise.
@@ -95,9 +95,9 @@ def foreign_ros() -> str:
 
 
 def probe() -> str:
-    """Make and destroy a node; tell the middleware. Raises what rclpy raises where ROS does not work.
+    """Make and destroy a node and return the middleware's name, for `graspd doctor`, in a process of its own.
 
-    `graspd doctor` asks for it in a process of its own.
+    Raises what rclpy raises where ROS does not work.
     """
     if told := foreign_ros():
         raise ImportError(told)
@@ -118,7 +118,7 @@ def probe() -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until a signal; 0 when stopped, 1 when it cannot go on, 2 for a bad argument or parameter."""
+    """Run the node until a signal. Return 0 when stopped, 1 when it cannot go on, 2 for a bad argument or parameter."""
     try:
         _refuse_arguments(sys.argv[1:] if args is None else args)
         if told := foreign_ros():
@@ -161,7 +161,7 @@ def main(args: list[str] | None = None) -> int:
     node.destroy_node()
     status = EXIT_FAILED if failed.is_set() else EXIT_STOPPED
     if not ended:
-        # A worker deep in a library call would abort the interpreter's teardown; there is nothing left to save.
+        # A worker deep in a library call would abort the interpreter's teardown. There is nothing left to save.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
@@ -175,7 +175,7 @@ def _refuse_arguments(args: list[str]) -> None:
 
 
 def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
-    """A thread that runs the executor until `wake` is set; before that, an end of it is a failure."""
+    """Return a thread that runs the executor until `wake` is set. If the executor ends earlier, `fail` is called."""
 
     def spin() -> None:
         try:
@@ -194,7 +194,7 @@ def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None
 
 
 def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspNode | None:
-    """The node; None where an argument or a parameter is bad, which standard error then says."""
+    """Return the node, or None where an argument or a parameter is bad, which is written to standard error."""
     import rclpy
 
     if told := log_directory():
@@ -219,7 +219,7 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
 
 
 def log_directory() -> str:
-    """Set a directory that logs can be written to, where the usual one cannot; gives the line that says so."""
+    """Set a writable directory for logs where the usual one is not. Return the line that says so."""
     if os.environ.get("ROS_LOG_DIR"):
         return ""
     usual = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"

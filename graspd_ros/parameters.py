@@ -1,4 +1,4 @@
-"""The node's parameters: one list of fields with type, default, range and description feeds ROS and the settings."""
+"""The node's parameters. One list of fields with type, default, range and description is used by ROS and settings."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _check_parts(parts: Any) -> None:
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters as they stood when a request came; the descriptions are those that `ros2 param describe` shows."""
+    """The parameters at the time of a request. The descriptions are those that `ros2 param describe` shows."""
 
     hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
     hand_prefix: str = _setting(
@@ -202,10 +202,10 @@ class Settings:
 
 
 class LiveSettings:
-    """A node's parameters as settings, in `now`, read anew when one changes; what is doubted is logged.
+    """A node's parameters as settings, in `now`, read again when one changes. Doubtful values are logged.
 
-    `frames` are those that /tf knows by now. Raises ConfigError: a value given at the start is not a valid choice;
-    rclpy's ParameterException: of the wrong type or out of range.
+    `frames` returns those that /tf knows. Raises ConfigError if a value given at the start is not a valid choice, and
+    rclpy's ParameterException if it has a wrong type or is out of range.
     """
 
     def __init__(self, node: Node, frames: Callable[[], Sequence[str]] = tuple) -> None:
@@ -255,7 +255,7 @@ def unknown_names(node: Node) -> list[str]:
 
 
 def doubts(settings: Settings) -> list[str]:
-    """Return what the node should warn of: values that leave nothing to do."""
+    """Return warnings about values that leave nothing to do."""
     told = []
     if any(low > high for low, high in zip(settings.roi_min, settings.roi_max, strict=True)):
         told.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
@@ -266,7 +266,7 @@ def doubts(settings: Settings) -> list[str]:
 
 
 def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
-    """Say of each frame that was set now whether /tf lacks it; before anything came, nobody knows."""
+    """Return a sentence for each frame set now that /tf lacks. Before any transform came, none is unknown."""
     told = []
     for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
         frame = getattr(settings, name).removeprefix("/")
@@ -276,7 +276,7 @@ def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequenc
 
 
 def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
-    """Return parameters with integers as numbers where numbers are meant, and words that YAML reads as truth values."""
+    """Return parameters with numbers where integers were given for them, and words where YAML reads truth values."""
     kept = []
     for parameter in parameters:
         setting = Settings.__dataclass_fields__.get(parameter.name)
@@ -286,7 +286,7 @@ def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
-    """Refuse what is not a valid choice; types and ranges are refused by ROS itself."""
+    """Refuse values that are not valid choices. ROS itself refuses wrong types and ranges."""
     try:
         for parameter in parameters:
             _check_value(parameter.name, parameter.value)
@@ -316,7 +316,7 @@ def _check_value(name: str, value: Any) -> None:
 
 
 def _word(setting: dataclasses.Field, value: Any) -> Any:
-    """The value; YAML reads an unquoted `off` as a truth value, and numbers without a point as integers."""
+    """Return the value in its field's type. YAML reads an unquoted `off` as a truth value, `1` as an integer."""
     if isinstance(value, int) and not isinstance(value, bool) and _is_number(setting):
         return float(value)
     if setting.name in _CORNERS:

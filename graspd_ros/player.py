@@ -25,7 +25,7 @@ DELIVERY = 5.0  # seconds that reliable subscribers get to confirm the last mess
 
 
 def main(args: list[str] | None = None) -> int:
-    """Play a recording to its end or until a signal; 0 when done or stopped, 2 for bad input."""
+    """Play a recording to its end or until a signal. Return 0 when done or stopped, 2 for bad input."""
     return run_command("graspd_play", args, _parse, _play)
 
 
@@ -48,12 +48,10 @@ def play(
     wait: float = 0.0,
     stop: threading.Event | None = None,
 ) -> int:
-    """Publish a recording's messages at the times they were recorded at, until `stop` is set; return how many.
+    """Publish a recording's messages at their recorded times until `stop` is set. Return how many.
 
-    `_parse` tells what the options mean.
-
-    Raises:
-        BagError: the bag cannot be read, lacks a topic, or holds none of a type known here.
+    `_parse` explains the options. Raises BagError if the bag cannot be read, lacks a topic, or holds none of a type
+    known here.
     """
     stop = stop or threading.Event()
     publishers = _publishers(node, bag, topics)
@@ -90,7 +88,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[Any, type]]:
-    """A publisher and the message type for each topic whose type is known here; warns of the others."""
+    """Return a publisher and the message type for each topic of a type known here. Warn of the others."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     recorded = bag_topics(bag)
@@ -144,9 +142,10 @@ def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
 
 
 def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> Any:
-    """The message with every header's stamp moved to when it is due; messages without headers as they are.
+    """Return the message with the stamp of every header moved to when it is due.
 
-    What was stamped at `start` of the recording [ns] is due at `began` [ns], and time goes `rate` times as fast.
+    Messages without headers are unchanged. What was stamped at `start` of the recording [ns] is due at `began` [ns],
+    and time goes `rate` times as fast.
     """
     from rclpy.serialization import deserialize_message
 

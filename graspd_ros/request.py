@@ -1,4 +1,4 @@
-"""What the worker works off: one object to grasp, with all that is asked of its grasps."""
+"""Requests as the worker gets them: one object to grasp, and everything asked of its grasps."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from graspd_ros.inputs.solids import Thing
 
 MOST_ID = 128
-# `T_target_source` of two frames; may raise a TransformError.
+# `T_target_source` of two frames. May raise a TransformError.
 FrameLookup = Callable[[str, str], Matrix]
 
 
 class Listener(Protocol):
-    """One more who wants to know of one request, beside the topics; called in the thread that publishes."""
+    """A receiver of one request's outcome, beside the topics. It is called in the thread that publishes."""
 
     def progressed(self, message: GraspProgress) -> None: ...
     def found(self, message: Grasp) -> None: ...
@@ -37,7 +37,7 @@ class Listener(Protocol):
 class KnownObject:
     """An object by its name in the library or, where that is empty, by the path of its mesh file.
 
-    `required` says whether a library must know it.
+    `required` is whether the library must have it.
     """
 
     name: str
@@ -51,24 +51,24 @@ class Request:
 
     Attributes:
         source: name of its source (`SOURCES`): mesh, cloud, latest_cloud, views or known.
-        frame: the frame that the results are told in, unless the settings name an output_frame.
-        stamp: when the object was as it was given.
-        settings: the parameters at the time of the request, with what the request itself asks for.
-        load: reads the object; slow, may raise a GraspdError.
-        T_frame_object: pose of the object's own frame in `frame`; None where they are one.
+        frame: the frame of the results, unless the settings name an output_frame.
+        stamp: the time at which the object was as it was given.
+        settings: the parameters at the time of the request, with those of the request itself.
+        load: reads the object. It is slow and may raise a GraspdError.
+        T_frame_object: pose of the object's own frame in `frame`. None where they are one.
         only_newest: whether a newer request of this kind takes its place while it waits.
-        listener: who is told of it beside the topics; None where nobody is.
-        timeless: whether it came without a time of its own: then the newest transforms are meant.
-        object_key: same for requests of the very same object, as it is or was seen then; empty: none is the same.
+        listener: informed of it beside the topics. None where there is none.
+        timeless: whether it came without a time of its own, so that the newest transforms are used.
+        object_key: equal for requests of the very same object, as it is or was seen then. Empty: equal to no other.
         exclude: ids of grasps that the answer must not be like.
         exclude_poses: the same by frame and pose of the base link in it.
-        known: what a library of grasps may know the object by; None: nothing.
-        surface: what the object stands on, in its own frame; None: nothing.
-        steering: makes of the frames that were seen what is asked of a grasp's place and direction; slow, may raise a
-            GraspdError. None where nothing is asked.
-        shown: reads the points that the request's region_mask shows, in `frame` [m]; None where there is no image.
+        known: how a library of grasps may know the object. None: not at all.
+        surface: the plane the object stands on, in its own frame. None: none.
+        steering: makes the restrictions on a grasp's place and direction from the frames that were seen. It is slow and
+            may raise a GraspdError. None where nothing is asked.
+        shown: reads the points that the request's region_mask shows, in `frame` [m]. None where there is no image.
         closes_late: whether the hand closes only when it has arrived, so that grasps need their `arrival`.
-        things: what stood in the planning scene by then, by id, wherever it is; empty where no such topic is heard.
+        things: all things of the planning scene at that time, by id. Empty where the node has no such topic.
         accepted: when the request came, by the monotonic clock [s].
     """
 
@@ -98,17 +98,17 @@ class Request:
         return self.settings.output_frame or self.frame
 
     def elapsed(self) -> float:
-        """Seconds since the request came."""
+        """Return the seconds since the request came."""
         return time.monotonic() - self.accepted
 
     def time_left(self) -> float:
-        """Seconds until its deadline."""
+        """Return the seconds until its deadline."""
         return self.settings.deadline - self.elapsed()
 
     def to_object(self, frame: str, T: Matrix, lookup: FrameLookup) -> Matrix:
-        """Return a pose of another frame (empty: the request's) in the object's own. Raises TransformError.
+        """Return a pose of another frame (empty: the request's) in the object's own. May raise TransformError.
 
-        `lookup` is asked only if the frame is another one than the request's.
+        `lookup` is called only if the frame is not the request's.
         """
         placed = T if frame in ("", self.frame) else lookup(self.frame, frame) @ T
         return placed if self.T_frame_object is None else np.linalg.inv(self.T_frame_object) @ placed

@@ -1,6 +1,6 @@
 """The worker's work on one request: read the object, plan, move the result to the frame asked for.
 
-Grasps that were tried and lost are left out: the answer is the next best of the same run, or a new run without them.
+Grasps that were tried and failed are left out. The answer is the next best of the same run, or a new run without them.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ MOST_RUNS = 16
 # A grasp is like one that was lost where its base is this near to it and turned by less [m], [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 
-# `T_target_source` of two frames at a time (0: the newest there is); waits a little, unless the hook says stop; may
+# `T_target_source` of two frames at a time (0: the newest there is). Waits a little, unless the hook says stop. May
 # raise a TransformError.
 Lookup = Callable[[str, str, Time, StopHook], Matrix]
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A result in the frame it is told in.
+    """A result in the frame of its answer.
 
     Attributes:
         result: the grasps.
-        file: where it was written; empty: nowhere.
+        file: where it was written. Empty: nowhere.
         worked_on: whether there was a run at all.
-        mass: what the object weighed in the trials [kg]; 0 where there was none.
-        mass_assumed: whether nobody said the mass.
+        mass: the object's mass in the trials [kg], 0 where there was none.
+        mass_assumed: whether the request gave no mass.
     """
 
     result: GraspResult
@@ -100,7 +100,7 @@ class RecentRuns:
     def excluded(self, request: Request, lookup: FrameLookup) -> list[Matrix]:
         """Return poses of the base link that the request excludes by id or pose, in the frame that it is planned in.
 
-        Raises RequestError: an id that no grasp of the last runs has; TransformError: as `lookup`.
+        Raises RequestError for an id that no grasp of the last runs has, and TransformError as `lookup`.
         """
         poses = []
         for name in request.exclude:
@@ -121,7 +121,7 @@ class RecentRuns:
         return run, run.grasps[int(rank)]
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return what is left of the runs on the very same object; None if nothing good is."""
+        """Return the rest of the runs on the very same object, or None if no good grasp is left."""
         runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
@@ -136,12 +136,12 @@ class RecentRuns:
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
-    """Those of the grasps that are not like any of the poses."""
+    """Return the grasps that are not like any of the poses."""
     return [grasp for grasp in grasps if not any(_alike(matrix_of_posture(grasp.grasp), pose) for pose in excluded)]
 
 
 def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
-    """A run's result without grasps like those excluded, at most `count` of the good ones."""
+    """Return a run's result without grasps like those excluded, at most `count` of the good ones."""
     left = unlike(result.grasps, excluded)
     good = [grasp for grasp in left if grasp.verdict is not Verdict.FAILED]
     failed = [grasp for grasp in left if grasp.verdict is Verdict.FAILED]
@@ -158,10 +158,10 @@ def _alike(a: Matrix, b: Matrix) -> bool:
 
 
 class Planner:
-    """Plans for one hand. Used by one thread at a time.
+    """A planner for one hand. Used by one thread at a time.
 
-    The work goes on in a thread of its own, since no step of it that reads a mesh or turns a large batch asks whether
-    to stop: when a request is over, that thread is left behind after a moment, and the answer goes out. It ends by
+    The work is done in a thread of its own, since steps that read a mesh or compute a large batch do not check whether
+    to stop. When a request is over, that thread is left behind after a moment, and the answer is sent. It ends by
     itself soon after, and the next request waits for that, so that cancelled work does not pile up.
     """
 
@@ -204,7 +204,7 @@ class Planner:
         return work.result()
 
     def rest(self, timeout: float) -> bool:
-        """Wait for work that was left behind; True when it ended within `timeout` seconds."""
+        """Wait for work that was left behind. Return whether it ended within `timeout` seconds."""
         end = time.monotonic() + timeout
         return self._behind is None or _ended(self._behind, lambda: time.monotonic() > end)
 
@@ -288,7 +288,7 @@ def _with_found(progress: Progress, change: Callable[[Grasp], Grasp]) -> Progres
 
 
 def _arrivals(scene: Scene, hand: HandModel) -> Callable[[Grasp], Grasp]:
-    """Return a function that gives each grasp that failed no trial its `arrival`; tenths of a second the first time."""
+    """Return a function that adds `arrival` to each grasp that failed no trial. Its first call is slow."""
     context, known = make_metrics_context(scene.object, hand), dict[bytes, Posture | None]()
 
     def arrived(grasp: Grasp) -> Grasp:
@@ -308,5 +308,5 @@ def _empty(request: Request, stop: StopHook) -> Planned:
 
 
 def overdue() -> Report[Planned]:
-    """The end of a request whose deadline passed before its turn came."""
+    """Return the end of a request whose deadline passed before its turn came."""
     return Report(WorkerEnding.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, ""), worked_on=False))

@@ -19,7 +19,7 @@ from graspd_ros.node import Parser, run_command
 
 
 def main(args: list[str] | None = None) -> int:
-    """Follow a node until a signal; 0 when stopped, 2 for bad input."""
+    """Follow a node until a signal. Return 0 when stopped, 2 for bad input."""
     return run_command("graspd_view", args, _parse, _serve)
 
 
@@ -55,11 +55,11 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
 
 
 class Follower:
-    """Subscriptions of the node `name`, whose newest answer a viewer shows.
+    """Subscriptions to the node `name`, whose newest answer a viewer shows.
 
     Args:
         scene: the object in the frame of the answers, where it is known.
-        hand: a name or a path, instead of the one that answers name.
+        hand: a name or a path, instead of the hand named in the answer.
     """
 
     def __init__(self, node: Any, viewer: Any, name: str, *, scene: Any = None, hand: str | None = None) -> None:
@@ -103,7 +103,7 @@ class Follower:
             self._viewer.show(make_session(title, hand, grasps, self._scene, PlanConfig(), seen, notes))
 
     def _seen(self, frame: str) -> np.ndarray:
-        """The points of the newest cloud, where it is in the frame of the answer [m]."""
+        """Return the points of the newest cloud if it is in the frame of the answer [m]."""
         from graspd_core.io.messages import points_from_message
 
         if self._cloud is None or self._cloud.header.frame_id != frame:
@@ -126,7 +126,7 @@ def _hand(name: str, *, named_by_message: bool) -> Any:
 
 
 def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
-    """A grasp out of its message. Raises ValueError: a joint is missing, or a number is not finite."""
+    """Return the grasp in a message. Raises ValueError if a joint is missing or a number is not finite."""
     from graspd_ros.convert import array_of, wxyz_of
 
     def posture(pose: Any, joints: Any) -> Posture:

@@ -1,7 +1,7 @@
-"""One thread that works off requests, one at a time. It knows neither ROS nor grasps.
+"""A thread that works off requests, one at a time. It knows neither ROS nor grasps.
 
-Every request that `submit` accepted ends in exactly one call of `finish`, whatever happens to it: done, failed,
-cancelled, or superseded by a newer one.
+Every request that `submit` accepted ends in exactly one call of `finish`, whether it is done, failed, cancelled, or
+superseded by a newer one.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Admission:
-    """The answer to `submit`: taken or, where there is a refusal, why not; `ahead` requests come before it."""
+    """The answer to `submit`: taken or, where there is a refusal, the reason. `ahead` requests come before it."""
 
     refusal: Refusal | None = None
     reason: str = ""
@@ -67,7 +67,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """The end of a request: `error` when failed; `value` when done, and what there was when it was told to end."""
+    """The end of a request: `error` when it failed, `value` when done, or what there was when it was stopped."""
 
     ending: WorkerEnding
     value: V | None = None
@@ -78,8 +78,9 @@ class Worker(Generic[R, V]):
     """A worker thread with a bounded queue.
 
     Args:
-        work: does one request; asks its stop hook often and returns early when that says so. May raise anything.
-        finish: told of each accepted request's end; called in the worker thread, or in the caller's when `submit` or
+        work: does one request. It must call its stop hook often and return early when that returns true. May raise
+            anything.
+        finish: called at each accepted request's end, in the worker thread, or in the caller's when `submit` or
             `cancel` ends a waiting request. Must not raise.
         prepare: runs in the worker thread before the first request.
         queue_size: most requests that wait behind the running one under the policy `queue`.
@@ -110,7 +111,7 @@ class Worker(Generic[R, V]):
         self._thread.start()
 
     def submit(self, request: R, policy: BusyPolicy) -> Admission:
-        """Take a request or say why not. An `only_newest` request is taken whatever the policy."""
+        """Take a request or return why not. An `only_newest` request is taken whatever the policy."""
         superseded: list[R] = []
         with self._condition:
             ahead = len(self._waiting) + (self._running is not None)
@@ -147,7 +148,7 @@ class Worker(Generic[R, V]):
         return None
 
     def cancel(self, request_id: str) -> int:
-        """Cancel a waiting or running request, or all of them when the id is empty; returns how many."""
+        """Cancel a waiting or running request, or all of them when the id is empty. Return how many."""
         with self._condition:
             dropped = self._take_out(lambda request: request_id in ("", request.id))
             running = self._running is not None and request_id in ("", self._running.id)
@@ -157,7 +158,7 @@ class Worker(Generic[R, V]):
         return len(dropped) + running
 
     def end_waiting(self, which: Callable[[R], bool], report: Report[V]) -> int:
-        """End those of the waiting requests that `which` picks with a report; returns how many."""
+        """End the waiting requests that `which` picks, with a report. Return how many."""
         with self._condition:
             dropped = self._take_out(which)
         self._end_all(dropped, report)
@@ -171,7 +172,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Id of the running request, and how many wait in the queue; an `only_newest` one takes no place there."""
+        """Return the id of the running request, and how many wait in the queue, not counting an `only_newest` one."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)
@@ -180,11 +181,11 @@ class Worker(Generic[R, V]):
         return self._thread.is_alive()
 
     def stopping(self) -> bool:
-        """Whether `stop` was called; long work outside requests polls this."""
+        """Return whether `stop` was called. Long work outside requests polls this."""
         return self._stopping
 
     def stop(self, timeout: float) -> bool:
-        """End everything as cancelled; True when the thread ended within `timeout` seconds."""
+        """End everything as cancelled. Return whether the thread ended within `timeout` seconds."""
         with self._condition:
             self._stopping = True
             self._condition.notify()

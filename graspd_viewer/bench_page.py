@@ -1,7 +1,7 @@
-"""A benchmark as one page: speed against accuracy, and behind every point the runs and the grasps that made it.
+"""A benchmark as one page: speed against accuracy, and behind every point its runs and their grasps.
 
-One file that needs no network and no library. Results keep figures of grasps, not their postures: a run that a visitor
-asks for is planned again with its own settings and seed, which finds the same grasps.
+The page is one file that needs no network and no library. Results keep figures of grasps, not their postures. A run
+that a visitor asks for is planned again with its own settings and seed, which finds the same grasps.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _FIGURES = (
 
 
 def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
-    """The page of a benchmark's folder, and its runs of raw grasps by key: who serves the page shows their grasps.
+    """Return the page of a benchmark's folder, and its runs of raw grasps by key, whose grasps a server can show.
 
     Raises:
         FormatError: the folder has no results that can be read, or none of a preset.
@@ -70,7 +70,7 @@ def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Re
 
 
 def page_data(runs: Sequence[Record]) -> dict[str, Any]:
-    """What the page's script draws: panels of points, and the runs of every name."""
+    """Return what the page's script draws: panels of points, and the runs of every name."""
     presets = by_name(rows(runs))
     panels = [
         {
@@ -115,8 +115,7 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
 def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop: StopHook) -> None:
     """Find a run's grasps anew, try and measure them, and show them.
 
-    Raises:
-        GraspdError: an object or a hand that is not here.
+    Raises GraspdError: its object or hand is not here.
     """
     config = plan_config(record["settings"], f"settings of {record['name']}")
     hand = load_hand(record["hand"], candidates=config.problem.fine_candidates)
@@ -142,15 +141,15 @@ def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop
 
 @contextmanager
 def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | None]) -> Iterator[str]:
-    """Serve one page, whatever is asked for, until the end.
+    """Serve one page for every path, until the context ends.
 
     Args:
         page: HTML.
         host, port: to listen on.
-        open_run: has the grasps of a run shown, by its key, and says on which port; None where there is no such run.
+        open_run: shows the grasps of a run, by its key, and returns the port, None for an unknown run.
 
     Raises:
-        ConfigError: the address cannot be had.
+        ConfigError: the address cannot be listened on.
     """
     handler = partial(_OnePage, page.encode(), host, open_run)
     try:
@@ -182,7 +181,7 @@ class _OnePage(BaseHTTPRequestHandler):
         self.wfile.write(self._content)
 
     def do_POST(self) -> None:
-        """Show the grasps of a run and send the visitor there; a page of another site may not ask."""
+        """Show the grasps of a run and send the visitor there. A page of another site may not ask."""
         named = self.headers.get("Host", "")
         allowed = may_connect(self.headers.get("Origin"), named, self._host)
         port = self._open_run(self.path.rpartition("/")[2]) if allowed else None

@@ -1,6 +1,6 @@
-"""What is drawn, as plain meshes: the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`) show the same.
+"""All drawings as plain meshes: the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`) show the same.
 
-Also the forces of a grasp's squeeze, the push that it resists least, and where the hand is on its way.
+Also the forces of a grasp's squeeze, the push that it resists least, and the hand's postures on its path.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ VERDICTS = {
     Verdict.UNVERIFIED: (0.60, 0.62, 0.66),
     Verdict.FAILED: (0.85, 0.20, 0.20),
 }
-# Arrows: a contact's normal [m], metres per newton of a force; of a push radii of the object, so that it comes out.
+# Lengths of arrows: a contact's normal [m], a force [m/N], and a push [radii of the object], which comes out of it.
 NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.008, (1.1, 0.7)
 _SHAFT, _SLICE = 0.0012, 96
 
@@ -50,7 +50,7 @@ class Part:
 
 
 def hand_parts(hand: HandModel) -> dict[int, Part]:
-    """The solids of every link that has any, by link number, link frame."""
+    """Return the solids of every link that has any, by link number, link frame."""
     parts = {}
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -60,7 +60,7 @@ def hand_parts(hand: HandModel) -> dict[int, Part]:
 
 
 def scene_parts(scene: Scene) -> list[Part]:
-    """The object, what was seen of it and what was guessed, and what stands around it."""
+    """Return the object, its seen and its guessed part, and what stands around it."""
     mesh, parts = scene.object.mesh, []
     if scene.confidence is None:
         parts.append(Part("object/known", mesh, OBJECT))
@@ -76,7 +76,7 @@ def scene_parts(scene: Scene) -> list[Part]:
 
 
 def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
-    """An arrow along the object's outward normal from every contact."""
+    """Return an arrow along the object's outward normal from every contact."""
     if not contacts:
         return []
     starts = np.array([contact.position for contact in contacts])
@@ -85,7 +85,7 @@ def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
 
 
 def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "n 3"]) -> list[Part]:
-    """An arrow for every force on the object [N], which ends where the force acts."""
+    """Return an arrow for every force on the object [N], which ends where the force acts."""
     strong = np.linalg.norm(forces, axis=1) > 0.02
     if not strong.any():
         return []
@@ -94,7 +94,7 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 
 
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
-    """The push that a grasp resists least: its force at the centre of mass, and the axis that it turns about."""
+    """Return arrows of the push that a grasp resists least: its force at the centre of mass, and its turning axis."""
     center, parts = target.center_of_mass, []
     for name, way, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
         share = float(np.linalg.norm(way))
@@ -107,9 +107,10 @@ def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Par
 def sdf_slice(
     scene: Scene, axis: int, share: float
 ) -> tuple[UInt8[np.ndarray, "rows columns 3"], Float[np.ndarray, "3"]]:
-    """The signed distance on a plane square to an axis, `share` of the grid along it, and the plane's middle [m].
+    """Return the signed distance on a plane normal to an axis, `share` of the grid along it, and the plane's middle
+    [m].
 
-    Blue is inside, red outside, white at the surface; the picture's rows and columns are `slice_axes`.
+    Blue is inside, red outside, white at the surface. The picture's rows and columns are `slice_axes`.
     """
     sdf = scene.sdf
     low = sdf.origin.double().cpu().numpy()
@@ -128,12 +129,12 @@ def sdf_slice(
 
 
 def slice_axes(axis: int) -> tuple[int, int]:
-    """The axes that the rows and the columns of a slice square to `axis` run along."""
+    """Return the axes that the rows and the columns of a slice normal to `axis` run along."""
     return (axis + 2) % 3, (axis + 1) % 3
 
 
 def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], radius: float = _SHAFT) -> TriangleMesh:
-    """Arrows as closed bodies: a shaft, and a head of three times its radius."""
+    """Return arrows as closed bodies: a shaft, and a head of three times its radius."""
     import trimesh
 
     bodies = []
@@ -152,7 +153,7 @@ def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], rad
 
 
 def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
-    """A square piece of the support below the object, three times as wide as that."""
+    """Return a square piece of the support below the object, three times as wide as the object."""
     middle = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
     middle = middle + (support.offset - support.normal @ middle) * support.normal
     side = perpendicular(support.normal)
@@ -164,14 +165,14 @@ def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class SqueezeForces:
-    """Where a squeeze presses on the object [m], and with what force [N], as it was planned."""
+    """The planned forces of a squeeze on the object [N], and where they act [m]."""
 
     positions: Float[np.ndarray, "contacts 3"]
     forces: Float[np.ndarray, "contacts 3"]
 
 
 class Mechanics:
-    """Answers for the grasps of a session, which has a scene; what they share is prepared once."""
+    """Forces of the grasps of a session with a scene. Shared parts are prepared once."""
 
     def __init__(self, session: Session) -> None:
         assert session.scene is not None
@@ -180,7 +181,7 @@ class Mechanics:
         self._metrics = make_metrics_context(session.scene.object, session.hand)
 
     def squeeze_forces(self, grasp: Grasp) -> SqueezeForces:
-        """The balanced contact forces that the squeeze was made from."""
+        """Return the balanced contact forces that the squeeze was made from."""
         posture = grasp.grasp
         rows = (posture.position, posture.quaternion_wxyz, posture.joint_positions)
         poses = Poses(*(torch.as_tensor(row)[None].to(self._problem.hand.lower) for row in rows))
@@ -191,9 +192,9 @@ class Mechanics:
         return SqueezeForces(contacts.position[0][pressing].double().numpy(), forces[pressing].double().numpy())
 
     def weakest_push(self, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
-        """The unit disturbance (force, torque over the object's radius) that the contacts resist least.
+        """Return the unit disturbance (force, torque over the object's radius) that the contacts resist least.
 
-        None where the contacts do not close around the object: there is a push that they do not resist at all.
+        None if the contacts do not close around the object: there is a push that they do not resist at all.
         """
         return prepare_grasp(self._metrics, grasp.grasp).wrench_hull.weakest_push
 
@@ -202,7 +203,7 @@ STAGES = ("retreat", "pregrasp", "grasp", "squeeze")
 
 
 def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
-    """The posture at `at`, 0 for the retreat to 3 for the squeeze; between two stages on the straight way."""
+    """Return the posture at `at`, 0 for the retreat to 3 for the squeeze, on the straight path between two stages."""
     stages = (retreat_posture(hand, grasp.pregrasp), grasp.pregrasp, grasp.grasp, grasp.squeeze)
     first = min(max(int(at), 0), len(stages) - 2)
     share = min(max(at - first, 0.0), 1.0)
@@ -220,7 +221,7 @@ def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
 def placed_links(
     hand: HandModel, posture: Posture
 ) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links 4"]]:
-    """Position [m] and quaternion (wxyz) of every link in the object's frame."""
+    """Return position [m] and quaternion (wxyz) of every link in the object's frame."""
     rotations, translations = link_poses(hand, posture.joint_positions)
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz).double()).numpy()
     quaternions = quaternion_from_rotation(torch.as_tensor(base @ rotations)).numpy()
@@ -228,7 +229,7 @@ def placed_links(
 
 
 def skeletons(hand: HandModel, seen: Snapshot) -> Float[np.ndarray, "hands bones 2 3"]:
-    """Every hand as lines from each link's origin to its parent's, object frame [m]."""
+    """Return every hand as lines from each link's origin to its parent's, object frame [m]."""
     joints = torch.as_tensor(seen.joint_positions).float()
     links = forward(make_kinematics(hand), joints).translation
     quaternions = torch.as_tensor(seen.quaternions_wxyz).float()

@@ -1,6 +1,6 @@
-"""The list of grasps beside the scene: which are in it, in what order, and what is said of them. Pure text and HTML.
+"""The list of grasps beside the scene: filter, order and figures. Pure text and HTML.
 
-Names and reasons come out of files that strangers may have written: nothing of them reaches the page unescaped.
+Names and reasons come out of files that strangers may have written. None of them reaches the page unescaped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ALL = "all"
 # What is unverified although it was tried: it holds on the likeliest shape, and is not as sure as was asked for.
 LESS_SURE = "less sure"
 FILTERS = (ALL, "verified", LESS_SURE, "unverified", "failed")
-# Metrics of which less is better; of all others more is.
+# Metrics of which less is better. More is better for all others.
 _LESS = ("penetration", "contact_depth", "self_penetration", "intersection_volume", "least_friction")
 ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
 # Columns of the table, and how many rows are shown about the chosen one.
@@ -32,12 +32,12 @@ _OTHER_FIGURES = {
 
 
 def standing(grasp: Grasp) -> str:
-    """What is known of a grasp, for people: its verdict, or that it is less sure; one of the filters."""
+    """Return what is known of a grasp, one of the filters: its verdict, or that it is less sure."""
     return LESS_SURE if grasp.verdict is Verdict.UNVERIFIED and grasp.trials else str(grasp.verdict)
 
 
 def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
-    """Ranks of the grasps that pass a filter, best first by an order; what lacks the figure comes last.
+    """Return ranks of the grasps that pass a filter, best first by an order, those without the figure last.
 
     An unknown filter or order, which only a forged message can hold, counts as the first.
     """
@@ -51,7 +51,7 @@ def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
 
 
 def _value(grasp: Grasp, rank: int, by: str) -> float | None:
-    """What a grasp is sorted by, less first; None where it has no such figure."""
+    """Return the value that a grasp is sorted by, less first, None without such a figure."""
     if by == "score":
         return -grasp.score
     if by == "probability":
@@ -63,7 +63,7 @@ def _value(grasp: Grasp, rank: int, by: str) -> float | None:
 
 
 def label(grasp: Grasp, rank: int) -> str:
-    """One line for the list of choices."""
+    """Return one line for the list of choices."""
     said = standing(grasp)
     mark = {"verified": "✓", LESS_SURE: "~", "failed": "✗"}.get(said, "·")
     return f"{mark} #{rank} {said}{_likely(grasp, ', ')}, {len(grasp.contacts)} contacts"
@@ -74,7 +74,7 @@ def _likely(grasp: Grasp, before: str) -> str:
 
 
 def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:
-    """The rows of the list about the chosen one."""
+    """Return the rows of the list about the chosen one."""
     if not ranks:
         return "<i>no grasp passes this filter</i>"
     middle = ranks.index(chosen) if chosen in ranks else 0
@@ -90,7 +90,7 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
 
 
 def figures_html(grasp: Grasp, rank: int) -> str:
-    """All that is known of one grasp, each figure with what it means."""
+    """Return all that is known of one grasp, each figure with its meaning."""
     r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
     reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
     head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"

@@ -27,10 +27,10 @@ def save_view(
     """Write a page with the object and the hand at the first grasp that did not fail its trial.
 
     Args:
-        path: of the page; appears whole or not at all.
+        path: of the page. It appears whole or not at all.
         object_mesh: object frame [m].
         hand: that the grasps are for.
-        grasps: in rank order; where all failed, the page shows the object alone.
+        grasps: in rank order. If all failed, the page shows the object alone.
         name: of the object, for the page's title.
     """
     from trimesh.viewer.notebook import scene_to_html
@@ -45,7 +45,7 @@ def save_view(
 
 
 def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasp: Grasp | None):
-    """Object and hand as a `trimesh.Scene` with the meshes `object` and `hand`, object frame [m]."""
+    """Return object and hand as a `trimesh.Scene` with the meshes `object` and `hand`, object frame [m]."""
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -65,7 +65,7 @@ def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasp: Grasp | None):
 
 
 def placed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
-    """The hand's collision surface at a posture, object frame [m]."""
+    """Return the hand's collision surface at a posture, object frame [m]."""
     mesh = hand_mesh(hand, posture.joint_positions)
     rotation = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz)).numpy()
     return TriangleMesh(mesh.vertices @ rotation.T + posture.position, mesh.faces)

@@ -1,4 +1,4 @@
-"""The tab of grasps: the list, the way of the hand, what is shown of a grasp, and its trial."""
+"""The tab of grasps: the list, the path of the hand, the drawings of a grasp, and its trial."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NAMES = {
 
 
 class GraspTab:
-    """Widgets of the tab, and what they do; everything is drawn by `jobs`, in one thread."""
+    """Widgets of the tab and their actions. `jobs` draws everything, in one thread."""
 
     def __init__(self, server: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._jobs, self._nodes = jobs, nodes
@@ -85,7 +85,7 @@ class GraspTab:
             self.step(-1 if self._step.value == "Previous" else 1)
 
     def show(self, session: Session) -> None:
-        """Look at another session, its first grasp first. From the drawing thread."""
+        """Show another session, its first grasp first. Call it from the drawing thread."""
         self._session = session
         # Made when the first grasp asks: it takes as long as opening the file does.
         self._mechanics = None
@@ -100,7 +100,7 @@ class GraspTab:
         self._jobs.submit("choose", lambda: self._choose_place(by))
 
     def draw_pose(self, at: float | None = None) -> None:
-        """Put hand and object where the scrubber says, or at another place of the way."""
+        """Put hand and object where the scrubber says, or at another place of the path."""
         self._at = float(self._stage.value) if at is None else at
         grasp = self._grasp()
         if self.trial.stop():

@@ -35,23 +35,23 @@ class LiveView:
         self._drawn = -float("inf")
 
     def begin(self, session: Session) -> None:
-        """A run for the hand and the object of a session begins."""
+        """Begin a run for the hand and the object of a session."""
         self._origin, self._hand = session.origin, session.hand
 
     def end(self) -> None:
-        """The run is over: what was drawn of it goes."""
+        """End the run and remove its drawings."""
         self._hand = None
         self._jobs.submit("live", lambda: self._nodes.draw_lines(np.zeros((0, 2, 3)), np.zeros((0, 3))))
 
     def progress(self, progress: Progress) -> None:
-        """`plan_grasps`'s progress hook."""
+        """Take a report of `plan_grasps`, as its progress hook."""
         found = f", {progress.verified} verified" if progress.verified else ""
         line = f"{_WORDS.get(progress.stage, progress.stage)} {progress.step} of {progress.of}{found}"
         share = progress.step / progress.of if progress.of else 0.0
         self._jobs.submit("progress", lambda: self._told(f"{line}, {progress.elapsed:.1f} s", share), self._wait())
 
     def watch(self, seen: Snapshot) -> None:
-        """`plan_grasps`'s watch hook. Costs the run no more than handing over."""
+        """Take hands of `plan_grasps`, as its watch hook. It costs the run no more than handing over."""
         hand = self._hand
         if hand is not None:
             self._jobs.submit("live", lambda: self._draw(hand, seen), self._wait())

@@ -21,12 +21,12 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 class MovingParts:
-    """Shows parts where they are. Every method returns at once: a thread of the page's own draws the newest.
+    """A page that shows parts. Every method returns at once, and a thread of the page draws the newest.
 
     Args:
         parts: that move, each in its own frame.
         eye, middle: where visitors look from, and at what [m].
-        host, port: to listen on; by default only this machine can come, and the next free port is taken.
+        host, port: to listen on. By default only this machine can connect, and the next free port is taken.
 
     Raises:
         ConfigError: the address cannot be listened on, or viser is not installed.
@@ -54,7 +54,7 @@ class MovingParts:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"http://{host}:{self._server.get_port()}"
 
@@ -69,15 +69,15 @@ class MovingParts:
         self._jobs.submit("place", lambda: self._nodes.place("moving", poses))
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
-        """Draw parts that stand still in place of those that the group had."""
+        """Draw parts that stand still, in place of the group's earlier ones."""
         self._jobs.submit(group, lambda: self._nodes.draw(group, parts))
 
     def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """Draw what a camera saw in place of what it saw before [m]."""
+        """Draw the points that a camera saw, in place of earlier ones [m]."""
         self._jobs.submit("points", lambda: self._nodes.draw_points(points))
 
     def tell(self, *lines: str) -> None:
-        """Show lines of text in place of those before."""
+        """Show lines of text in place of earlier ones."""
         text = "<br>".join(map(html.escape, lines))
         self._jobs.submit("text", lambda: setattr(self._text, "content", f"{BLOCK}{text}</div>"))
 

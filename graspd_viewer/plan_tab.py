@@ -1,6 +1,6 @@
-"""The tab where visitors plan: an object, a hand, a preset; Plan, Stop and Save. One run at a time, seen by all.
+"""The tab where visitors plan: an object, a hand, a preset, and Plan, Stop and Save. One run at a time, seen by all.
 
-A visitor's wish is checked here, because a forged message may hold anything in any field.
+A visitor's request is checked here, because a forged message may hold anything in any field.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ MOST_GRASPS = 64
 
 @dataclass(frozen=True)
 class Upload:
-    """A file that a visitor sent: its name, which is only ever shown, and what is in it."""
+    """A file that a visitor sent: its name, which is only ever shown, and its content."""
 
     name: str
     content: bytes
 
     @property
     def ending(self) -> str:
-        """In lower case, without a dot."""
+        """The ending in lower case, without a dot."""
         return self.name.rpartition(".")[2].lower() if "." in self.name else ""
 
 
@@ -67,7 +67,7 @@ class PlanRequest:
     """One run.
 
     Attributes:
-        shape: name of an authored shape, where no file was sent.
+        shape: name of an authored shape, if no file was sent.
         upload: the object's file.
         units: of the file's coordinates, a key of `UNITS`.
         alone: a cloud shows the object and nothing else.
@@ -92,13 +92,13 @@ class PlanRequest:
 
     @property
     def restrictions(self) -> tuple[Steering, ...]:
-        """What `plan_grasps` is asked to keep to. Raises ConfigError: the angle is out of its range."""
+        """The restrictions for `plan_grasps`. Raises ConfigError: the angle is out of its range."""
         direction = APPROACHES[self.approach]
         return () if direction is None else (Steering(direction, math.radians(self.approach_angle)),)
 
 
 def check(request: PlanRequest) -> None:
-    """Refuse what no honest visitor can ask for: names only, no paths. Raises ConfigError: what is valid."""
+    """Refuse what no honest visitor can ask for: names only, no paths. Raises ConfigError: names the valid values."""
     chosen = (
         ("shape", request.shape, tuple(SHAPES)),
         ("units", request.units, tuple(UNITS)),
@@ -120,12 +120,12 @@ def check(request: PlanRequest) -> None:
 
 
 def load_object(request: PlanRequest) -> tuple[Scene, Any]:
-    """The scene of a checked request, and the points that it was made of [m].
+    """Load the scene of a checked request, and the points that it was made of [m].
 
-    A file is read by the process's child: what crashes or misleads a reader ends there.
+    The process's child reads a file: a reader that crashes or is misled ends there.
 
     Raises:
-        GraspdError: the object cannot be used; the message names the file as the visitor does.
+        GraspdError: the object cannot be used. The message names the file as the visitor does.
     """
     if request.upload is None:
         source = f"{SHAPE_PREFIX}{request.shape}"
@@ -195,11 +195,11 @@ class PlanTab:
         self._status.content, self._bar.value = f"{BLOCK}{html.escape(line)}</div>", 100.0 * min(max(share, 0.0), 1.0)
 
     def plan(self) -> None:
-        """Begin what the widgets ask for, unless a run is under way."""
+        """Begin the run that the widgets ask for, unless one is under way."""
         self.begin(lambda _: self._plan_and_show(self._request()))
 
     def begin(self, work: Callable[[StopHook], None]) -> None:
-        """Do something else in the thread that plans, which says when to stop, unless a run is under way."""
+        """Do other work in the planning thread, unless a run is under way. `work` gets the stop hook."""
         if not self._busy.acquire(blocking=False):
             return
         self._stop.clear()
@@ -228,7 +228,7 @@ class PlanTab:
         self._say(f"refused: {reason}")
 
     def _request(self) -> PlanRequest:
-        """What the widgets say, checked. Raises ConfigError."""
+        """Return the checked request of the widgets. Raises ConfigError."""
         sent = self._upload if self._object.value == _FILE else None
         try:
             friction, count, angle = float(self._friction.value), int(self._count.value), float(self._angle.value)

@@ -1,4 +1,4 @@
-"""The three-dimensional half of the page: what `drawing` makes, as viser's nodes. Used from the drawing thread."""
+"""The three-dimensional half of the page: the meshes of `drawing` as viser's nodes. Used from the drawing thread."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class SceneNodes:
         self._aim(session)
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
-        """Draw parts in place of those that the group had."""
+        """Draw parts in place of the group's earlier ones."""
         for node in self._groups.pop(group, ()):
             node.remove()
         nodes = [self._mesh(f"/{part.name}", part) for part in parts]
@@ -66,7 +66,7 @@ class SceneNodes:
         self._groups[group] = nodes
 
     def draw_lines(self, lines: Float[np.ndarray, "n 2 3"], colours: Float[np.ndarray, "n 3"]) -> None:
-        """Lines in place of those before; none where there are none."""
+        """Draw lines in place of earlier ones."""
         for node in self._groups.pop("lines", ()):
             node.remove()
         if len(lines):
@@ -77,7 +77,7 @@ class SceneNodes:
             self._groups["lines"] = [node]
 
     def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
-        """The signed distance on a plane square to an axis; None for none."""
+        """Draw the signed distance on a plane normal to an axis, for None nothing."""
         for node in self._groups.pop("slice", ()):
             node.remove()
         if axis is None or session.scene is None:
@@ -104,13 +104,13 @@ class SceneNodes:
         self.pose_links(*placed_links(hand, posture))
 
     def pose_links(self, positions: Float[np.ndarray, "_ 3"], quaternions: Float[np.ndarray, "_ 4"]) -> None:
-        """Put every link where it is; rows beyond the links are left out."""
+        """Put every link at its pose. Rows beyond the links are left out."""
         with self._server.atomic():
             for link, node in self._links.items():
                 node.position, node.wxyz = PER_METRE * positions[link], quaternions[link]
 
     def pose_object(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> None:
-        """Put the object somewhere else than where it was planned on."""
+        """Move the object from where it was planned on."""
         if self._object is not None:
             self._object.position, self._object.wxyz = PER_METRE * position, quaternion
 
@@ -136,7 +136,7 @@ class SceneNodes:
             node.position, node.wxyz = PER_METRE * pose[:3, 3], _quaternion(pose[:3, :3])
 
     def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """Draw points in place of those before [m]."""
+        """Draw points in place of earlier ones [m]."""
         for node in self._groups.pop("cloud", ()):
             node.remove()
         nodes = []
@@ -161,7 +161,7 @@ class SceneNodes:
         )  # fmt: skip
 
     def _aim(self, session: Session) -> None:
-        """Every visitor's camera at the object, with the support's free side up."""
+        """Aim every visitor's camera at the object, with the support's free side up."""
         middle, size, up = np.zeros(3), 0.1, np.array([0.0, 0.0, 1.0])
         if session.scene is not None:
             corners = session.scene.object.mesh.vertices

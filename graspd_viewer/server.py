@@ -1,8 +1,8 @@
 """A viser server that may be left running, and the one thread that draws.
 
-viser serves anybody on every interface, lets any page that is open in the same browser connect, takes files of any
-size, and opens a public tunnel when a visitor asks for one. This one does none of it.
-The thread draws the newest of each kind, so that no flood of sliders piles up.
+viser serves anybody on every interface, lets any page in the same browser connect, takes files of any size, and opens a
+public tunnel when a visitor asks for one. This server does none of it. The thread draws the newest job of each kind, so
+that no flood of sliders piles up.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Work = Callable[[], object]
 
 
 class LatestJobs:
-    """Does what it is given in a thread of its own; work that newer work of its kind replaces is never done.
+    """A thread that does the newest job of each kind. Replaced jobs are never done.
 
     Args:
-        failed: told of what work raised.
+        failed: called with the exception of a job.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -37,18 +37,18 @@ class LatestJobs:
         self._thread.start()
 
     def submit(self, kind: str, work: Work, after: float = 0.0) -> None:
-        """Have work done, `after` seconds from now, unless other work of its kind comes first."""
+        """Submit a job, due `after` seconds from now, in place of a waiting one of its kind."""
         with self._change:
             self._waiting[kind] = time.monotonic() + after, work
             self._change.notify()
 
     def drop(self, kind: str) -> None:
-        """Work of that kind that waits is not done."""
+        """Drop a waiting job of that kind."""
         with self._change:
             self._waiting.pop(kind, None)
 
     def close(self) -> None:
-        """End the thread behind the work it is at."""
+        """End the thread after its present job."""
         with self._change:
             self._closed = True
             self._change.notify()
@@ -80,7 +80,7 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 def start_server(host: str, port: int) -> Any:
-    """A `viser.ViserServer` on that address, on the next free port after `port`.
+    """Start a `viser.ViserServer` on that address, on the next free port after `port`.
 
     Raises:
         ConfigError: no viser, or no such address on this machine.
@@ -111,10 +111,10 @@ def quiet() -> contextlib.AbstractContextManager[Any]:
 
 
 def may_connect(origin: str | None, named: str | None, host: str) -> bool:
-    """Whether a page of `origin` may talk to the server that it calls `named`, which listens on `host`.
+    """Tell whether a page of `origin` may talk to the server that it calls `named`, which listens on `host`.
 
-    A page of another site may not, nor one that calls a local server by a name that is not local: its own, which it has
-    pointed here. What is no page has no origin.
+    A page of another site may not, nor a page that calls a local server by a name that is not local. A client that is
+    no page has no origin.
     """
     name = urlsplit(f"//{named or ''}")
     if host in LOCAL and name.hostname not in LOCAL:
@@ -142,7 +142,7 @@ def _refuse_tunnels(server: Any) -> None:
 
 
 def _limit_uploads(server: Any) -> None:
-    """Take no file that is too large or one too many; end a transfer that sends more than it said."""
+    """Refuse files that are too large or one too many. End a transfer that sends more than it said."""
     from viser import _messages
 
     gui = server.gui

@@ -1,4 +1,4 @@
-"""What is looked at: grasps, the hand that they are for, and the object as far as it can be had."""
+"""A session of the viewer: grasps, their hand, and the object if it can be had."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from graspd_core.types import Grasp, TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What is looked at.
+    """What the viewer shows.
 
     Attributes:
         title: for people.
         hand: that the grasps are for.
         grasps: in rank order.
-        scene: None where the object cannot be had: the grasps are shown all the same.
+        scene: None if the object cannot be had. The grasps are shown all the same.
         config: of the run that found them.
-        seen: points that the cameras saw, object frame [m]; empty for a mesh.
+        seen: points that the cameras saw, object frame [m], empty for a mesh.
         notes: what a visitor should know, one sentence each.
-        origin: of what is shown, in the frame of the file [m]: zero, but for an object far from its own.
+        origin: of what is shown, in the frame of the file [m]: zero except for an object far from its own.
     """
 
     title: str
@@ -47,14 +47,14 @@ class Session:
 
 
 def open_grasps(path: Path, *, object_source: str | None = None, hand: str | None = None) -> Session:
-    """What a grasps file holds, and the object and the hand that it names.
+    """Open a grasps file, with the object and the hand that it names.
 
-    An object that cannot be read, or is not the one that the grasps were planned on, is a note.
+    An object that cannot be read, or differs from the one that the grasps were planned on, is a note.
 
     Args:
         path: of a file of the format graspd/grasps.
-        object_source: a mesh or cloud file, or shape:NAME; without it, what the file names.
-        hand: a name or a path; without it, what the file names.
+        object_source: a mesh or cloud file, or shape:NAME. None: what the file names.
+        hand: a name or a path. None: what the file names.
 
     Raises:
         FormatError: the file cannot be read, or the hand has other joints than the file.
@@ -80,7 +80,7 @@ def make_session(
     seen: Float[np.ndarray, "points 3"],
     notes: tuple[str, ...],
 ) -> Session:
-    """A session about its object: browsers keep places as float32, which is too coarse far from the origin."""
+    """Make a session about its object. Browsers keep positions as float32, which is too coarse far from the origin."""
     scene, far = planning_scene(scene, config.resolution)
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, config, seen - far, notes, far)
 
@@ -88,7 +88,7 @@ def make_session(
 def seen_points(
     source: str | TriangleMesh, scale: float = 1.0, camera: str | Path | None = None
 ) -> Float[np.ndarray, "points 3"]:
-    """The points of a cloud file, or of a depth image by its camera's file [m]; none for anything else."""
+    """Return the points of a cloud file, or of a depth image by its camera's file [m], none for all else."""
     if isinstance(source, TriangleMesh) or (camera is None and not is_cloud_file(source)):
         return np.zeros((0, 3))
     points = np.concatenate([view.points for view in scaled_views(source, camera, scale)])
@@ -110,13 +110,13 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
 def _object_of(
     document: dict[str, Any], path: Path, wanted: str | None, config: PlanConfig
 ) -> tuple[Scene | None, Float[np.ndarray, "points 3"], tuple[str, ...]]:
-    """The scene, the points that it was made of, and what is wrong with it."""
+    """Return the scene, the points that it was made of, and notes."""
     told = document.get("object")
     told = told if isinstance(told, dict) else {}
     source = wanted or _beside(str(told.get("source")), path)
     given = {key: told[key] for key in ("mass", "friction", "scale") if isinstance(told.get(key), int | float)}
     try:
-        # Whether a cloud showed the object alone is not in the file; what stood on nothing was taken whole.
+        # Whether a cloud showed the object alone is not in the file. What stood on nothing was taken whole.
         alone = told.get("support") is None
         scene = load_scene(source, **given, resolution=config.resolution, alone=alone)
         seen = seen_points(source, given.get("scale", 1.0))

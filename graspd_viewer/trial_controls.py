@@ -1,7 +1,7 @@
 """A grasp's trial, run again and watched: forwards, step by step, up to the moment and the reason of its failure.
 
-A recording holds where hand and object were as MuJoCo ran it, and what pressed on the object. A trial that is recorded
-takes the same steps and ends with the same result.
+A recording holds the poses of hand and object in MuJoCo, and the forces on the object. A recorded trial takes the same
+steps and ends with the same result.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FRAME_STEPS = 5
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment of a trial; the object's frame as it was at the start, in which a lift moves hand and object up.
+    """One moment of a trial in the object's frame at the start, in which a lift moves hand and object up.
 
     Attributes:
         stage: what is being done.
@@ -55,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Recording:
-    """A trial from its first step to its end, `seconds` of simulated time apart; the last frame is its very end."""
+    """A trial with frames `seconds` of simulated time apart. The last frame is its very end."""
 
     result: TrialResult
     frames: tuple[Frame, ...]
@@ -63,11 +63,7 @@ class Recording:
 
 
 def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
-    """Run one trial of a grasp and keep what happens.
-
-    Raises:
-        ConfigError: no such trial, or none that applies to this scene.
-    """
+    """Run one trial of a grasp and record it. Raises ConfigError: no such trial, or none that applies to this scene."""
     names = [row.name for row in TRIALS.values() if row.applies(context)]
     if name not in names:
         raise ConfigError(f"trial {shown(name)}: valid for this scene: {', '.join(names)}")
@@ -82,7 +78,7 @@ def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
 
 
 class _Recorder:
-    """Keeps every fifth step of a trial, and the last."""
+    """A hook that keeps every fifth step of a trial, and the last."""
 
     def __init__(self, context: TrialContext, name: str) -> None:
         world = context.around if name == "lift" else context.alone
@@ -105,7 +101,7 @@ class _Recorder:
         return tuple(self._frames) if self._last is None else (*self._frames, self._last)
 
     def _frame(self, data: Any) -> Frame:
-        # What is beside the hand sinks in a lift (lift_trial.py); seen from there, hand and object rise.
+        # What is beside the hand sinks in a lift (lift_trial.py). Seen from there, hand and object rise.
         origin = -data.mocap_pos[1] if len(data.mocap_pos) > 1 else np.zeros(3)
         contacts, forces = _contact_forces(self._world, data)
         return Frame(
@@ -118,7 +114,7 @@ class _Recorder:
 
 
 def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Where the hand touches the object, and the force on the object there; world frame [m], [N]."""
+    """Return where the hand touches the object, and the force on the object there, world frame [m], [N]."""
     import mujoco
 
     places, forces, wrench = [], [], np.zeros(6)
@@ -154,7 +150,7 @@ _RATE = 25.0
 
 
 class TrialControls:
-    """Widgets of a trial; everything is drawn by `jobs`, in one thread."""
+    """Widgets of a trial. `jobs` draws everything, in one thread."""
 
     def __init__(self, gui: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._jobs, self._nodes = jobs, nodes
@@ -178,7 +174,7 @@ class TrialControls:
                 self._jobs.submit("frame", lambda: self._draw(int(self._time.value)))
 
     def show(self, session: Session, grasp: Grasp | None) -> None:
-        """Another grasp, of which no trial is run yet; its own failed trial is offered first."""
+        """Show another grasp, without a trial yet. Its own failed trial is offered first."""
         if session is not self._session:
             self._session, self._contexts = session, {}
         self._grasp = grasp
@@ -189,7 +185,7 @@ class TrialControls:
         self._text.content = ""
 
     def stop(self) -> bool:
-        """Show no moment of a trial any more; whether one was shown. From the drawing thread."""
+        """Leave the trial. Tells whether a moment of it was shown. Call it from the drawing thread."""
         self._jobs.drop("play")
         shown, self._recording, self._time.disabled = self._recording is not None, None, True
         self._nodes.draw("trial", ())
@@ -251,7 +247,7 @@ class TrialControls:
 
 
 def _told(recording: Recording, index: int, stage: str) -> str:
-    """When and what, and how the trial ended."""
+    """Return time and stage, and how the trial ended."""
     result, seconds = recording.result, recording.seconds
     end = seconds * (len(recording.frames) - 1)
     line = f"{seconds * index:.2f} s of {end:.2f} s: {html.escape(stage)}"

@@ -26,7 +26,7 @@ _PATIENCE = 60.0
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("view")
     parser.set_defaults(run=run)
     parser.add_argument(
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: PlanConfig) -> Iterator[Watched]:
-    """A page for a run with --view, which begins when somebody is there or a minute has passed."""
+    """Give a page for a run with --view. The run begins when somebody is there or a minute has passed."""
     from graspd_viewer.session import make_session, seen_points
     from graspd_viewer.viewer import Viewer
 
@@ -91,7 +91,7 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
 
 
 def wait_for_end(url: str) -> None:
-    """Say where the page is, until Ctrl-C."""
+    """Print the page's address, and wait for Ctrl-C."""
     print(f"{url} - Ctrl-C ends it", flush=True)
     with Interrupt() as interrupt:
         pause = threading.Event()

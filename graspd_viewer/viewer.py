@@ -1,4 +1,4 @@
-"""The page: its tabs, its help, and the thread that draws. Runs until it is closed; visitors come and go."""
+"""The page: its tabs, its help, and the thread that draws. It runs until it is closed, and visitors come and go."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Viewer:
     """A page that shows sessions to whoever comes.
 
     Args:
-        host, port: to listen on; by default only this machine can come, and the next free port is taken.
+        host, port: to listen on. By default only this machine can connect, and the next free port is taken.
         plan: whether visitors may plan.
 
     Raises:
@@ -95,13 +95,13 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"http://{host}:{self.port}"
 
     @property
     def port(self) -> int:
-        """That it listens on."""
+        """Port of the page."""
         return self._server.get_port()
 
     def show(self, session: Session) -> None:
@@ -115,17 +115,17 @@ class Viewer:
             time.sleep(0.05)
 
     def do(self, kind: str, work: Callable[[], None]) -> None:
-        """Have the drawing thread do something; of each kind the newest."""
+        """Submit a job to the drawing thread, which does the newest of each kind."""
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:
-        """Have the thread that plans do something, in place of what it is at; `plan` must be had."""
+        """Run work in the planning thread, in place of its present run. It needs `plan`."""
         if self._planner is not None:
             self._planner.close()
             self._planner.begin(work)
 
     def say(self, line: str, share: float = 0.0) -> None:
-        """Show how far a run is in place of what was said before, from any thread."""
+        """Show how far a run is in place of the earlier line, from any thread."""
         self._jobs.submit("progress", lambda: self.tell(line, share))
 
     def tell(self, line: str, share: float) -> None:

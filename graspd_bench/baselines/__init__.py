@@ -1,1 +1,1 @@
-"""Methods that others are compared with."""
+"""Methods to compare others with."""

@@ -1,20 +1,20 @@
 """A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
 
-It searches a low-dimensional space of postures for any hand, and the places on the inside of its links.
+Eigengrasps are the principal components of how people shape their hands. No such recordings exist for an arbitrary
+hand. Here they are those of seeded random postures between open and closed, in which the fingers mostly close together.
+The first is the hand's closing, the next are differences between fingers.
 
-Eigengrasps (Ciocarlie and Allen, IJRR 2009) are the principal components of how people shape their hands. No such
-recordings exist for an arbitrary hand, so here they are those of seeded random postures between open and closed, in
-which the fingers mostly close together: the first is the hand's closing, the next are how fingers differ.
-
-A chain's state is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, the mean over
-chosen places on the inside of the hand of their distance to the object and of how far they face away from it,
+A chain's state is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!. It is the
+mean, over chosen places on the inside of the hand, of their distance to the object and of how far they face away from
+it:
 
     E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i the unit direction from the place to the object,
 
-and states in which the hand collides are refused. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛) for k from
-30,000 to 100,000, jumps drawn by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each
-chain is then closed until contact, and the best of those by ε are kept. ε is Ferrari and Canny's for forces that sum
-to one, over sampled wrenches instead of the hull's faces, so an upper bound. Batched over chains; no gradients.
+States in which the hand collides are refused. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛) for k from 30,000
+to 100,000, jumps drawn by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each chain
+is then closed until contact, and the best of those by ε are kept. ε is that of Ferrari and Canny for forces that sum to
+one. It is taken over sampled wrenches instead of the hull's faces, which makes it an upper bound. Chains run as one
+batch, without gradients.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ from graspd_dataset.finger_closing import finger_of, link_gaps, make_closing, sp
 
 @dataclass(frozen=True)
 class AnnealingConfig:
-    """A GraspIt!-style planner: simulated annealing in a low-dimensional space of hand postures.
+    """Settings of simulated annealing in a low-dimensional space of hand postures, as in GraspIt!.
 
     Attributes:
-        chains_per_grasp: chains run for each grasp asked for, one grasp each; the best by ε are kept.
-        keep_per_grasp: closed grasps kept for each grasp asked for.
+        chains_per_grasp: chains run for each requested grasp. Each gives one grasp, and the best by ε are kept.
+        keep_per_grasp: closed grasps kept for each requested grasp.
         steps: states tried by each chain.
         eigengrasps: dimensions of the space of hand postures.
         contacts_per_link: places on the inside of each link that are drawn to the object.
-        normal_weight: what a contact location that faces away from the object costs, as a distance [m].
+        normal_weight: cost of a contact location that faces away from the object, as a distance [m].
         translation_jump: largest jump of the base [m].
         rotation_jump: largest turn of the base about each of its axes [rad].
         posture_jump: largest jump along an eigengrasp, as a share of its range.
-        close_steps: of the closing of the best states, from open to closed.
-        directions: wrenches that ε is the least resistance against.
+        close_steps: steps of the closing of the best states, from open to closed.
+        directions: number of wrenches against which ε is the least resistance.
     """
 
     chains_per_grasp: float = 4.0
@@ -77,7 +77,7 @@ class AnnealingConfig:
 # Random postures, how far fingers differ from the common closing (shares), and joints from their finger (range).
 _POSTURES, _FINGER_SPREAD, _JOINT_SPREAD = 512, 0.3, 0.05
 # The inside of a group of links: where its surface faces the way that closing moves it (cosine), or comes nearest to
-# facing it; a group that never does by as much as the second has no inside.
+# facing it. A group that never does by as much as the second has no inside.
 _FACING, _LEAST_FACING = 0.85, 0.5
 
 
@@ -98,7 +98,7 @@ class PostureSpace:
 
 
 def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
-    """The first principal components of random postures; fewer where the hand has fewer joints that vary."""
+    """Return the first principal components of random postures, fewer where fewer joints vary."""
     rng = np.random.default_rng(seed)
     fingers = finger_of(hand)
     span = hand.upper - hand.lower
@@ -120,9 +120,10 @@ def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
 
 
 def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"]:
-    """Indices of contact candidates on the inside of the hand: the palm's, and those that closing moves ahead of it.
+    """Return indices of contact candidates on the inside: those of the palm, and those ahead when their link closes.
 
-    For each rigid group of links the one nearest to the middle of its inside, then those farthest from the chosen.
+    For each rigid group of links the one nearest to the middle of its inside is taken, then those farthest from the
+    chosen.
     """
     chosen: list[int] = []
     facing = _facing(hand)
@@ -147,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Cosine between each candidate's outward normal and the way that closing moves it; for the palm, its normal."""
+    """Return the cosine of each candidate's outward normal with its motion in closing, or with the palm's normal."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -177,11 +178,11 @@ _FEWEST_CHAINS, _FEWEST_KEPT = 16, 8
 
 @dataclass(frozen=True)
 class ChainState:
-    """States of a batch of chains and the best that each has seen.
+    """States of a batch of chains, and the best that each has reached.
 
     Attributes:
         x: base translation [m], base quaternion, amplitudes.
-        energy: [m]; infinite where the state collides.
+        energy: [m], infinite where the state collides.
         best_x, best_energy: of the best legal state so far.
     """
 
@@ -193,7 +194,7 @@ class ChainState:
 
 @dataclass(frozen=True)
 class Annealing:
-    """The annealing as a solver for the shared loop; build with `make_annealing`.
+    """The annealing as a solver for the shared loop, built by `make_annealing`.
 
     Attributes:
         config: its settings.
@@ -253,13 +254,13 @@ class Annealing:
         return self.poses(state.best_x), state.best_energy
 
     def poses(self, x: Float[Tensor, "batch variables"]) -> Poses:
-        """The hands of states."""
+        """Return the hands of states."""
         return Poses(x[:, :3], x[:, 3:7], (self.center + x[:, 7:] @ self.basis).clamp(self.lower, self.upper))
 
     def neighbour(
         self, x: Float[Tensor, "batch variables"], jumps: Float[Tensor, "batch jumps"]
     ) -> Float[Tensor, "batch variables"]:
-        """States a jump away, jumps in units of the largest: three of place, three of turn, then amplitudes."""
+        """Return states a jump away, in units of the largest jumps: three of place, three of turn, then amplitudes."""
         config = self.config
         translation = x[:, :3] + config.translation_jump * jumps[:, :3]
         half = 0.5 * config.rotation_jump * jumps[:, 3:6]
@@ -270,7 +271,7 @@ class Annealing:
 
     @torch.no_grad()
     def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
-        """GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
+        """Return GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
         poses = self.poses(x)
         placed = hand_forward(problem, problem.hand.coarse, poses)
         points = placed.base.apply(place_points(self.contacts, placed.links))
@@ -283,7 +284,7 @@ class Annealing:
         return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
 
     def clear(self, problem: Problem, placed: HandPlacement) -> Bool[Tensor, "batch"]:
-        """Whether the hand keeps clear of itself and of obstacles."""
+        """Return whether the hand keeps clear of itself and of obstacles."""
         clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
         if problem.obstacles is None:
             return clear
@@ -291,14 +292,14 @@ class Annealing:
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
-        """Whether object and hand overlap, by all of the hand's points and the object's sharp ones."""
+        """Return whether object and hand overlap, by all of the hand's points and the object's sharp ones."""
         if len(x) == 0:
             return torch.zeros(0, dtype=torch.bool, device=x.device)
         return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0
 
 
 def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, seed: int) -> Annealing:
-    """The annealing of one hand about one object."""
+    """Return the annealing of one hand about one object."""
 
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values).to(problem.hand.lower)
@@ -328,19 +329,19 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
 
 
 def cooling(progress: float) -> float:
-    """GraspIt!'s default temperature at a share of its run."""
+    """Return GraspIt!'s default temperature at a share of its run."""
     k = _FIRST + progress * (_LAST - _FIRST)
     return _T0 * math.exp(-_COOLING * k ** (1 / _DIMENSIONS))
 
 
 def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
-    """Ingber's distribution of jumps (1989) from numbers in [0, 1): between −1 and 1, mostly of the size of T."""
+    """Return Ingber's distribution of jumps (1989) from numbers in [0, 1): from −1 to 1, mostly of the size of T."""
     side = 2 * uniform - 1
     return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
 
 
 def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"]) -> Float[Tensor, "batch 4"]:
-    """Hamilton's product: the turn b, then the turn a."""
+    """Return Hamilton's product, which turns by b, then by a."""
     w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(-1, keepdim=True)
     v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])
     return torch.cat([w, v], -1)
@@ -349,9 +350,10 @@ def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"])
 def sampled_epsilon(
     problem: Problem, contact_set: ContactSet, directions: Float[Tensor, "directions 6"]
 ) -> Float[Tensor, "batch"]:
-    """Ferrari and Canny's ε for forces that sum to one, with hard contacts: min over directions of max over contacts.
+    """Return Ferrari and Canny's ε with hard contacts: the least over directions of the greatest over contacts.
 
-    An upper bound of the true radius, because only these directions are looked at; zero without force closure.
+    Forces sum to one. It is an upper bound of the true radius, because only these directions are tried. It is zero
+    without force closure.
     """
     batch, slots = contact_set.active.shape
     support = wrench_support(
@@ -365,7 +367,7 @@ def sampled_epsilon(
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """The best state of each chain, closed until contact; the best of those by ε. After the deadline, what there is."""
+    """Close the best state of each chain until contact and return the best by ε, after the deadline those done."""
     settings, hooks = task.config.settings, task.hooks
     problem = task.problem
     annealing = make_annealing(problem, task.hand, settings, task.seed)

@@ -1,8 +1,8 @@
 """The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
 
-The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open, and moves along
-its normal until the hand first touches; then the fingers close (`finger_closing`). Nothing is chosen by quality: of the
-hands that touch with enough links, and reach through no obstacle, the first are taken. No gradients.
+The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open. It moves along
+its normal until the hand first touches. Then the fingers close (`finger_closing`). Nothing is chosen by quality. The
+first hands that touch with enough links and reach through no obstacle are taken. No gradients are used.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from graspd_dataset.finger_closing import CLOSE_STEPS, Closing, link_gaps, make_
 
 @dataclass(frozen=True)
 class RandomClosureConfig:
-    """Approach at random, close until contact.
+    """Settings of random approaches that close until contact.
 
     Attributes:
-        rounds: of as many approaches as grasps are asked for, until as many touch well enough.
+        rounds: most rounds of as many approaches as requested grasps, until as many touch well enough.
         touching: rigid groups of links that must touch.
-        close_steps: of the closing, from open to closed.
+        close_steps: steps of the closing, from open to closed.
     """
 
     rounds: int = 4
@@ -44,7 +44,7 @@ _TOUCHING, _ADVANCES = 0.0003, 60
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Closed hands from random sides, `count` tries a round until as many touch; a round cut short gives none."""
+    """Return closed hands from random sides, from rounds of `count` tries. A round that is cut short gives none."""
     settings, hand, count = task.config.settings, task.hand, task.count
     problem = task.problem
     closing = make_closing(problem, hand, settings.close_steps)
@@ -64,13 +64,13 @@ def plan(task: PlannerInput) -> PlannerOutput:
 
 
 def join(a: Poses, b: Poses) -> Poses:
-    """One batch of two."""
+    """Return two batches as one."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("translation", "quaternion", "joints"))
     return Poses(*(torch.cat(pair) for pair in pairs))
 
 
 def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) -> Poses:
-    """Open hands clear of the object whose palms face its centre of mass, from uniform directions, rolled uniformly."""
+    """Return open hands clear of the object, palms towards its centre of mass, directions and rolls uniform."""
     generator = torch.Generator().manual_seed(seed)
     rotation = random_rotations(count, generator, torch.float64)
     away = problem.object.length + hand_reach(hand)
@@ -86,7 +86,7 @@ def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) ->
 
 @torch.no_grad()
 def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -> Poses:
-    """The hands moved along their palms' normals until something touches, the palm at the centre of mass at most.
+    """Return the hands moved along their palms' normals to the first touch, or until the palm is at the centre of mass.
 
     Sphere tracing: the hand may always go as far as its least distance from the object.
     """
@@ -105,7 +105,7 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 def touching_groups(
     problem: Problem, closing: Closing, hand: HandModel, poses: Poses, reach: float
 ) -> Float[Tensor, "batch"]:
-    """How many rigid groups of links are within `reach` [m] of the object."""
+    """Return how many rigid groups of links are within `reach` [m] of the object."""
     near = link_gaps(problem, poses, closing.sphere_links)[:, 0] <= reach
     groups = torch.as_tensor(hand.link_group, device=near.device)
     found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.hand.lower.dtype)
@@ -113,7 +113,7 @@ def touching_groups(
 
 
 def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
-    """Which hands reach into no support and no neighbour."""
+    """Return which hands reach into no support and no neighbour."""
     if problem.obstacles is None:
         return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
     links = forward(problem.hand.kinematics, poses.joints)

@@ -1,1 +1,1 @@
-"""The second simulator."""
+"""Trials in the second simulator."""

@@ -1,6 +1,6 @@
 """The hold trial in the second simulator: same stages, gains, effort limits, pulls and limits as `hold_trial`.
 
-What Bullet does in another way, and how it is matched: docs/metrics.md.
+docs/metrics.md tells what Bullet does differently, and how that is matched.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class _Run:
 
     Attributes:
         client: PyBullet's client.
-        world: what it was made of.
+        world: hand and object of the simulation.
         protocol: physics settings.
-        body: the object.
-        hand: the hand.
+        body: PyBullet's number of the object.
+        hand: PyBullet's number of the hand.
         joints: PyBullet's numbers of the hand's joints.
-        worst: greatest travel [m] and turn [rad] so far, brought up to date in place.
+        worst: greatest travel [m] and turn [rad] so far, updated in place.
     """
 
     client: int
@@ -53,7 +53,7 @@ class _Run:
 
 
 def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> TrialResult:
-    """Run one hold trial of `protocol` in PyBullet; ends at the first breach.
+    """Run one hold trial of `protocol` in PyBullet, which ends at the first broken limit.
 
     Returns:
         Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions.
@@ -90,7 +90,7 @@ def _result(run: _Run, reason: str) -> TrialResult:
 
 
 def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol) -> _Run:
-    """Hand at a posture, object at rest in its frame."""
+    """Start with the hand at a posture and the object at rest in its frame."""
     import pybullet
 
     sliding, torsional, _ = protocol.friction
@@ -135,7 +135,7 @@ def _start_penetration(run: _Run) -> float:
 
 
 def _move(run: _Run, start: Posture, end: Posture) -> str:
-    """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
+    """Move the targets linearly from start to end. Return why the trial is over, empty if it is not."""
     steps = round(run.protocol.stage_time / TIMESTEP)
     # The shorter way round for the base: wxyz and its negative are the same rotation.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
@@ -150,7 +150,7 @@ def _move(run: _Run, start: Posture, end: Posture) -> str:
 
 
 def _pull(run: _Run, posture: Posture, direction: Float[np.ndarray, "3"]) -> str:
-    """Pull at the object's centre of mass for as long as the protocol says; why the trial is over, empty if not."""
+    """Pull at the object's centre of mass as long as the protocol says. Return why the trial is over, or nothing."""
     import pybullet
 
     force = (run.protocol.pull * run.world.mass * direction).tolist()
@@ -171,11 +171,11 @@ def _step(run: _Run, step: int) -> str:
 
 
 def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
-    """Springs towards `target` [rad], damped, for one step.
+    """Drive the joints by damped springs towards `target` [rad] for one step.
 
-    Bullet's motor aims at a velocity with at most a given force. Told the velocity at which the damper balances the
-    spring, and the force that spring and damper have now, it is that spring and damper, and cannot overshoot: an
-    explicit torque on fingers this light would need steps of microseconds.
+    Bullet's motor aims at a velocity with at most a given force. It gets the velocity at which the damper balances the
+    spring, and the force that spring and damper have now. So it acts as that spring and damper, and cannot overshoot.
+    An explicit torque on fingers this light would need steps of microseconds.
     """
     import pybullet
 
@@ -196,7 +196,7 @@ def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
 
 
 def _breach(run: _Run) -> str:
-    """Bring the worst travel and turn up to date; name the limit that is broken, if any."""
+    """Update the worst travel and turn. Return the broken limit, if any."""
     import pybullet
 
     position, quaternion = pybullet.getBasePositionAndOrientation(run.body, physicsClientId=run.client)

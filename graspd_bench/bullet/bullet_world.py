@@ -1,12 +1,11 @@
-"""A hand as PyBullet takes it: a URDF of its links, joints and collision solids, written out and loaded.
+"""Hand and object in PyBullet, the second simulator, and the displacement trial.
 
-Written from the hand's model instead of loading the hand's own file, so that both simulators see the same solids,
-the same masses and the same joint frames.
+The hand is a URDF of its links, joints and collision solids. It is written from the hand's model and not loaded from
+the hand's own file, so that both simulators use the same solids, masses and joint frames. The object is made of convex
+parts.
 
-The second simulator: an object of convex parts and a hand of primitives in PyBullet; and the displacement trial.
-
-A world here is plain data. Every trial builds its own simulation from it and throws that away, because Bullet keeps
-contacts and solver state from one trial to the next, which would make a figure depend on what ran before.
+A world here is plain data. Every trial builds its own simulation from it and discards that. Bullet keeps contacts and
+solver state from one trial to the next, and a figure would depend on what ran before.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ _LEAST_MASS, _LEAST_LINK_MOMENT = 1e-3, 1e-7
 
 
 def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, tuple[int, ...]]:
-    """Put a hand with its base fixed into a simulation; returns its body and the number of each actuated joint.
+    """Put a hand with its base fixed into a simulation. Return its body and the number of each actuated joint.
 
     Args:
         client: PyBullet's client.
         hand: without coupled joints.
-        armature: rotor inertia of every joint [kg·m²]; Bullet has none, so that the moved link carries it.
+        armature: rotor inertia of every joint [kg·m²]. Bullet has none, so the moved link carries it.
 
     Raises:
         SimulatorError: the hand has coupled joints.
@@ -82,7 +81,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
 
 
 def hand_urdf(hand: HandModel, armature: float) -> str:
-    """The URDF text; links and joints are numbered, hulls are files named hull<number of the primitive>.obj."""
+    """Return the URDF text. Links and joints are numbered. Hulls are files named hull<number of the primitive>.obj."""
     robot = ET.Element("robot", name=hand.name)
     for link in range(hand.num_links):
         element = ET.SubElement(robot, "link", name=f"link{link}")
@@ -131,13 +130,13 @@ def _add_joint(robot: ET.Element, hand: HandModel, link: int) -> None:
     ET.SubElement(element, "origin", xyz=_text(hand.link_offset_translation[link]), rpy=_text(rpy))
     if joint >= 0:
         ET.SubElement(element, "axis", xyz=_text(hand.joint_axis[link]))
-        # Efforts are the trial's affair; Bullet refuses an infinite one.
+        # Efforts are the trial's affair. Bullet refuses an infinite one.
         limits = {"lower": hand.lower[joint], "upper": hand.upper[joint], "effort": 1e3, "velocity": 1e3}
         ET.SubElement(element, "limit", {key: repr(float(value)) for key, value in limits.items()})
 
 
 def roll_pitch_yaw(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """URDF's angles [rad] of a rotation: R = Rz(yaw) Ry(pitch) Rx(roll); where pitch is ±90°, roll is zero."""
+    """Return URDF's angles [rad] of a rotation R = Rz(yaw) Ry(pitch) Rx(roll). Where pitch is ±90°, roll is zero."""
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
         return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
@@ -163,7 +162,7 @@ OBMAN = np.array([[0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class BulletWorld:
-    """One hand and one object, ready for trials in PyBullet; plain data, so that processes can share it.
+    """One hand and one object, ready for trials in PyBullet. It is plain data, so that processes can share it.
 
     Attributes:
         hand: the hand.
@@ -183,7 +182,7 @@ class BulletWorld:
 
 
 def bullet_available() -> bool:
-    """Whether PyBullet is installed; it has no wheel for Python 3.12."""
+    """Return whether PyBullet is installed, which has no wheel for Python 3.12."""
     return importlib.util.find_spec("pybullet") is not None
 
 
@@ -221,7 +220,7 @@ def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
 
 @contextmanager
 def simulation(*, timestep: float, solver_iterations: int) -> Iterator[int]:
-    """An empty simulation without gravity; yields the number of its PyBullet client.
+    """Open an empty simulation without gravity and yield the number of its PyBullet client.
 
     Args:
         timestep: [s].
@@ -244,10 +243,10 @@ def simulation(*, timestep: float, solver_iterations: int) -> Iterator[int]:
 
 
 def add_object(client: int, world: BulletWorld, mass: float) -> int:
-    """Put the object of a given mass [kg] where its frame is the simulation's; returns its body.
+    """Put the object with a given mass [kg] where its frame is the simulation's. Return its body.
 
-    Bullet's origin of a body is its centre of mass. What is not said here is left as PyBullet has it: a margin of 1 mm
-    about convex parts, damping of 4 % a second.
+    Bullet's origin of a body is its centre of mass. Other values are PyBullet's defaults: a margin of 1 mm about convex
+    parts, and damping of 4 % a second.
     """
     import pybullet
 
@@ -269,7 +268,7 @@ def add_object(client: int, world: BulletWorld, mass: float) -> int:
 
 
 def add_frozen_hand(client: int, hand: HandModel, posture: Posture) -> tuple[int, ...]:
-    """Every collision primitive of a hand as a fixed body, where a posture puts it; returns the bodies."""
+    """Add every collision primitive of a hand as a fixed body, where a posture puts it. Return the bodies."""
     import pybullet
 
     kinematics = make_kinematics(hand, "cpu", torch.float64)
@@ -308,7 +307,7 @@ def _collision_shape(client: int, primitive: Primitive) -> int:
 
 
 def wavefront(parts: Sequence[TriangleMesh]) -> str:
-    """Meshes as the text of one OBJ file, an object each: PyBullet makes a convex hull of every one."""
+    """Return meshes as the text of one OBJ file, an object each. PyBullet makes a convex hull of every one."""
     lines, first = [], 1
     for index, part in enumerate(parts):
         lines.append(f"o part{index}")
@@ -319,7 +318,7 @@ def wavefront(parts: Sequence[TriangleMesh]) -> str:
 
 
 def xyzw(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
-    """A rotation as PyBullet's quaternion."""
+    """Return a rotation as PyBullet's quaternion."""
     w, x, y, z = quaternion_from_rotation(torch.as_tensor(np.ascontiguousarray(rotation))).tolist()
     return [x, y, z, w]
 
@@ -327,12 +326,12 @@ def xyzw(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
 def bullet_displacement(
     world: BulletWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
 ) -> float:
-    """Displacement of the object's centre of mass [m] after 35 steps of 1/240 s, mean over gravity's directions.
+    """Return the displacement [m] of the object's centre of mass after 35 steps of 1/240 s, mean over gravity's
+    directions.
 
-    ObMan's protocol (Hasson et al., CVPR 2019), the figure that the papers report, re-implemented from its parameters:
-    gravity moves an object off a hand that is frozen in its grasp. Where this deviates: docs/metrics.md.
-
-    An object in free fall moves 10.7 cm, so that a figure near it says only that the hand does not hold.
+    This is ObMan's protocol (Hasson et al., CVPR 2019), the figure that the papers report, implemented from its
+    parameters. Gravity moves an object off a hand that is frozen in its grasp. docs/metrics.md tells where this
+    deviates. An object in free fall moves 10.7 cm, so a figure near it says only that the hand does not hold.
     """
     return float(displacements(world, posture, directions).mean())
 
@@ -340,7 +339,7 @@ def bullet_displacement(
 def displacements(
     world: BulletWorld, posture: Posture, directions: Float[np.ndarray, "directions 3"]
 ) -> Float[np.ndarray, "directions"]:
-    """Displacement [m] under gravity along each of some unit directions of the object's frame."""
+    """Return the displacement [m] under gravity along each of some unit directions of the object's frame."""
     import pybullet
 
     moved = np.empty(len(directions))

@@ -1,1 +1,1 @@
-"""Pictures, depth images, and scenes whose truth is known."""
+"""Pictures, depth images, and scenes with known truth."""

@@ -1,9 +1,10 @@
-"""What a depth camera adds to the truth: noise that grows with the square of depth, flying pixels, holes, steps.
+"""Faults of a depth camera: noise that grows with the square of depth, flying pixels, holes, steps.
 
-Depth from disparity has a random error of z² / (f B) times that of the disparity (Khoshelham and Elberink 2012; Intel's
-tuning guide for the D400 series gives 0.08 pixels for a D415). With f = 616 pixels and a baseline of B = 55 mm that is
-0.0024 z², and it is the table of real D415 frames that DEFAULT was compared with: 0.9 mm at 0.5 m, 1.3 mm at 0.7 m,
-correlated by 0.96 between neighbouring pixels and by 0.6 at a distance of eight, because a matching window spans many.
+Depth from disparity has a random error of z² / (f B) times that of the disparity (Khoshelham and Elberink 2012).
+Intel's tuning guide for the D400 series gives 0.08 pixels for a D415. With f = 616 pixels and a baseline of B = 55 mm
+that is 0.0024 z². It agrees with the table of real D415 frames that DEFAULT was compared with: 0.9 mm at 0.5 m, 1.3 mm
+at 0.7 m. There the errors correlate by 0.96 between neighbouring pixels and by 0.6 at a distance of eight, because a
+matching window spans many.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _SLOW = 0.15
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """A depth camera's faults. All zero: none.
+    """A depth camera's faults, none where all are zero.
 
     Attributes:
         floor: standard deviation of depth at no distance [m].
@@ -39,7 +40,7 @@ class DepthNoise:
         edge_loss: share of the pixels at an edge without depth.
         loss: share of all pixels without depth, in patches.
         grazing: surfaces seen at a smaller angle to the line of sight lose pixels, all of them at none [rad].
-        baseline: distance between the eyes of a stereo camera [m]; what one of them does not see has no depth.
+        baseline: distance between the eyes of a stereo camera [m]. What one of them does not see has no depth.
         step: depth is rounded to multiples of this [m].
         disparity_step: disparity, focal length times baseline over depth, is rounded to multiples of this [pixels].
         bias: standard deviation at 1 m of an error that is smooth over the image and grows with depth squared [m].
@@ -140,9 +141,9 @@ CAMERAS = {
 
 
 def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int) -> Depth:
-    """The image that a camera with such faults would give of the true `depth` [m]; 0 where it has none.
+    """Return the image that a camera with such faults gives of the true `depth` [m], 0 where it has none.
 
-    Flying pixels appear before the error of depth is added; holes come last. The same seed gives the same image.
+    Flying pixels appear before the error of depth is added. Holes come last. The same seed gives the same image.
     """
     rng = np.random.default_rng(seed)
     true = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
@@ -178,7 +179,7 @@ def _around(depth: Depth) -> tuple[Depth, Depth, Bool[np.ndarray, "height width"
 
 
 def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
-    """Each pixel takes the depth of one nearby: outlines become ragged (lateral noise)."""
+    """Give each pixel the depth of one nearby, so that outlines become ragged (lateral noise)."""
     if not pixels:
         return depth
     height, width = depth.shape
@@ -188,9 +189,9 @@ def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
 
 
 def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.ndarray, "height width"]:
-    """Pixels that a second eye, `baseline` to the right, does not see: something nearer lies in its way.
+    """Return pixels that a second eye, `baseline` to the right, does not see, because something nearer is in its way.
 
-    In that eye's image a point appears f B / z pixels further left; a pixel is hidden if one to its right in the row
+    In that eye's image a point appears f B / z pixels further left. A pixel is hidden if one to its right in the row
     appears no further right than it does.
     """
     if not baseline:
@@ -204,7 +205,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
 
 
 def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray, rng: np.random.Generator):
-    """Pixels lost because their surface is seen too flatly; at an edge there is no surface to speak of."""
+    """Return pixels lost because their surface is seen at a small angle. At an edge there is no surface to judge."""
     if not limit:
         return np.zeros(depth.shape, dtype=bool)
     rays = np.nan_to_num(camera_rays(camera))
@@ -217,7 +218,7 @@ def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray
 
 
 def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Generator) -> Depth:
-    """Normal numbers of unit variance, of which all but a share `white` of the variance is smooth."""
+    """Return normal numbers of unit variance, of which all but a share `white` of the variance is smooth."""
     from scipy.ndimage import gaussian_filter
 
     smooth = gaussian_filter(rng.standard_normal(shape), blur, mode="wrap") / _blurred_scale(shape, blur)
@@ -226,7 +227,7 @@ def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Gen
 
 @lru_cache(maxsize=16)
 def _blurred_scale(shape: tuple[int, ...], blur: float) -> float:
-    """Standard deviation of blurred white noise; wrapped around, so that it is the same everywhere."""
+    """Return the standard deviation of blurred white noise, wrapped around so that it is the same everywhere."""
     from scipy.ndimage import gaussian_filter
 
     impulse = np.zeros(shape)

@@ -1,8 +1,8 @@
-"""Irregular household things, drawn at random: families of shapes that no rule of completion describes.
+"""Irregular household things, drawn at random from families of shapes that no rule of completion describes.
 
-A thing is the zero level of a signed distance on a grid, so that it is one watertight body: round cones, ellipsoids,
-boxes and bodies of revolution, blended where they meet. Its mass is drawn from the densities that such things have,
-full or hollow. The same family and seed give the same thing.
+A thing is the zero level of a signed distance on a grid, so that it is one watertight body. It is made of round cones,
+ellipsoids, boxes and bodies of revolution, blended where they meet. Its mass is drawn from the densities of such
+things, full or hollow. The same family and seed give the same thing.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def draw_thing(family: str, seed: int) -> Thing:
 
 
 def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """The zero level of a field inside the box of half edges `half` [m] about the origin."""
+    """Return the zero level of a field inside the box of half edges `half` [m] about the origin."""
     import igl
 
     half = half + 0.004
@@ -74,7 +74,7 @@ def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:
 
 
 def _cone(*stations: tuple[float, float, float, float]) -> Field:
-    """Round cones along a polyline of (x, y, z, radius)."""
+    """Return round cones along a polyline of (x, y, z, radius)."""
     nodes = np.array(stations)
 
     def field(points: Points) -> Distance:
@@ -98,7 +98,7 @@ def _box(centre: tuple[float, float, float], half: tuple[float, float, float], r
 
 
 def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
-    """A body of (height, radius), rounded at its ends. `flat` shrinks its depth, y."""
+    """Return a body of (height, radius), rounded at its ends. `flat` shrinks its depth, y."""
     heights, radii = np.array(profile).T
 
     def field(points: Points) -> Distance:
@@ -112,7 +112,7 @@ def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
 
 
 def _blend(*fields: Field, width: float = 0.004) -> Field:
-    """The union of bodies, with fillets about so wide [m]."""
+    """Return the union of bodies, with fillets about so wide [m]."""
 
     def field(points: Points) -> Distance:
         joined = fields[0](points)

@@ -1,8 +1,6 @@
-"""Rays against meshes: depth images as a camera sees them, and shaded pictures, without any display.
+"""Depth images and shaded pictures of meshes by ray casting, without a display, and pictures of a hand.
 
 Camera frames follow the optical convention: z forward, x right, y down.
-
-A picture of a hand by ray casting: open and closed, from the side and onto the palm, with what was found of it.
 """
 
 from __future__ import annotations
@@ -29,15 +27,15 @@ AMBIENT = 0.25
 
 
 def camera_of_view(width: int, height: int, field_of_view: float = 0.7) -> PinholeCamera:
-    """A centred camera of that vertical field of view [rad]."""
+    """Return a centred camera of that vertical field of view [rad]."""
     focal = 0.5 * height / float(np.tan(0.5 * field_of_view))
     return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
-    """`T_world_camera` of a camera at `eye` that looks at `target` with `up` upwards in its image [m].
+    """Return `T_world_camera` of a camera at `eye` that looks at `target` with `up` upwards in its image [m].
 
-    Looking along `up`, any roll will do and one is chosen.
+    When it looks along `up`, the roll is arbitrary.
     """
     forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     forward /= np.linalg.norm(forward)
@@ -54,7 +52,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[
 def render_depth(
     mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "height width"]:
-    """Distance along the optical axis [m], 0 where the ray meets nothing."""
+    """Return the distance along the optical axis [m], 0 where the ray meets nothing."""
     distance, _, _ = _cast(mesh, camera, T_world_camera)
     return np.where(np.isfinite(distance), distance, 0.0)
 
@@ -62,7 +60,7 @@ def render_depth(
 def render_scene(
     meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
-    """Distance along the optical axis [m], 0 where the ray meets nothing, and which mesh it meets, -1 for none."""
+    """Return the distance along the optical axis [m], 0 without a hit, and which mesh each ray meets, -1 for none."""
     distance, face, _ = _cast(joined(*meshes), camera, T_world_camera)
     hit = np.isfinite(distance)
     label = np.full(distance.shape, -1)
@@ -77,7 +75,7 @@ def render_shaded(
     width: int = 640,
     height: int = 480,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
+    """Return a picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
     together = joined(*(mesh for mesh, _ in meshes))
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
     distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
@@ -105,7 +103,7 @@ def save_png(image: UInt8[np.ndarray, "height width 3"], path: str | Path) -> No
 
 
 def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
-    """Depth (infinite where nothing is hit), face index and unit face normal of each pixel."""
+    """Return the depth (infinite where nothing is hit), face index and unit face normal of each pixel."""
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
     rays = camera_rays(camera)
     # Pixels beyond the lens's range look nowhere.
@@ -123,9 +121,9 @@ _DOT, _ARROW, _SHAFT = 0.006, 0.35, 0.012
 
 
 def hand_picture(hand: HandModel) -> UInt8[np.ndarray, "height width 3"]:
-    """Four views: above from the side, below onto the palm; left open, right closed.
+    """Return four views of a hand: above from the side, below onto the palm, left open, right closed.
 
-    Contact candidates are red dots; a green arrow stands on the palm's centre along its normal.
+    Contact candidates are red dots. A green arrow stands on the palm's centre along its normal.
     """
     reach = hand_mesh(hand, hand.open_posture).vertices
     middle, size = 0.5 * (reach.min(0) + reach.max(0)), float(np.ptp(reach, axis=0).max())

@@ -36,12 +36,12 @@ _UPRIGHT = 0.999
 
 @dataclass(frozen=True)
 class TabletopScene:
-    """What stands on a table, all in the world frame.
+    """The things on a table, all in the world frame.
 
     Attributes:
         truth: the object to grasp [m].
         T_world_object: pose of the shape's own frame.
-        obstacles: what stands beside it [m].
+        obstacles: meshes beside it [m].
         table: its surface [m].
         support: its top as a half-space.
     """
@@ -54,7 +54,7 @@ class TabletopScene:
 
     @property
     def meshes(self) -> tuple[TriangleMesh, ...]:
-        """In the order of the labels of `depth_views`: the object 0, its neighbours 1 and on, the table last."""
+        """Return meshes in the order of the labels of `depth_views`: the object, its neighbours, the table."""
         return (self.truth, *self.obstacles, self.table)
 
 
@@ -64,12 +64,12 @@ def tabletop(
     yaw: float = 0.0,
     obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = (),
 ) -> TabletopScene:
-    """A shape by name, or a mesh, on the table.
+    """Put a shape by name, or a mesh, on the table.
 
     Args:
-        shape: named ones stand as authored if they would, else lie; a mesh lies where it is lowest.
+        shape: named ones stand as authored if they would, else lie. A mesh lies where it is lowest.
         yaw: turn about the vertical [rad].
-        obstacles: shape, x and y [m] of what stands beside it.
+        obstacles: shape, x and y [m] of each neighbour.
 
     Raises:
         MeshError: an unknown shape.
@@ -83,12 +83,12 @@ def tabletop(
 
 
 def on_table(target: TriangleMesh, others: Sequence[TriangleMesh] = ()) -> TabletopScene:
-    """Things that lie where they are, on the table."""
+    """Return a scene of things that lie where they are, on the table."""
     return TabletopScene(target, np.eye(4), tuple(others), _table(), Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
 def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
-    """The pose on z = 0 in which the mesh's centre of mass is lowest; it is always one of stable rest.
+    """Return the pose on z = 0 in which the mesh's centre of mass is lowest, which is always one of stable rest.
 
     The facet of the convex hull nearest to the centre of mass has the foot of the perpendicular inside it.
     """
@@ -104,7 +104,7 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
 
 
 def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
-    """A pose on z = 0 in which the mesh rests, with a random turn about the vertical.
+    """Return a pose on z = 0 in which the mesh rests, with a random turn about the vertical.
 
     Half of those that can stand as they are do so. The others come to rest as they fall, from any direction.
     """
@@ -130,7 +130,7 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
 
 
 def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random.Generator) -> tuple[TriangleMesh, ...]:
-    """Things at rest beside a target, each in a direction of its own, 2 to 5 cm away from all before it."""
+    """Return things at rest beside a target, each in a direction of its own, 2 to 5 cm away from all before it."""
     from scipy.spatial import KDTree
 
     placed, begun = [target], rng.uniform(0, 2 * np.pi)
@@ -153,7 +153,7 @@ def ring_poses(
     azimuth: float = 0.0,
     target: tuple[float, float, float] = (0.0, 0.0, 0.04),
 ) -> tuple[Float[np.ndarray, "4 4"], ...]:
-    """`T_world_camera` of cameras spaced evenly on a horizontal ring, all looking at `target`.
+    """Return `T_world_camera` of cameras spaced evenly on a horizontal ring, all looking at `target`.
 
     Args:
         elevation: of the cameras above the horizon, seen from the target [rad].
@@ -173,7 +173,7 @@ def depth_views(
     noise: DepthNoise = NONE,
     seed: int = 0,
 ) -> tuple[tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]], ...]:
-    """The depth image [m] of each pose, and which of `scene.meshes` each pixel truly shows, -1 for none."""
+    """Return the depth image [m] of each pose, and which of `scene.meshes` each pixel truly shows, -1 for none."""
     images = []
     for index, pose in enumerate(poses):
         depth, label = render_scene(scene.meshes, camera, pose)
@@ -188,13 +188,13 @@ def views_of(
     noise: DepthNoise = NONE,
     seed: int = 0,
 ) -> tuple[PointCloud, ...]:
-    """What the camera sees from each pose, table and all, in the world frame."""
+    """Return what the camera sees from each pose, table and all, in the world frame."""
     images = depth_views(scene, camera, poses, noise, seed)
     return tuple(cloud_from_depth(depth, camera, pose) for (depth, _), pose in zip(images, poses, strict=True))
 
 
 def moved(mesh: TriangleMesh, transform: Float[np.ndarray, "4 4"]) -> TriangleMesh:
-    """The mesh under a rigid motion."""
+    """Return the mesh after a rigid motion."""
     return TriangleMesh(mesh.vertices @ transform[:3, :3].T + transform[:3, 3], mesh.faces)
 
 

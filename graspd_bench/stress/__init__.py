@@ -1,1 +1,1 @@
-"""Objects and clouds broken on purpose."""
+"""Objects and clouds with deliberate faults."""

@@ -1,6 +1,6 @@
-"""Meshes broken on purpose: what scanners, CAD exports and hands at a keyboard make of a mug or a box.
+"""Meshes with the faults of scanners, CAD exports and hand edits, and sound objects at extremes.
 
-Extremes of physics, of numbers, and of what a hand can do, on sound objects.
+The extremes are those of physics, of numbers, and of what a hand can do.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ Maker = Callable[[], TriangleMesh]
 
 
 def mesh_cases() -> tuple[Case, ...]:
-    """Every broken mesh, through a file and `load_scene`."""
+    """Return every faulty mesh, which goes through a file and `load_scene`."""
     return (*_whole(), *_broken())
 
 
 def _whole() -> Iterator[Case]:
-    """What is still a solid."""
+    """Return cases of meshes that are still solids."""
     whole = (
         ("open-box", "a box without its lid", lambda: _kept("box", lambda corners: corners[..., 2].mean(1) < 0.044)),
         (
@@ -94,7 +94,7 @@ def _whole() -> Iterator[Case]:
 
 
 def _broken() -> Iterator[Case]:
-    """What is none, or of an absurd size."""
+    """Return cases of meshes that are no solids, or of an absurd size."""
     broken = (
         (
             "nan-vertices",
@@ -129,7 +129,7 @@ def _case(name: str, about: str, make: Maker, expect: tuple[str, ...] = (GRASP,)
 
 
 def write_obj(mesh: TriangleMesh, path: Path) -> None:
-    """As it is, NaN and all; `save_mesh` would refuse or repair some of these."""
+    """Write a mesh as it is, even with NaN, where `save_mesh` would refuse or repair it."""
     # One format for all rows: `np.savetxt` takes four seconds for a million.
     vertices = "v %.9g %.9g %.9g\n" * len(mesh.vertices) % tuple(mesh.vertices.ravel().tolist())
     faces = "f %d %d %d\n" * len(mesh.faces) % tuple((mesh.faces + 1).ravel().tolist())
@@ -137,7 +137,7 @@ def write_obj(mesh: TriangleMesh, path: Path) -> None:
 
 
 def box(size: Sequence[float] | np.ndarray, middle: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> TriangleMesh:
-    """A box with edges of so many metres, as finely cut as the authored one."""
+    """Return a box with edges of so many metres, as finely cut as the authored one."""
     unit = make_shape("box").vertices
     return _edited("box", lambda points: points / np.abs(unit).max(0) / 2 * np.asarray(size) + np.asarray(middle))
 
@@ -184,7 +184,7 @@ def _folded() -> TriangleMesh:
 
 
 def _slivers() -> TriangleMesh:
-    """Each face of a box becomes a fan of a hundred triangles along its longest side."""
+    """Return a box whose faces are each a fan of a hundred triangles along its longest side."""
     mesh = make_shape("box")
     pieces = []
     for a, b, c in mesh.vertices[mesh.faces]:
@@ -211,7 +211,7 @@ def _fine_mesh(mesh: TriangleMesh, times: int) -> TriangleMesh:
 
 
 def thin_cup(wall: float) -> TriangleMesh:
-    """A cup 80 mm high and 66 mm wide, open at the top, with a wall and a bottom of `wall` [m]."""
+    """Return a cup 80 mm high and 66 mm wide, open at the top, with a wall and a bottom of `wall` [m]."""
     import trimesh
 
     radius, half = 0.033, 0.04
@@ -235,12 +235,12 @@ _NONE = _MAYBE[1:]
 
 
 def extreme_cases() -> tuple[Case, ...]:
-    """All of them."""
+    """Return all cases of physics, numbers and hands."""
     return (*physics_cases(), *number_cases(), *hand_cases())
 
 
 def physics_cases() -> Iterator[Case]:
-    """Friction and mass over their decades, and objects that look alike from many sides."""
+    """Return cases of friction and mass over their decades, and of objects that look alike from many sides."""
     for mu in (0.1, 0.2, 0.3, 0.6, 1.0, 1.5):
         about, expect = f"a box at a friction of {mu:g}", (GRASP,) if mu >= 0.3 else _MAYBE
         yield Case(f"friction-{mu:g}", "physics", about, _shape("box", friction=mu), expect)
@@ -252,7 +252,7 @@ def physics_cases() -> Iterator[Case]:
 
 
 def number_cases() -> tuple[Case, ...]:
-    """Values that are not numbers where the optimiser looks, grids too coarse or too fine, and no time."""
+    """Return cases of values that are not numbers where the optimiser looks, unsuitable grids, and no time."""
     family, box = "numbers", _shape("box")
     coarse, fine = ({"preset": PlanConfig(resolution=nodes)} for nodes in (8, 128))
     return (
@@ -268,7 +268,7 @@ def number_cases() -> tuple[Case, ...]:
 
 
 def hand_cases() -> tuple[Case, ...]:
-    """Objects beyond the hand."""
+    """Return cases of objects beyond the hand."""
     wide, small, heavy = _shape("sphere", scale=10.0), _shape("sphere", scale=0.1), _shape("box", mass=30.0)
     return (
         Case("too-wide", "hand", "a ball of 70 cm across", wide, _NONE, whole=False),
@@ -282,7 +282,7 @@ def _shape(name: str, **settings: Any) -> Callable[[Path], Scene]:
 
 
 def _poisoned(channel: int, value: float) -> Callable[[Path], Scene]:
-    """A node on the surface, where fingers are sure to look."""
+    """Return a loader of a scene with a bad value at a node on the surface, where fingers are sure to look."""
 
     def scene(folder: Path) -> Scene:
         clean = load_scene("shape:cylinder")

@@ -1,7 +1,7 @@
-"""What a stress case is; what one ended in, how long that took, how much memory, what the user saw.
+"""Stress cases and how they end: the outcome, how long it took, how much memory, what the user saw.
 
-A grasp counts as verified only if it holds in a second trial too: from the file that a user would keep, with the
-object loaded anew and a world built anew.
+A grasp counts as verified only if it holds in a second trial too. That one starts from the file that a user would keep,
+with the object loaded anew and a world built anew.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graspd_dataset.run_records import peak_mb
 
 Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
 
-# An ending that is a verified grasp; the others are names of `Outcome` or of a `GraspdError`.
+# An ending that is a verified grasp. The others are names of `Outcome` or of a `GraspdError`.
 GRASP = "grasp"
 # What a deadline may be overrun by [s].
 GRACE = 0.5
@@ -30,15 +30,15 @@ GRACE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One thing that breaks methods.
+    """One input that breaks methods.
 
     Attributes:
         name: unique, words joined by dashes.
         family: what of it is broken.
         about: what is wrong, one line.
-        scene: makes the input in a folder of its own and loads it as a user would; may raise a GraspdError.
+        scene: makes the input in a folder of its own and loads it as a user would. It may raise a GraspdError.
         expect: the endings that are right: "grasp", names of `Outcome` ("TOO_FEW") or of an error ("MeshError").
-        whole: a meaningful solid, or an object that can be seen: counted in the share that ends in a verified grasp.
+        whole: a meaningful solid, or an object that can be seen. Counted in the share that ends in a verified grasp.
         hand: by name or path.
         deadline: seconds that planning is given.
         loading: seconds that loading may take.
@@ -65,11 +65,11 @@ class Case:
 
 @dataclass(frozen=True)
 class StressEnding:
-    """What came of a case.
+    """The end of a case.
 
     Attributes:
         case: its name.
-        ending: "grasp", the name of an `Outcome` or of a GraspdError; "crash" or "hang" where it was none of these.
+        ending: "grasp", the name of an `Outcome` or of a GraspdError, or "crash" or "hang" where it was none of these.
         message: what the user saw.
         loading, planning: seconds.
         memory: peak of the process [MB].
@@ -77,7 +77,7 @@ class StressEnding:
         verified: how many of them held.
         again: how many of those held in the second trial.
         finite: no number of the result is NaN or infinite.
-        true: how many verified grasps hold on the true object; None where the case knows no truth.
+        true: how many verified grasps hold on the true object. None where the case knows no truth.
     """
 
     case: str
@@ -94,7 +94,7 @@ class StressEnding:
 
 
 def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
-    """What is wrong with an ending, one line each; none where all is well."""
+    """Return what is wrong with an ending, one line each, none where all is well."""
     wrong = []
     if ending.ending not in case.expect:
         wrong.append(f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}")
@@ -155,7 +155,7 @@ def _told(result: GraspResult, folder: str) -> str:
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
-    """How many verified grasps hold again: read back from a file, on the object loaded and cut into parts anew."""
+    """Return how many verified grasps hold again, read from a file, on the object loaded and cut into parts anew."""
     from graspd_core.io.grasps_json import grasps_of, load_document, save_result
     from graspd_core.optimize.plan_config import load_preset
     from graspd_core.runtime import disk_cache as cache
@@ -176,7 +176,7 @@ def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: Trian
 
 
 def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
-    """How many grasps pass the hold trial on an object, in a world of its own."""
+    """Return how many grasps pass the hold trial on an object, in a world of its own."""
     from graspd_core.verify.hold_trial import hold_trial, out_of_place
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
@@ -188,7 +188,7 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
 
 
 def _finite(result: GraspResult) -> bool:
-    """Whether every number of every grasp that did not fail is finite; a trial that diverged may say so."""
+    """Return whether every number of every grasp that did not fail is finite. A trial that diverged may say so."""
     good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
     postures = [asdict(posture) for g in result.grasps for posture in (g.pregrasp, g.grasp, g.squeeze)]
     try:

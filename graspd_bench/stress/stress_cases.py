@@ -1,4 +1,4 @@
-"""Every stress case by its name, what the benchmark runs of them, and the endings as Markdown."""
+"""All stress cases by name, what the benchmark runs of them, and the endings as Markdown."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StressRun(study.Case):
 
 
 def stress_runs(request: Request) -> tuple[StressRun, ...]:
-    """Cases by their names or families, all of them for no name. Raises ConfigError: there is no such case."""
+    """Return cases by their names or families, all of them for no name. Raises ConfigError: there is no such case."""
     families = sorted({case.family for case in CASES.values()})
     names = request.cases or (_QUICK if request.quick else ())
     if unknown := [name for name in names if name not in CASES and name not in families]:
@@ -44,42 +44,42 @@ def stress_runs(request: Request) -> tuple[StressRun, ...]:
 
 
 def run_stress(run: StressRun) -> Record:
-    """What a case ends in."""
+    """Return the record of a case's ending."""
     return asdict(run_case(CASES[run.name], run.preset))
 
 
 def stress_patience(run: StressRun) -> float:
-    """Seconds until a case is called hung. It is loaded twice: for the second trial, too."""
+    """Return the seconds until a case counts as hung. It is loaded twice, because of the second trial."""
     case = CASES[run.name]
     return 2 * case.loading + case.deadline + _PATIENCE
 
 
 def ending_of(record: Record) -> StressEnding:
-    """The ending that a record tells of; where its process failed, a crash or a hang."""
+    """Return the ending that a record tells of, a crash or a hang where its process failed."""
     if record["error"]:
         return StressEnding(record["name"], "hang" if record["failed"] == "hung" else "crash", record["error"])
     return StressEnding(**{name: record[name] for name in StressEnding.__dataclass_fields__})
 
 
 def stress_faults(record: Record) -> tuple[str, ...]:
-    """What is wrong with the ending that a record tells of."""
+    """Return what is wrong with the ending that a record tells of."""
     return faults(CASES[record["name"]], ending_of(record))
 
 
 def stress_came(record: Record) -> str:
-    """The ending and its seconds."""
+    """Return the ending and its seconds."""
     ending = ending_of(record)
     return f"{ending.ending}, {ending.loading + ending.planning:.1f} s"
 
 
 def stress_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """What held and every fault; and the table."""
+    """Return what held and every fault, and the table."""
     endings = {CASES[record["name"]]: ending_of(record) for record in records}
     return {"stress-summary": [summary(endings)], "stress": [stress_table(endings)]}
 
 
 def stress_table(endings: Mapping[Case, StressEnding]) -> str:
-    """A table a family; faults in bold."""
+    """Return a table for each family, faults in bold."""
     blocks = []
     for family in dict.fromkeys(case.family for case in endings):
         body = [_line(case, ending) for case, ending in endings.items() if case.family == family]
@@ -88,7 +88,7 @@ def stress_table(endings: Mapping[Case, StressEnding]) -> str:
 
 
 def summary(endings: Mapping[Case, StressEnding]) -> str:
-    """What held of all that should, and every fault, a line each."""
+    """Return what held of all that should, and every fault, a line each."""
     wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
     lines = [f"{len(endings)} cases, {len(wrong)} faults."]
     for family in dict.fromkeys(case.family for case in endings):

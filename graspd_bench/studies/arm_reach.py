@@ -1,7 +1,7 @@
-"""What an arm costs and buys: inverse kinematics by itself, and requests with and without the filter by reach.
+"""Costs and benefits of an arm: inverse kinematics by itself, and requests with and without the filter by reach.
 
-Things stand or lie on a table; the arm's base stands 40 to 80 cm away in a random direction, turned at random. Without
-the filter the verified grasps that come back are asked afterwards whether the arm reaches them.
+Things stand or lie on a table. The arm's base stands 40 to 80 cm away in a random direction, turned at random. Without
+the filter, the returned verified grasps are checked afterwards for whether the arm reaches them.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from graspd_dataset.run_records import markdown_table
 SHAPES = ("box", "mug", "hammer", "bottle", "torus", "cylinder", "plate", "l_block", "sphere", "bowl")
 POSES = 1000
 NEAREST, FARTHEST = 0.4, 0.8
-# Poses at once; starts of each, one after another for those that are left, and steps of each start.
+# Poses at once. Starts of each, one after another for those that are left, and steps of each start.
 _BATCH, _STARTS, _STEPS = 256, 12, 16
-# Of the library: starts at once and steps; fewer of either find fewer poses.
+# Of the library: starts at once and steps. Fewer of either find fewer poses.
 _RETRIES, _ITERATIONS = 20, 50
 
 
@@ -60,12 +60,12 @@ class ArmCase(Case):
 
 @dataclass(frozen=True)
 class ReachCase(ObjectCase):
-    """A request for `count` grasps of a thing on a table, with an arm; the seed draws where both are."""
+    """A request for `count` grasps of a thing on a table, with an arm. The seed draws where both are."""
 
     arm: str = ""
 
     def place(self) -> tuple[HandModel, Scene, Reach]:
-        """The hand, the thing as it stands or lies, and the arm."""
+        """Return the hand, the thing as it stands or lies, and the arm."""
         rng = np.random.default_rng((self.seed, sum(self.object.encode())))
         hand, scene = self.load()
         side = axis_rotation(np.eye(3)[int(rng.integers(2))], float(rng.choice([0.0, np.pi / 2])))
@@ -83,7 +83,7 @@ class ReachCase(ObjectCase):
 
 
 def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
-    """Every arm alone, and every arm at every thing."""
+    """Return every arm alone, and every arm at every thing."""
     arms = [ArmCase(arm, 256 if request.quick else POSES) for arm in arm_names()]
     things = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
     seeds = request.seeds or ((0,) if request.objects else (0, 1))
@@ -97,12 +97,12 @@ def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
 
 
 def run_reach(case: ArmCase | ReachCase) -> Record:
-    """What the case asks for."""
+    """Run a case of either kind."""
     return measure_arm(load_arm(case.arm), case.poses) if isinstance(case, ArmCase) else _run_request(case)
 
 
 def _run_request(case: ReachCase) -> Record:
-    """The request with the filter, and without; both on libraries and caches in use."""
+    """Run the request with the filter and without, both with libraries and caches in use."""
     hand, scene, reach = case.place()
     request: dict[str, Any] = {"count": case.count, "seed": case.seed, "preset": case.config, "measure": False}
     plan_grasps(scene, hand, count=1, measure=False, restrictions=[reach])
@@ -130,7 +130,7 @@ def _run_request(case: ReachCase) -> Record:
 
 
 class _Found:
-    """Notes each verified grasp, the CPU seconds until it came, and those of them that the filter took."""
+    """A progress hook that notes each verified grasp, the CPU seconds until it came, and the filter's part of them."""
 
     def __init__(self, seconds: Sequence[float]) -> None:
         self.found: list[tuple[float, float, Grasp]] = []
@@ -143,7 +143,7 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Timed(BoundRestriction):
-    """A reach, and the CPU seconds of each call to it."""
+    """A reach that notes the CPU seconds of each call to it."""
 
     reach: Any
     seconds: list[float]
@@ -166,14 +166,14 @@ class _Timed(BoundRestriction):
 
 
 def came(record: Record) -> str:
-    """What came of a case, in a few words."""
+    """Return the results of a case, in a few words."""
     if "own" in record:
         return f"{record['own']['reached']:.1%} of the poses reached"
     return f"{record['filtered']['verified']} verified in reach, without the filter {record['plain']['reached']}"
 
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Both tables as Markdown."""
+    """Return both tables as Markdown."""
     alone, asked = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],
@@ -214,7 +214,7 @@ def _seconds(ones: Sequence[Record]) -> str:
 
 
 def _reasons(records: Sequence[Record]) -> str:
-    """How many candidates were refused, and the kinds of reason."""
+    """Return how many candidates were refused, and the kinds of reason."""
     kinds: dict[str, int] = {}
     for record in records:
         for reason, count in record["filtered"]["refused"].items():
@@ -229,7 +229,7 @@ _KINDS = ("limit on the way", "limit", "in the table", "in the object", "against
 
 
 def measure_arm(arm: Arm, poses: int) -> Record:
-    """graspd and, if installed, pytorch-kinematics on the same poses, made from joint values within the limits."""
+    """Measure graspd and, if installed, pytorch-kinematics on the same poses, made from joint values in the limits."""
     q = random_postures(arm, poses, torch.Generator().manual_seed(11))
     target = arm_links(arm, q)[:, arm.tip]
     start_table(arm)
@@ -241,7 +241,7 @@ def measure_arm(arm: Arm, poses: int) -> Record:
 
 
 def _measured(solver: Callable[[SE3], Bool[Tensor, "batch"]], target: SE3) -> Record:
-    """Share of poses that are reached, and CPU milliseconds of each."""
+    """Return the share of poses that are reached, and CPU milliseconds of each."""
     solver(target[:_BATCH])
     began, reached = time.process_time(), 0
     for first in range(0, len(target.translation), _BATCH):
@@ -261,7 +261,7 @@ def _own(arm: Arm, target: SE3) -> Bool[Tensor, "batch"]:
 
 
 def _library(arm: Arm) -> Callable[[SE3], Bool[Tensor, "batch"]]:
-    """The library's damped least squares within the arm's limits, to the same tolerances."""
+    """Return the library's damped least squares within the arm's limits, to the same tolerances."""
     import pytorch_kinematics
 
     # Its reader knows no capsules.

@@ -1,4 +1,5 @@
-"""Views that nothing was fitted to, of four kinds of cameras, things at rest anyhow, alone and crowded: `cameras`.
+"""Study `cameras`: views that nothing was fitted to, of four kinds of cameras and things at rest anyhow, alone or
+crowded.
 
 A thing is of a family of irregular things (`rendering/families.py`), an authored shape of a random size, or a scan.
 Every grasp that is verified on the view is tried on the true thing at 0.1 kg and at the thing's own mass. Shares of
@@ -39,7 +40,7 @@ from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.world import PROTOCOLS, altered, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Families and shapes that the shares of verified grasps were taken from, with seeds from 0 on; those here are others.
+# Families and shapes that the shares of verified grasps were taken from, with seeds from 0 on. Those here are others.
 CHOSEN_ON = ("pear", "pitcher", "pump", "tool", "plane", "sponge", "jar", "box", "cylinder", "mug", "l_block")
 FIRST_SEED, SEEDS = 100, 4
 SHAPES = ("sphere", "capsule", "bowl", "bottle")
@@ -72,7 +73,7 @@ class CameraView(Case):
 
     @property
     def kind(self) -> str:
-        """Irregular, regular or a scan."""
+        """Return irregular, regular or scan."""
         return "irregular" if self.thing in FAMILIES else "scan" if Path(self.thing).suffix else "regular"
 
     def shown(self) -> Record:
@@ -80,7 +81,7 @@ class CameraView(Case):
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
-    """Every thing from some places, cameras and crowds taking turns. Scans are those of --objects."""
+    """Return every thing from some places, with alternating cameras and crowds. Scans are those of --objects."""
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -97,7 +98,7 @@ def camera_cases(request: Request) -> tuple[CameraView, ...]:
 
 
 def thing_of(case: CameraView) -> tuple[TriangleMesh, float]:
-    """The thing in its own frame, and its mass [kg]."""
+    """Return the thing in its own frame, and its mass [kg]."""
     if case.kind == "irregular":
         drawn = draw_thing(case.thing, case.seed)
         return drawn.mesh, drawn.mass
@@ -112,7 +113,7 @@ def thing_of(case: CameraView) -> tuple[TriangleMesh, float]:
 
 
 def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target | None]:
-    """The scene and what the camera saw of it, the thing's mass [kg], and in a crowd which thing is meant."""
+    """Return the scene and its view, the thing's mass [kg], and in a crowd which thing is meant."""
     rng = np.random.default_rng([case.seed, sum(map(ord, thing_name(case.thing) + case.camera)), case.crowd])
     mesh, mass = thing_of(case)
     target = moved(mesh, resting_pose(mesh, rng))
@@ -135,7 +136,7 @@ def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target 
 
 
 def _share_seen(scene: TabletopScene, lens: PinholeCamera, pose: np.ndarray) -> float:
-    """How much of the thing the others leave to see."""
+    """Return the share of the thing that the others do not hide."""
     pixels = [(render_scene(some.meshes, lens, pose)[1] == 0).sum() for some in (scene, on_table(scene.truth))]
     return float(pixels[0] / max(pixels[1], 1))
 
@@ -178,7 +179,7 @@ def run_view(case: CameraView) -> Record:
 
 
 def camera_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """A row for each way, camera, sight and kind, and how far the stated probability is right."""
+    """Return a row for each way, camera, sight and kind, and how far the stated probability is right."""
     usual = [r for r in records if r["way"] == ASSUMED]
     rows = [(way, [r for r in records if r["way"] == way]) for way in (ASSUMED, GIVEN, OPEN3D)]
     for name, told in (("camera", str), ("crowd", lambda some: "crowded" if some else "alone"), ("kind", str)):
@@ -210,7 +211,7 @@ def _row(own: Sequence[Record]) -> list[str]:
 
 
 def _share(own: Sequence[Record], name: str) -> str:
-    """Of the verified grasps, with the 90 % interval that resampling the views gives: errors cluster by view."""
+    """Return how many of the verified grasps held, with a 90 % interval of resampled views (errors cluster there)."""
     pairs = np.array([(r[name], r["verified"]) for r in own])
     if not pairs[:, 1].sum():
         return "–"

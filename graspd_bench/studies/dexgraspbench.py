@@ -1,10 +1,10 @@
-"""Our grasps through DexGraspBench's own evaluation, beside what our hold trial says of them.
+"""Our grasps in DexGraspBench's own evaluation, beside the results of our hold trial.
 
     graspd bench dexgraspbench FOLDER --python ENVIRONMENT/bin/python
 
-FOLDER is a checkout of the user's with its submodule, the environment one with its requirements. Its code runs in a
-child process and is never imported. Our grasps and objects are written to a temporary folder, in its format; so is a
-copy of its Allegro where that is changed. What it writes is read by a reader that runs nothing (`inert_pickle`).
+FOLDER is a checkout of the user's with its submodule. The environment has its requirements. Its code runs in a child
+process and is never imported. Our grasps and objects are written to a temporary folder, in its format, with a copy of
+its Allegro where that is changed. Its results are read by a reader that runs nothing (`inert_pickle`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from graspd_dataset.run_records import markdown_table, thing_name
 NAME = "dexgraspbench"
 # Its object's mass [kg], and how far [m] and by how much [degrees] an object may move there.
 MASS, _TRAVEL, _TURN = 0.1, 0.05, 15.0
-# Files of a checkout that a result depends on; the first two are what is run.
+# Files of a checkout that a result depends on. The first two are what is run.
 _MAIN, _ALLEGRO = "src/main.py", "assets/hand/allegro/right_hand.xml"
 _HASHED = ("src/**/*.py", "config/**/*.yaml", _ALLEGRO)
 # Seconds until it is called hung: its start, and one of its grasps.
@@ -72,7 +72,7 @@ class BenchCase(ObjectCase):
         checkout: folder of DexGraspBench.
         python: program that runs it.
         armature: whether its Allegro is tried with our armature, too.
-        grasps: file of grasps that are taken; empty where they are planned.
+        grasps: file of grasps to use, empty where they are planned.
         content: hash of the checkout's code and of that file.
     """
 
@@ -87,12 +87,15 @@ class BenchCase(ObjectCase):
         return f"{thing_name(self.object)} {self.preset} {thing_name(self.hand)} seed {self.seed} {self.armature:d}"
 
     def asked(self) -> Record:
-        """Where files lie does not count, what they hold does."""
+        """Return what the case asks. The contents of files count, their places do not."""
         return {name: value for name, value in super().asked().items() if name not in ("checkout", "python", "grasps")}
 
 
 def bench_cases(request: Request) -> tuple[BenchCase, ...]:
-    """One an object and seed. Raises GraspdError: no checkout, it does not start, or the request names what is not."""
+    """Return a case for each object and seed.
+
+    Raises GraspdError: no checkout, one that does not start, or unknown names in the request.
+    """
     if not request.checkout:
         raise ConfigError(f"{NAME}: give the folder of a checkout: graspd bench {NAME} FOLDER --python PATH")
     checkout, hand = Path(request.checkout).absolute(), request.hand or "allegro_right"
@@ -126,7 +129,7 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
 
 
 def run_bench(case: BenchCase) -> Record:
-    """All grasps that were tried here, verified or failed, and what becomes of them there."""
+    """Return all grasps that were tried here, verified or failed, with their results there."""
     config = case.config
     hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
     if case.grasps:
@@ -179,10 +182,9 @@ def write_armature(xml: Path, to: Path, armature: float) -> Path:
 
 
 def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -> list[Record]:
-    """Run its evaluation on the grasps. Return of each whether it held, how far [m] and by how much [degrees] it moved.
+    """Run its evaluation. Return whether each grasp held, and how far [m] and by how much [degrees] it moved.
 
-    Raises:
-        ConfigError: it ended with an error, or gave no result for a grasp.
+    Raises ConfigError if it ended with an error, or gave no result for a grasp.
     """
     results = Path(tempfile.mkdtemp(dir=written.parent))
     options = {"task": "eval", "hand": "allegro", "setting": "fc", "exp_name": "graspd", "n_worker": "1"}
@@ -234,7 +236,7 @@ def _run(command: Sequence[str], folder: Path, patience: float) -> str:
 
 
 def why_failed(there: Record) -> str:
-    """Why a grasp did not hold there, in a few words."""
+    """Return why a grasp did not hold there, in a few words."""
     # So it says that a pregrasp was refused.
     if there["travel"] >= 100 and there["turn"] >= 100:
         return "refused: the pregrasp overlaps the object, or the hand itself, by more than 1 cm"
@@ -246,13 +248,13 @@ def why_failed(there: Record) -> str:
 
 
 def bench_came(record: Record) -> str:
-    """How many of the verified grasps hold there."""
+    """Return how many of the verified grasps hold there."""
     pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
     return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
 
 
 def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:
-    """Of every grasp whether it is verified here, and what became of it there."""
+    """Return for every grasp whether it is verified here, and its result there."""
     return [
         (own["verified"], there)
         for record in records
@@ -262,7 +264,7 @@ def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]
 
 
 def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """One table, a row for every object and Allegro and for all objects together, the reasons and the differences."""
+    """Return one table, the reasons and the differences. Rows are objects by Allegro, and all objects together."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
     groups = [(thing_name(record["object"]), [record]) for record in records]

@@ -1,8 +1,8 @@
-"""Do trials that stop early give the verdict of the full length, and what do they save?
+"""Study of whether trials that stop early give the verdict of the full length, and how much time they save.
 
-The first grasps of the method's own ranking, none filtered by a trial. Each is tried as it is and out of place, at
-standard and lower friction, hard, lifted, with the short pulls of the ranking by robustness, and under gravity; each
-trial twice, early and at full length.
+It uses the first grasps of the method's own ranking, none filtered by a trial. Each is tried as it is and out of place,
+at standard and lower friction, hard, lifted, with the short pulls of the ranking by robustness, and under gravity. Each
+trial runs twice, early and at full length.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class EarlyEnds(ObjectCase):
 
 
 def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
-    """Every hand on a few shapes and thin things."""
+    """Return every hand on a few shapes and thin things."""
     things = [(thing, ()) for thing in find_objects(request.objects or SHAPES)]
     hands = (request.hand,) if request.hand else hand_names()
     cases = tuple(
@@ -64,7 +64,7 @@ def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
 
 
 def run_early(case: EarlyEnds) -> Record:
-    """Both lengths of every trial of every grasp."""
+    """Run both lengths of every trial of every grasp."""
     hand, scene = case.load()
     grasps = raw_grasps(scene, hand, case.config, case.count, case.seed)
     errors = pose_errors((ERROR_SEED, case.seed), max(len(grasps), 1))
@@ -83,12 +83,12 @@ def run_early(case: EarlyEnds) -> Record:
 
 
 def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
-    """Trials by group."""
+    """Return the trials by group."""
     parts, center = object_parts(scene.object), scene.object.center_of_mass
     standard, hard = PROTOCOLS["standard"], PROTOCOLS["hard"]
     slippery, brief = at_friction(standard, 0.3), replace(standard, hold_time=RobustConfig().hold_time)
     usual, low, harder = (build_world(hand, scene.object, parts, p) for p in (standard, slippery, hard))
-    # Too far below for the hand; the object rests on a plane of its own.
+    # Too far below for the hand. The object rests on a plane of its own.
     table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()) - 1.0)
     around = build_world(hand, scene.object, parts, standard, table)
 
@@ -112,7 +112,7 @@ def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
 
 
 def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Disagreements and CPU time by group as Markdown."""
+    """Return disagreements and CPU time by group as Markdown."""
     groups: dict[str, list[Record]] = {}
     told = []
     for record in records:
@@ -139,7 +139,7 @@ def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:
 
 
 def _figures(rows: Sequence[Record]) -> list[str]:
-    """Cells of one group's row."""
+    """Return the cells of one group's row."""
     from scipy.stats import beta
 
     if "figure" in rows[0]["early"]:

@@ -1,4 +1,4 @@
-"""Frames of a real depth camera: segmentation against a reference cloud, reconstruction, verified grasps.
+"""Study of a real depth camera's frames: segmentation against a reference cloud, reconstruction, verified grasps.
 
     graspd bench frames --objects DIR ...
 
@@ -50,7 +50,7 @@ class Frame(Case):
 
 
 def frame_cases(request: Request) -> tuple[Frame, ...]:
-    """Every frame below the folders, in order of name. Raises ConfigError: there is none."""
+    """Return every frame below the folders, in order of name. Raises ConfigError: there is none."""
     found = sorted(path.parent for folder in request.objects for path in Path(folder).glob("*/depth_mm.png"))
     if not found:
         raise ConfigError("objects: no */depth_mm.png in the folders; valid: --objects DIR, as docs/clouds.md has it")
@@ -59,7 +59,7 @@ def frame_cases(request: Request) -> tuple[Frame, ...]:
 
 
 def run_frame(case: Frame) -> Record:
-    """The object nearest the view axis; where that is not the reference's, the one at the reference's centre."""
+    """Plan on the object nearest the view axis. If it is not the reference's, use that at the reference's centre."""
     cloud, reference = read_frame(Path(case.folder))
     hand = load_hand(case.hand)
     target, found = None, {}
@@ -90,19 +90,19 @@ def run_frame(case: Frame) -> Record:
 
 
 def read_frame(folder: Path) -> tuple[PointCloud, np.ndarray]:
-    """The cloud of a depth image in its camera's frame, and the reference cloud of its object [m]."""
+    """Return the cloud of a depth image in its camera's frame, and the reference cloud of its object [m]."""
     view = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
     return view, np.loadtxt(folder / "object_cloud.xyz")
 
 
 def overlap(found: np.ndarray, reference: np.ndarray) -> float:
-    """Intersection over union of the 5 mm cubes that two clouds touch."""
+    """Return the intersection over union of the 5 mm cubes that two clouds touch."""
     a, b = ({tuple(c) for c in np.floor(points / CUBE).astype(int)} for points in (found, reference))
     return len(a & b) / max(len(a | b), 1)
 
 
 def frame_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """A row a frame."""
+    """Return a row for each frame."""
     headings = ["frame", "object picked by", "points", "IoU with the reference", "closed", "verified grasps", "scene"]
     return {"frames": [markdown_table([*headings, "first verified grasp"], [_line(r) for r in records])]}
 

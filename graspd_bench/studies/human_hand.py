@@ -1,11 +1,11 @@
-"""Human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
+"""Study of human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
 
     graspd bench mano --hand MANO_RIGHT.pkl
 
-The model is the user's (https://mano.is.tue.mpg.de; never shipped). All grasps go through the hold trial, and the two
-best ranked of every object are measured, as the paper does, once with rigid flesh and once with flesh that gives by a
-millimetre. Area and volume are those of the skinned mesh, by the definitions of docs/metrics.md; the trials use the
-convex hulls that stand for it.
+The model is the user's (https://mano.is.tue.mpg.de, never shipped). All grasps go through the hold trial. As in the
+paper, the two best ranked of every object are measured, once with rigid flesh and once with flesh that gives by a
+millimetre. Area and volume are those of the skinned mesh, by the definitions of docs/metrics.md. The trials use its
+convex hulls.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
 
 
 def _shared_volume(query: DistanceQuery, skin: TriangleMesh) -> float:
-    """Volume inside both [m³]: 1 mm voxels over the box that the two share, counted by their middles."""
+    """Return the volume inside both [m³], from the middles of 1 mm voxels over the box that the two share."""
     low = np.maximum(query.tree.low, skin.vertices.min(0))
     high = np.minimum(query.tree.high, skin.vertices.max(0))
     if (high <= low).any():
@@ -124,7 +124,7 @@ class HumanGrasps(ObjectCase):
 
 
 def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
-    """One an object, seed and softness. Raises ConfigError: the hand is not a file."""
+    """Return a case for each object, seed and softness. Raises ConfigError: the hand is not a file."""
     model = Path(request.hand)
     if not model.is_file():
         raise ConfigError(f"hand: {request.hand or 'none given'}; valid: MANO_RIGHT.pkl or MANO_LEFT.pkl, as a path")
@@ -160,7 +160,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """The objects, their mean, and the paper's rows, as Markdown."""
+    """Return the objects, their mean, and the paper's rows, as Markdown."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]
@@ -173,7 +173,7 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _row(name: str, softness: float, records: Sequence[Record]) -> list[str]:
-    """Means over cases; without a grasp there is nothing to measure."""
+    """Return means over cases, empty where there are no grasps to measure."""
     name = f"{name}, {1e3 * softness:g} mm" if softness else f"{name}, rigid"
     held = f"{sum(r['held'] for r in records)}/{sum(r['count'] for r in records)}"
     if not any(r["contact_area_cm2"] for r in records):

@@ -1,9 +1,9 @@
-"""Somebody else's grasps beside ours: the same objects, hand, trials and metrics, in one table.
+"""Study of imported grasps beside ours: the same objects, hand, trials and metrics, in one table.
 
     graspd bench --import FOLDER --hand NAME
 
-What a file says of its grasps counts for nothing. A grasp that was refused has failed, as has one that ours did not
-find: shares are of all grasps of an object, or of the first `--count` of them.
+Claims of a file about its grasps are ignored. A refused grasp has failed, as has one that our planner did not find.
+Shares are of all grasps of an object, or of the first `--count` of them.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _FIGURES = {
 
 @dataclass(frozen=True)
 class ImportedCase(ObjectCase):
-    """The grasps of one object; `count` of them.
+    """`count` imported grasps of one object.
 
     Attributes:
         scale: factor on the object's coordinates.
-        files: that hold them.
-        mesh: given instead of what the files name; empty where none is.
+        files: files of the grasps.
+        mesh: used instead of the mesh that the files name, empty where none is given.
         order: of the joints in npy files.
         trials: their names.
         content: hash of the files.
@@ -67,7 +67,7 @@ class ImportedCase(ObjectCase):
         return f"{_name(self.object)} scale {self.scale:g} {thing_name(self.hand)} seed {self.seed}"
 
     def asked(self) -> Record:
-        """Where the files lie does not count, what they hold does."""
+        """Return what the case asks. The contents of files count, their places do not."""
         return {name: value for name, value in super().asked().items() if name not in ("files", "mesh")}
 
     def shown(self) -> Record:
@@ -75,7 +75,7 @@ class ImportedCase(ObjectCase):
 
 
 def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
-    """One an object and seed. Raises GraspdError: no folder or hand is given, or a file is malformed."""
+    """Return a case for each object and seed. Raises GraspdError: no folder or hand is given, or a malformed file."""
     if not request.imported or not request.hand:
         raise ConfigError("imported: give --import FOLDER, and --hand: whose grasps these are")
     if len(request.objects) > 1:
@@ -104,7 +104,7 @@ def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
 
 
 def run_imported(case: ImportedCase) -> Record:
-    """Theirs, the first of our own ranking, and verified ones: all tried and measured alike."""
+    """Try and measure imported grasps, the first of our own ranking, and verified ones, all alike."""
     config, hand = case.config, load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     scene = load_scene(case.object, mass=PROTOCOL_MASS, scale=case.scale, resolution=config.resolution)
     completed = complete_grasps(scene, hand, _theirs(case, hand), config)
@@ -127,7 +127,7 @@ def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:
 
 
 def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequence[str]) -> list[dict[str, Any]]:
-    """Figures of every grasp: metrics, and trials by name."""
+    """Return the figures of every grasp: metrics, and trials by name."""
     context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
     results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
     for name in trials if grasps else ():
@@ -138,7 +138,7 @@ def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequen
 
 
 def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """One table, a row for every object and source and for all objects together, as Markdown."""
+    """Return one table as Markdown, with a row for every object and source, and for all objects together."""
     trials = [name for name in TRIALS if any(name in record["trials"] for record in records)]
     metrics = [row for row in METRICS.values() if row.measure is not None]
     headings = ["object", "grasps of", "tried", *(_PASSED[name] for name in trials if name in _PASSED)]

@@ -1,6 +1,7 @@
-"""Clear a pile: look, choose a thing, plan among the others, lift it on the truth, until nothing can be grasped.
+"""Study that clears a pile: look, choose a thing, plan among the others, lift it on the truth, until none can be
+grasped.
 
-What the robot knows is what the camera saw; what came of it is measured on the truth.
+The robot knows only what the camera saw. The results are measured on the truth.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ _ELEVATION, _DISTANCE = np.deg2rad(55.0), 0.7
 
 @dataclass(frozen=True)
 class PileCase(Case):
-    """`size` things drawn from `objects`, dropped, and taken out as cameras see them from `views` places."""
+    """`size` things drawn from `objects`, dropped, and removed as cameras see them from `views` places."""
 
     objects: tuple[str, ...]
     size: int
@@ -75,7 +76,7 @@ class PileCase(Case):
 
 
 def pile_cases(request: Request) -> tuple[PileCase, ...]:
-    """A scene a size and seed. Raises GraspdError: an object or a size that there is not."""
+    """Return a scene for each size and seed. Raises GraspdError: an unknown object or a size out of range."""
     sizes = tuple(map(_size, request.cases)) or (SIZES[:1] if request.quick else SIZES)
     objects = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
     preset, hand = request.preset(), request.hand or "allegro_right"
@@ -89,12 +90,12 @@ def _size(text: str) -> int:
 
 
 def pile_seconds(case: PileCase) -> float:
-    """CPU seconds of a case, roughly: among more neighbours every plan takes longer."""
+    """Return the CPU seconds of a case, roughly. Among more neighbours every plan takes longer."""
     return 4.0 * case.size + 0.3 * case.size**2
 
 
 def drawn_things(case: PileCase) -> list[str]:
-    """The things of a scene: all in a drawn order, then all again where there are too few."""
+    """Return the things of a scene: all in a drawn order, then all again where there are too few."""
     rng = np.random.default_rng((case.seed, case.size))
     order: list[str] = []
     while len(order) < case.size:
@@ -103,7 +104,7 @@ def drawn_things(case: PileCase) -> list[str]:
 
 
 def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
-    """Things at rest: they fall one above the other into a fence, which is taken away then."""
+    """Return things at rest, which fell one above the other into a fence that is then removed."""
     things = drawn_things(case)
     models = {thing: load_scene(thing, mass=MASS).object for thing in set(things)}
     wall = 0.5 * _FENCE * float(np.sqrt(case.size)) + 0.05
@@ -111,7 +112,7 @@ def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
 
 
 def seen_pile(case: PileCase, bodies: Sequence[FreeBody], look: int) -> tuple[list[PointCloud], Any]:
-    """What the cameras see, and of each point, view after view, which thing it truly is of (beyond them: the table)."""
+    """Return the views, and for each point, view after view, the thing it belongs to (beyond them: the table)."""
     meshes = [moved(body.model.mesh, body.pose) for body in bodies]
     table = tabletop("sphere")
     stage = TabletopScene(meshes[0], np.eye(4), tuple(meshes[1:]), table.table, table.support)
@@ -121,7 +122,7 @@ def seen_pile(case: PileCase, bodies: Sequence[FreeBody], look: int) -> tuple[li
     return views, np.concatenate([label[depth > 0] for depth, label in images])
 
 
-# A thing that is seen within this of a place where one failed is that thing [m]; so often is one tried.
+# A thing that is seen within this of a place where one failed is that thing [m]. So often is one tried.
 _SAME_PLACE, _TRIES = 0.03, 2
 # A segment of which so much is of a second thing is two things taken for one.
 _MERGED = 0.15
@@ -136,12 +137,12 @@ CLEARED, DROPPED, BLOCKED, NO_GRASP, NO_SCENE = "cleared", "dropped", "blocked",
 
 @dataclass
 class _Run:
-    """What is left on the table, and what was tried.
+    """The things left on the table, and what was tried.
 
     Attributes:
         present: numbers of the things that are left, in the order of `bodies`.
         bodies: these things, as they lie.
-        failures: places where things were tried in vain.
+        failures: places where trials failed.
         attempts: their records.
         frames: of the film strip.
     """
@@ -157,7 +158,7 @@ class _Run:
 
 
 def run_pile(case: PileCase) -> Record:
-    """Everything that is reported of one scene."""
+    """Return the record of one scene."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     things, bodies = drawn_things(case), dropped_pile(case)
     run, look_s, looks = _Run(list(range(case.size)), bodies), [], 0
@@ -199,7 +200,7 @@ def _take_one(
     truth: Int[np.ndarray, "points"],
     seen: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> bool:
-    """Try things, those least tried in vain first, then the highest, until a grasp was executed; whether one was."""
+    """Try things until a grasp was executed, fewest failures first, then the highest. Return whether one was."""
     cloud = KDTree(np.vstack([view.points for view in views]))
     order = sorted(seen, key=lambda points: (run.failed_before(points.mean(0)), -float(points[:, 2].max())))
     for points in order:
@@ -235,7 +236,7 @@ def _planned(
     attempt: Record,
     seed: int,
 ) -> Grasp | None:
-    """The surest verified grasp of a segment; where there is none, the attempt says why."""
+    """Return the surest verified grasp of a segment. Where there is none, the attempt says why."""
     began = time.process_time()
     # A point of the thing itself: the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
@@ -263,7 +264,7 @@ def _why_none(result: GraspResult) -> str:
 
 
 def _execute(hand: HandModel, run: _Run, grasp: Grasp, attempt: Record) -> None:
-    """Lift on the truth; what came up is taken away, the rest comes to rest."""
+    """Lift on the truth. Things that came up are removed, the rest comes to rest."""
     index = run.present.index(attempt["thing"])
     before = [body.pose for body in run.bodies]
     lifted = lift_out(hand, run.bodies, index, grasp, _PROTOCOL, _LIFT)
@@ -307,7 +308,7 @@ _HEADINGS = [
     "two taken for one", "came along", "moved others", "verified grasps that held",
     "segmentation and reconstruction, a thing", "planning, a thing",
 ]  # fmt: skip
-# The scene of this many things is drawn, if there is one; frames of this size, so many in a row.
+# The scene of this many things is drawn, if there is one. Frames of this size, so many in a row.
 _DRAWN, _WIDTH, _HEIGHT, _ROW = 8, 320, 240, 4
 _BORDER = 4
 _COLOURS = (
@@ -319,12 +320,12 @@ _HAND, _TABLE = (0.35, 0.38, 0.42), (0.93, 0.92, 0.89)
 
 
 def pile_came(record: Record) -> str:
-    """What came of a scene, in a few words."""
+    """Return the results of a scene, in a few words."""
     return f"{record['cleared']} of {record['size']} taken out in {len(record['attempts'])} attempts"
 
 
 def pile_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """The table, the causes and the film strip."""
+    """Return the table, the causes and the film strip."""
     sizes = {size: [r for r in records if r["size"] == size] for size in sorted({r["size"] for r in records})}
     body = [_row(str(size), own) for size, own in sizes.items()]
     if len(sizes) > 1:
@@ -363,7 +364,7 @@ def _by_segment(records: Sequence[Record]) -> str:
 
 
 def _causes(records: Sequence[Record]) -> list[str]:
-    """What attempts failed of, most often first, and of how many of them a segment was of two things."""
+    """Return the causes of failed attempts, most frequent first, and how many segments were of two things."""
     failed = [a for r in records for a in r["attempts"] if a["ended"] != CLEARED]
     if not failed:
         return []
@@ -380,7 +381,7 @@ def _plain(reason: str) -> str:
 
 
 def film_picture(record: Record, chart: Path) -> Picture | None:
-    """The film strip of a scene as a file; none where its meshes are not here any more."""
+    """Return the film strip of a scene as a file, or None where its meshes are missing."""
     try:
         image = film_strip(record)
     except GraspdError:
@@ -392,10 +393,9 @@ def film_picture(record: Record, chart: Path) -> Picture | None:
 
 
 def film_strip(record: Record) -> UInt8[np.ndarray, "height width 3"]:
-    """A frame as the pile fell, and one at the end of every lift, in rows.
+    """Return a frame of the fallen pile, and one at the end of every lift, in rows.
 
-    Raises:
-        GraspdError: an object or the hand cannot be loaded.
+    Raises GraspdError if an object or the hand cannot be loaded.
     """
     names = ("size", "preset", "hand", "seed", "views")
     case = PileCase(tuple(record["objects"]), **{name: record[name] for name in names})

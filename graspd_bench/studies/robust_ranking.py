@@ -1,4 +1,4 @@
-"""Does ranking by robustness pay: as many verified grasps in the order of the score, and in that of the noisy trial.
+"""Study of ranking by robustness: as many verified grasps in the order of the score, and of the noisy trial.
 
 Both orders are compared by noisy trials of other errors, with pulls of 2 s.
 """
@@ -32,12 +32,12 @@ _SCORE, _NOISE, _BEST = (method_row(name).colour for name in ("graspd2022", "clo
 
 
 def robust_cases(request: Request) -> tuple[ObjectCase, ...]:
-    """One a shape and seed."""
+    """Return a case for each shape and seed."""
     return object_cases(request, SHAPES, 8)
 
 
 def run_robust(case: ObjectCase) -> Record:
-    """Costs of both plans; what each grasp was ranked by, and what it really holds."""
+    """Return the costs of both plans, the figure each grasp was ranked by, and the share that it really holds."""
     config = case.config
     ranked = replace(config, robust=replace(config.robust, rank=True))
     hand, scene = case.load(friction=FRICTION)
@@ -64,7 +64,7 @@ def run_robust(case: ObjectCase) -> Record:
 
 
 def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Costs and gains by shape, the rank correlations, and the chart."""
+    """Return costs and gains by shape, the rank correlations, and the chart."""
     rows = [record for record in records if record["shares"]]
     if not rows:
         return {}
@@ -88,9 +88,9 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 def orders(
     rows: Sequence[Record],
 ) -> tuple[Float[np.ndarray, "places"], Float[np.ndarray, "places"], Float[np.ndarray, "places"]]:
-    """Mean share held at each place, first to last: by score, by the noisy trial, and in the best order there is.
+    """Return the mean share held at each place, first to last: by score, by the noisy trial, and in the best order.
 
-    As many places as the shortest plan has grasps. Grasps that are level keep the order of the score.
+    There are as many places as the shortest plan has grasps. Grasps that are level keep the order of the score.
     """
     places = min(len(row["shares"]) for row in rows)
     held = [np.array(row["shares"]) for row in rows]
@@ -101,7 +101,7 @@ def orders(
 
 
 def correlation(rows: Sequence[Record], key: str) -> float:
-    """Spearman's rank correlation of a figure with the share held, within each plan, mean over plans that differ."""
+    """Return Spearman's rank correlation of a figure with the share held within a plan, mean over plans that differ."""
     from scipy.stats import rankdata
 
     found = [
@@ -113,7 +113,7 @@ def correlation(rows: Sequence[Record], key: str) -> float:
 
 
 def draw_robust(rows: Sequence[Record], path: Path) -> Path:
-    """Share held by place on the left, CPU seconds by shape on the right. Returns the PNG's path."""
+    """Draw the share held by place on the left, CPU seconds by shape on the right. Return the PNG's path."""
     with figure(8.0, 3.0, ncols=2) as (made, (gain, cost)):
         by_score, by_noise, best = (100.0 * order for order in orders(rows))
         places = np.arange(1, len(best) + 1)

@@ -1,7 +1,7 @@
-"""What a camera sees of a thing on a table, to grasps that are tried on the truth: study `rgbd`.
+"""Study `rgbd`: grasps of a thing on a table as a camera sees it, tried on the truth.
 
 Every case is rendered with the sensor noise of a D415 and goes through segmentation, reconstruction and `plan_grasps`
-as a user's clouds do; every grasp that was verified on the reconstruction is tried again on the true mesh.
+as a user's clouds do. Every grasp that was verified on the reconstruction is tried again on the true mesh.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
-# Cameras; 0 plans on the true mesh.
+# Cameras. 0 plans on the true mesh.
 VIEWS = (0, 1, 3, 15)
-# Elevation of the camera at each start: a robot looks at its table from half above; from a wrist, from above [deg].
+# Elevation of the camera at each start: a robot looks at its table from half above. From a wrist, from above [deg].
 ELEVATIONS, ABOVE = (40.0, 50.0, 30.0), (75.0, 88.0, 60.0)
 YAW = 0.3
 # Room between the object and each thing beside it [m].
@@ -61,15 +61,18 @@ _HEADINGS = [
 
 @dataclass(frozen=True)
 class Seen(ObjectCase):
-    """Grasps of what `views` cameras see; 0 plans on the true mesh. The seed is of noise and grasps, and of the place
-    of the first camera. Where it is crowded, two other things stand beside and hide a part."""
+    """Grasps of what `views` cameras see, or of the true mesh if `views` is 0.
+
+    The seed draws noise and grasps, and the place of the first camera. In a crowd, two other things beside it hide a
+    part.
+    """
 
     views: int = 1
     sight: str = PLAIN
 
 
 def seen_cases(request: Request) -> tuple[Seen, ...]:
-    """Every object from every number of views, by default from two places."""
+    """Return every object from every number of views, by default from two places."""
     request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
     seen = [(views, PLAIN) for views in VIEWS[: 2 if request.quick else None]] + [(1, CROWDED), (1, FROM_ABOVE)]
@@ -77,12 +80,12 @@ def seen_cases(request: Request) -> tuple[Seen, ...]:
 
 
 def seen_seconds(case: Seen) -> float:
-    """CPU seconds of a case, roughly."""
+    """Return the CPU seconds of a case, roughly."""
     return 4.0 + 0.4 * case.count + 0.6 * case.views
 
 
 def run_seen(case: Seen) -> Record:
-    """Everything that is reported of one case; a refusal is a result with its message."""
+    """Return the record of one case. A refusal is a result with its message."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     stage = _stage(case)
     clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
@@ -105,7 +108,7 @@ def run_seen(case: Seen) -> Record:
 
 
 def _stage(case: Seen) -> TabletopScene:
-    """The object on its table, and what stands `CLEAR` beside it, one of them towards the camera."""
+    """Return the object on its table, and its neighbours at a distance of `CLEAR`, one of them towards the camera."""
     thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)
     alone = tabletop(thing, yaw=YAW)
     if case.sight != CROWDED:
@@ -116,7 +119,7 @@ def _stage(case: Seen) -> TabletopScene:
 
 
 def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
-    """One camera, three around, or two rings of eight and seven."""
+    """Return one camera, three around, or two rings of eight and seven."""
     azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
     places = ABOVE if case.sight == FROM_ABOVE else ELEVATIONS
     elevation = np.deg2rad(places[case.seed % len(places)])
@@ -139,7 +142,7 @@ def _true_scene(stage: TabletopScene, source: str) -> Scene:
 
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
-    """Plan one grasp against the clock, then `count`; try all that were verified on the truth."""
+    """Plan one grasp against the clock, then `count`. Try all that were verified on the truth."""
     first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
     many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
     protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
@@ -173,10 +176,11 @@ def _verified(result: GraspResult) -> list[Grasp]:
 
 
 def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
-    """Distances between the reconstruction's surface and the true one, and whether it is closed.
+    """Return distances between the reconstruction's surface and the true one, and whether it is closed.
 
-    chamfer_mm: mean of the mean distances either way [mm]; completeness: share of the true surface within 5 mm of the
-    reconstruction; beyond_10mm: share of the reconstruction farther than 10 mm from the truth.
+    `chamfer_mm` is the mean of the mean distances either way [mm]. `completeness` is the share of the true surface
+    within 5 mm of the reconstruction. `beyond_10mm` is the share of the reconstruction farther than 10 mm from the
+    truth.
     """
     points, normals = surface_samples(stage.truth, SAMPLES, 0)
     # Bodies that overlap have surfaces that nobody could see.
@@ -193,7 +197,7 @@ def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
 
 
 def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Both tables."""
+    """Return both tables."""
     rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["sight"]) == row])}
     full = _share(rows[0, PLAIN], "first_held") if (0, PLAIN) in rows else 0.0
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
@@ -243,7 +247,7 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(told: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """How often grasps of each stated probability held on the truth, and the mean square of what that was off."""
+    """Return how often grasps of each stated probability held on the truth, and the mean square of the error."""
     if not told:
         return []
     levels = sorted({probability for probability, _ in told}, reverse=True)

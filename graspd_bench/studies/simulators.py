@@ -1,7 +1,7 @@
-"""Does the second simulator agree? Hold and displacement trials of the same grasps in MuJoCo and PyBullet.
+"""Study of whether the second simulator agrees: hold and displacement trials of the same grasps in MuJoCo and PyBullet.
 
-The first grasps of the optimiser's own ranking, none filtered by a trial, and each of them once more with the hand out
-of place by up to 5 mm and 5°, as in the noisy trial, so that failures are among them.
+It uses the first grasps of the optimiser's own ranking, none filtered by a trial. Each is tried once more with the hand
+out of place by up to 5 mm and 5°, as in the noisy trial, so that failures are among them.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from graspd_core.verify.hold_trial import displaced, hold_trial, pose_error
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Seconds of each pull, in both simulators; MuJoCo tries the full length as well.
+# Seconds of each pull, in both simulators. MuJoCo tries the full length as well.
 PULL = 0.5
 
 
 def simulator_cases(request: Request) -> tuple[ObjectCase, ...]:
-    """One a shape and seed. Raises ConfigError: there is no PyBullet."""
+    """Return a case for each shape and seed. Raises ConfigError: there is no PyBullet."""
     if not bullet_available():
         raise ConfigError("simulators: PyBullet is not installed; pip install -e '.[bench]', on Python 3.11")
     return object_cases(request, all_shapes(), 4, 1)
 
 
 def run_simulators(case: ObjectCase) -> Record:
-    """Both simulators on the grasps of one object: a trial each."""
+    """Run the trials of one object's grasps in both simulators."""
     hand, scene = case.load()
     first = raw_grasps(scene, hand, case.config, case.count, case.seed)
     parts, standard = object_parts(scene.object), PROTOCOLS["standard"]
@@ -60,7 +60,7 @@ def run_simulators(case: ObjectCase) -> Record:
 
 
 def simulator_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """The verdicts side by side, every disagreement with both reasons, and the displacements, as Markdown."""
+    """Return the verdicts side by side, every disagreement with both reasons, and the displacements, as Markdown."""
     rows = [(r["object"], trial) for r in records for trial in r["trials"]]
     if not rows:
         return {}

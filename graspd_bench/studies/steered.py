@@ -1,7 +1,7 @@
-"""Does steering do what is asked of it, and what does it cost: the same request with a wish and without.
+"""Study of whether steering works and what it costs, by the same request with a wish and without.
 
-Wishes are drawn at random from the case's seed, object and hand. Some cannot be met: a cone may come from where the
-object is too wide for the hand. Whether grasps keep to a wish is computed here from postures and contacts.
+Wishes are drawn at random from the case's seed, object and hand. Some cannot be met, as a cone from where the object is
+too wide for the hand. Whether grasps keep to a wish is computed here from postures and contacts.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SteeredCase(ObjectCase):
 
 
 def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
-    """One an object, hand, wish and seed."""
+    """Return a case for each object, hand, wish and seed."""
     things = find_objects(request.objects or tuple(f"shape:{s}" for s in SHAPES[: 1 if request.quick else None]))
     hands = (request.hand,) if request.hand else HANDS[: 1 if request.quick else None]
     count, preset = request.count or (2 if request.quick else 4), request.preset()
@@ -57,7 +57,7 @@ def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
 
 
 def drawn_wish(case: SteeredCase, scene: Scene) -> Steering:
-    """The wish of a case, at random."""
+    """Return the wish of a case, drawn at random."""
     rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.wish}".encode())])
     direction, angle = rng.normal(size=3), float(rng.uniform(*_ANGLES))
     vertices = scene.object.mesh.vertices
@@ -73,7 +73,7 @@ def drawn_wish(case: SteeredCase, scene: Scene) -> Steering:
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
-    """A box about a share of the object, from one of its six ends on, and no narrower than a hand can use."""
+    """Return a box about a share of the object, from one of its six ends, no narrower than a hand can use."""
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))
     breadth = max(share * (high - low)[axis], _BREADTH if beyond < _BEYOND else 0.0)
@@ -86,7 +86,7 @@ def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share:
 
 
 def run_steered(case: SteeredCase) -> Record:
-    """Costs of both plans, how many of the verified grasps keep to the wish, and by how much the worst misses it."""
+    """Return the costs of both plans, how many verified grasps keep to the wish, and the greatest miss."""
     hand, scene = case.load()
     object_parts(scene.object)
     wish = drawn_wish(case, scene)
@@ -118,7 +118,7 @@ def _timed(case: SteeredCase, scene: Scene, hand: HandModel, restrictions: Seque
 
 
 def beyond_cone(hand: HandModel, grasp: Grasp, wish: Steering) -> float:
-    """By how much a grasp's approach is outside the cone [rad]."""
+    """Return by how much a grasp's approach is outside the cone [rad]."""
     if wish.approach_direction is None:
         return -np.pi
     w, x, y, z = grasp.grasp.quaternion_wxyz
@@ -127,7 +127,7 @@ def beyond_cone(hand: HandModel, grasp: Grasp, wish: Steering) -> float:
 
 
 def beyond_region(grasp: Grasp, wish: Steering) -> float:
-    """How far the farthest contact is outside the region [m]."""
+    """Return how far the farthest contact is outside the region [m]."""
     if not isinstance(wish.region, Box):
         return -1.0
     beyond = (
@@ -141,7 +141,7 @@ def _in_boxes(hand: HandModel, grasp: Grasp, wish: Steering) -> bool:
 
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Success and cost by wish."""
+    """Return success and cost by wish."""
     headings = ["wish", "requests", "with a verified grasp", "without the wish", "grasps of those asked for"]
     headings += [
         "without the wish",

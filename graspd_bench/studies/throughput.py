@@ -1,6 +1,6 @@
-"""How many verified grasps a second: of a known object, on one thread and on two, by the clock on the wall.
+"""Study of verified grasps a second of a known object, on one thread and on two, by the clock on the wall.
 
-Cases that run at a time share the cores: figures count with `--processes 1` on a quiet machine.
+Cases that run at the same time share the cores, so figures count with `--processes 1` on a quiet machine.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Throughput(ObjectCase):
 
 
 def throughput_cases(request: Request) -> tuple[Throughput, ...]:
-    """Every shape from three seeds, on one thread and on two."""
+    """Return every shape from three seeds, on one thread and on two."""
     request = request if request.seeds or request.quick else replace(request, seeds=(0, 1, 2))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 64)
     return tuple(Throughput(**vars(case), threads=threads) for case in cases for threads in THREADS)
 
 
 def run_throughput(case: Throughput) -> Record:
-    """Seconds, on the wall and of the CPU, of one plan without metrics."""
+    """Return seconds, on the wall and of the CPU, of one plan without metrics."""
     hand, scene = case.load()
     before = torch.get_num_threads()
     torch.set_num_threads(case.threads)
@@ -55,7 +55,7 @@ def run_throughput(case: Throughput) -> Record:
 
 
 def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Verified grasps a second and CPU time of each, by object and number of threads."""
+    """Return verified grasps a second and CPU time of each, by object and number of threads."""
     rows = [record for record in records if record["verified"]]
     if not rows:
         return {}
@@ -70,7 +70,7 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
-    """Tried for each verified; then verified a second and CPU ms of each, by number of threads; over all seeds."""
+    """Return tries for each verified grasp, then by number of threads verified ones a second and CPU ms of each."""
     found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]

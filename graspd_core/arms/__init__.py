@@ -1,1 +1,1 @@
-"""Robot arms: what carries a hand, where it can bring it, and what it would hit on the way (docs/arms.md)."""
+"""Robot arms: their reach with a hand, their paths, and their collisions (docs/arms.md)."""

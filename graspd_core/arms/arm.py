@@ -1,10 +1,10 @@
 """Arms by name, from an arm description: the YAML file beside a URDF (docs/arms.md).
 
-An arm is a frozen chain of links from its base to the tip that carries the hand. Its URDF is read and refused by our
-reader. Forward kinematics and Jacobians are those of pytorch-kinematics, which is imported when an arm is used.
+An arm is a frozen chain of links from its base to the tip that carries the hand. graspd's URDF reader reads it. Forward
+kinematics and Jacobians are those of pytorch-kinematics, which is imported when an arm is used.
 
-Solids become capsules: all that is nearer to a segment than a radius. Every distance is then one of segments: exact
-between capsules and to a plane. Any other solid gets a capsule about it, which is larger than the solid.
+Solids become capsules: all points nearer to a segment than a radius. Distances between capsules and to a plane are
+exact. Any other solid gets an enclosing capsule, which is larger.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Capsules:
 
 
 def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
-    """A capsule about each solid; spheres and capsules as they are."""
+    """Return an enclosing capsule of each solid, spheres and capsules as they are."""
     rows = [_about(primitive) for primitive in primitives]
     turned = [
         [primitive.rotation @ point + primitive.translation for point in row[:2]]
@@ -65,7 +65,7 @@ def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
 
 
 def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Ends and radius of a capsule about a solid, in the solid's frame."""
+    """Return ends and radius of a capsule about a solid, in the solid's frame."""
     size, up = primitive.size, np.array([0.0, 0.0, 1.0])
     if primitive.kind == "sphere":
         return np.zeros(3), np.zeros(3), size[0]
@@ -78,14 +78,14 @@ def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 
 
 def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """A capsule about points, along the direction in which they spread most, as thin and then as short as can be."""
+    """Return a capsule about points, along their direction of greatest spread, as thin, then as short as possible."""
     center = 0.5 * (corners.min(0) + corners.max(0))
     local = corners - center
     axis = np.linalg.svd(local, full_matrices=False)[2][0]
     along = local @ axis
     away = np.linalg.norm(local - np.outer(along, axis), axis=1)
     radius = float(away.max())
-    # The caps reach past the ends; a point beside the axis needs them to reach less far than one on it.
+    # The caps reach past the ends. A point beside the axis needs them to reach less far than one on it.
     slack = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     low, high = float((along + slack).min()), float((along - slack).max())
     if low > high:
@@ -96,7 +96,7 @@ def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, 
 def placed(
     capsules: Capsules, links: SE3
 ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"], Float[Tensor, "n"]]:
-    """Ends [m] and radii of capsules at link poses, in the frame of the poses."""
+    """Return ends [m] and radii of capsules at link poses, in the frame of the poses."""
     poses = links[:, torch.as_tensor(capsules.link)]
     ends = [torch.as_tensor(points).to(poses.translation) for points in (capsules.start, capsules.end)]
     start, end = ((poses.rotation @ points[..., None]).squeeze(-1) + poses.translation for points in ends)
@@ -109,10 +109,10 @@ def segment_distance(
     c: Float[Tensor, "*#batch 3"],
     d: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*batch"]:
-    """Distance [m] of the segments from a to b and from c to d, either of which may be a point.
+    """Return the distance [m] of the segments from a to b and from c to d.
 
-    C. Ericson, Real-Time Collision Detection, 5.1.9: the nearest points of the lines, each brought back into its
-    segment, the other then found anew.
+    Each may be a point. C. Ericson, Real-Time Collision Detection, 5.1.9: the nearest points of the lines are clamped
+    to their segments.
     """
     along, other, between = b - a, d - c, a - c
     aa, ee = (along * along).sum(-1), (other * other).sum(-1)
@@ -129,16 +129,16 @@ def segment_distance(
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm as loaded; hashed by identity. Joints are those between base and tip, base first.
+    """An arm as loaded, hashed by identity. Joints are those between base and tip, base first.
 
     Attributes:
         name: the arm's name.
         chain: its links and joints, link 0 the base, whose frame is the arm's base frame.
         tip: number of the link that carries the hand.
         lower, upper: joint limits, the URDF's or narrower [rad] or [m].
-        seed: joint values clear of everything, which joints stay near where a choice is free.
+        seed: joint values clear of everything, which joints stay near if they can.
         capsules: its links' solids, a little larger than they are.
-        mounts: where hands' base links sit on the tip, by the hand's name; others sit as they say themselves.
+        mounts: where hands' base links sit on the tip, by the hand's name. Others sit as they say themselves.
     """
 
     name: str
@@ -162,7 +162,7 @@ class Arm:
 
 
 def tip_hand(arm: Arm, hand: HandModel) -> SE3:
-    """`T_tip_hand`: where the hand's base link sits on the tip. Raises ConfigError: neither arm nor hand says."""
+    """Return `T_tip_hand`, the hand's pose on the tip. Raises ConfigError: neither arm nor hand says it."""
     mount = arm.mounts.get(hand.name, hand.mount)
     if mount is None:
         known = ", ".join(arm.mounts) or "none"
@@ -227,11 +227,11 @@ class ArmFile:
         urdf: path of the URDF, from the description's folder, or `robot_description`: the robot that a caller brings
             along. It may hold more than the arm.
         tip: the link that carries the hand.
-        base: the link that the arm begins at; empty: the URDF's root.
-        name: of the arm; empty: the file's.
-        seed: joint values by name; what is not named is in the middle of its limits [rad] or [m].
+        base: the link that the arm begins at. Empty: the URDF's root.
+        name: of the arm. Empty: the file's.
+        seed: joint values by name, others in the middle of their limits [rad] or [m].
         limits: narrower limits by joint name, lower and upper [rad] or [m].
-        mounts: `_MountEntry`s by the hand's name; other hands sit as their own description says.
+        mounts: `_MountEntry`s by the hand's name. Other hands sit as their own description says.
     """
 
     urdf: str = ""
@@ -244,19 +244,19 @@ class ArmFile:
 
 
 def arm_names() -> tuple[str, ...]:
-    """Names of the arms that graspd ships with."""
+    """Return the names of the arms that graspd ships with."""
     return tuple(sorted(path.stem for path in (config_dir() / "arms").glob("*.yaml")))
 
 
 def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
-    """An arm by its name, or by the path of its description (.yaml).
+    """Load an arm by its name, or by the path of its description (.yaml).
 
     Args:
         name_or_path: of the arm.
         robot_description: a robot's URDF, for descriptions whose `urdf` is `robot_description`.
 
     Raises:
-        ConfigError: no such arm or file, or the description is wrong: names file, key and valid choices.
+        ConfigError: no such arm or file, or the description is wrong. Names file, key and valid choices.
         HandError: the URDF cannot be used.
     """
     path, entries = read_arm_file(name_or_path)
@@ -270,12 +270,12 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
 
 
 def from_robot_description(entries: ArmFile) -> bool:
-    """Whether the arm is part of a robot that the description does not name a file of."""
+    """Tell whether the arm is part of a robot whose URDF the caller brings."""
     return entries.urdf == ROBOT_DESCRIPTION
 
 
 def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
-    """The path of an arm's description, and what it says. Raises ConfigError: see `load_arm`."""
+    """Read an arm's description. Return its path and entries. Raises ConfigError: see `load_arm`."""
     text = str(name_or_path)
     if not text.endswith((".yaml", ".yml")):
         if text not in arm_names():
@@ -290,7 +290,7 @@ def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
 
 
 def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
-    """The arm that a description makes of a URDF, whose elements are taken over. Raises: see `load_arm`."""
+    """Make the arm of a description and its URDF. The elements of `root` are changed. Raises: see `load_arm`."""
     _keep_chain(root, entries.base, entries.tip, where)
     chain = read_urdf(urdf, root)
     if chain.mimics:
@@ -314,7 +314,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
 
 
 def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
-    """Drop all links and joints but those from base to tip, and what is welded to them before the tip."""
+    """Drop all links and joints except those from base to tip and what is welded to them before the tip."""
     links = [str(link.get("name")) for link in root.findall("link")]
     for key, link in (("tip", tip), ("base", base)):
         if link and link not in links:
@@ -348,7 +348,7 @@ def _end(joint: ET.Element, end: str) -> str:
 def _limits(
     chain: HandModel, narrower: Mapping[str, Any], where: str
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
-    """The URDF's limits, made narrower where the description says so."""
+    """Return the URDF's limits, narrowed as the description says."""
     lower, upper = chain.lower.copy(), chain.upper.copy()
     for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
         index = chain.joint_names.index(joint)

@@ -1,8 +1,8 @@
-"""What an arm hits: its links as capsules against the support, the object, obstacles, each other and the hand.
+"""Collisions of an arm: its links as capsules against the support, the object, obstacles, each other and the hand.
 
-The support is a plane and what stands on it a signed distance, sampled along a capsule's segment so densely that the
-padding for what lies between two samples stays below an eighth of the radius. The arm's base is held against nothing
-but the arm: it stands where it stands. Nor is the first link that moves held against the support, above which it turns.
+The support is a plane. Objects are signed distances, sampled along each capsule's segment so densely that the padding
+stays below an eighth of the radius. The base is checked against the arm only. The first moving link is not checked
+against the support, above which it turns.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from torch import Tensor
 from graspd_core.arms.arm import Arm, Capsules, arm_links, capsules_about, placed, segment_distance, tip_hand
 from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.sdf import GridSDF, sample_sdf
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3
 
 
 @dataclass(frozen=True)
 class Hits:
-    """How deep an arm is in what it must not touch.
+    """Collision depths of an arm.
 
     Attributes:
-        depth: of each thing that could be hit, negative where clear [m].
-        what: the things, "forearm in the table".
+        depth: of each possible collision, negative where clear [m].
+        what: names of the collisions, "forearm in the table".
     """
 
     depth: Float[Tensor, "batch things"]
@@ -37,12 +37,12 @@ class Hits:
 
 
 def joined(*hits: Hits) -> Hits:
-    """All things of several."""
+    """Join the collisions of several."""
     return Hits(torch.cat([h.depth for h in hits], -1), tuple(what for h in hits for what in h.what))
 
 
 def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
-    """Depths in the support, the object and the obstacles.
+    """Return the depths in the support, the object and the obstacles.
 
     Args:
         base: `T_scene_base`, one.
@@ -54,7 +54,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
     found = [hits_of_support(arm, scene, base, placed(arm.capsules, links)[:2])]
     for what, sdf in solids:
-        depth = padded - _distance(sdf, at)
+        depth = padded - sample_sdf(sdf, at.to(sdf.field))[0].to(at)
         worst = _worst_of_each(depth, owner, len(arm.capsules.link))
         found.append(Hits(worst[:, moved], tuple(f"{_name(arm, k)} in {what}" for k in moved.tolist())))
     return joined(*found)
@@ -63,7 +63,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
 def hits_of_support(
     arm: Arm, scene: Scene, base: SE3, ends: tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"]]
 ) -> Hits:
-    """Depths in the support, if there is one, of capsules whose segments end there in the base's frame [m]."""
+    """Return the depths in the support, if there is one, of capsules with these segment ends, base frame [m]."""
     start, end = ends
     if scene.support is None:
         return Hits(start.new_zeros(len(start), 0), ())
@@ -90,7 +90,7 @@ def _worst_of_each(
 
 
 def hits_of_self(arm: Arm, links: SE3) -> Hits:
-    """Depths of links in each other, but for neighbours and pairs that touch in the seed posture."""
+    """Return the depths of links in each other, except neighbours and pairs that touch in the seed posture."""
     start, end, radius = placed(arm.capsules, links)
     first, second = _pairs(arm)
     distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
@@ -101,7 +101,7 @@ def hits_of_self(arm: Arm, links: SE3) -> Hits:
 
 
 def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
-    """Depths of links in the hand at its joint values, but for pairs that touch in the seed posture."""
+    """Return the depths of links in the hand at its joint values, except pairs that touch in the seed posture."""
     own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
     # Links that stay clear of a ball about the hand need no closer look.
@@ -132,7 +132,7 @@ def _capsules_of_hand(hand: HandModel) -> Capsules:
 
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """Capsules to hold against each other: no neighbours, none that touch in the seed posture."""
+    """Return the capsules to check against each other: no neighbours, none that touch in the seed posture."""
     group = arm.chain.link_group[arm.capsules.link]
     parent = arm.chain.link_parent[group]
     above = np.where(parent < 0, -1, arm.chain.link_group[parent])
@@ -160,7 +160,7 @@ def _seed_links(arm: Arm) -> SE3:
 
 @lru_cache(maxsize=8)
 def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Points along the segments as a `placement`, their padded radii [m], and the capsule of each."""
+    """Return points along the segments as a `placement`, their padded radii [m], and the capsule of each."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
@@ -174,7 +174,3 @@ def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "
     links = torch.as_tensor(arm.capsules.link[owner])
     matrix = placement(arm.chain.num_links, torch.as_tensor(np.concatenate(points)), links)
     return matrix, torch.as_tensor(np.concatenate(radii)), owner
-
-
-def _distance(sdf: GridSDF, points: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch n"]:
-    return sample_sdf(sdf, points.to(sdf.field))[0].to(points)

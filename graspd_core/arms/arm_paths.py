@@ -1,9 +1,8 @@
-"""Paths of an arm through grasps: joint values at every waypoint of the hand, or why there are none.
+"""Paths of an arm through grasps: joint values at every waypoint of the hand, or a reason why there are none.
 
-The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. Of each grasp several postures are found,
-from starts all over the arm's postures, so that elbow and wrist vary. From each the whole way is solved at once; the
-first in order of nearness to the seed posture is taken whose way stays within the limits, goes on without a jump, and
-hits nothing.
+The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. For each grasp several postures are found,
+from starts all over the arm's postures, so that elbow and wrist vary. From each the whole path is solved at once. The
+path nearest to the seed posture is taken that keeps the limits, has no jump, and hits nothing.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ _SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))),
 
 
 def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
-    """`T_scene_hand` along the way of each grasp: a batch of grasps by waypoints.
+    """Return `T_scene_hand` along the path of each grasp: a batch of grasps by waypoints.
 
     Args:
-        grasps: some; positions between pregrasp and grasp are on a line, turns between them the shortest.
+        grasps: some. Positions between pregrasp and grasp are on a line, turns between them the shortest.
         approach: unit direction in which the hand moves towards an object, hand frame.
         up: unit direction of the lift, scene frame.
     """
@@ -65,7 +64,7 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
 
 # No joint moves farther between two waypoints [rad].
 LARGEST_JUMP = 0.2
-# Starts of each grasp, of which so many postures are followed along the way; steps of the one and of the other.
+# Starts of each grasp, and postures of each that are followed along the path. Steps of inverse kinematics for both.
 _STARTS, _FOLLOWED = 8, 2
 _STEPS, _WAY_STEPS = 8, 5
 # Joint values nearer than this are one posture [rad].
@@ -76,13 +75,13 @@ _AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class ArmTask:
-    """An arm somewhere in a scene, with a hand.
+    """An arm with a hand in a scene.
 
     Attributes:
-        arm, hand, scene: who takes what where.
+        arm, hand, scene: the parts.
         base: `T_scene_base` of the arm's base frame, one.
         usable: entries of the arm's start table that are clear of the support.
-        bounds: how far away their tips are, see `reach_bounds`.
+        bounds: distances of their tips, see `reach_bounds`.
     """
 
     arm: Arm
@@ -99,7 +98,7 @@ class ArmTask:
 
 
 def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
-    """The task, with what of the start table is clear of the support."""
+    """Build the task, with the entries of the start table that are clear of the support."""
     table = start_table(arm)
     hits = hits_of_support(arm, scene, base, (table.start, table.end))
     usable = (hits.depth <= 0).all(-1)
@@ -107,7 +106,7 @@ def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
 
 
 def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
-    """`T_base_tip` that bring the hand to `T_scene_hand`."""
+    """Return the `T_base_tip` that bring the hand to `T_scene_hand`."""
     mount = tip_hand(task.arm, task.hand)
     rotation = hand_poses.rotation @ mount.rotation.T
     at = hand_poses.translation - (rotation @ mount.translation[:, None]).squeeze(-1)
@@ -117,7 +116,7 @@ def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
 
 @torch.no_grad()
 def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
-    """A way of the arm through each grasp, or why there is none: "beyond joint_4's limit"."""
+    """Return a path of the arm through each grasp, or the reason why there is none: "beyond joint_4's limit"."""
     found: list[ArmPath | str] = []
     for first in range(0, len(grasps), _AT_ONCE):
         found += _some_paths(task, grasps[first : first + _AT_ONCE])
@@ -138,7 +137,7 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 
 
 def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
-    """The first posture of each grasp whose way can be gone, else the first of all; -1 where there is none."""
+    """Return the first posture of each grasp with a valid path, else the first of all, -1 for none."""
     best = [-1] * count
     for row in reversed(range(len(owner))):
         grasp, good = int(owner[row]), followed.good(row)
@@ -148,7 +147,7 @@ def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: in
 
 
 def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:
-    """Why the grasps that have no way have none, by their number."""
+    """Return the reasons of the grasps without a path, by number."""
     reasons: dict[int, str] = {}
     unreached: list[tuple[int, int, Tensor]] = []
     for grasp, row in enumerate(best):
@@ -169,9 +168,9 @@ def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]
 
 
 def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joints"], Int[Tensor, "postures"]]:
-    """Different joint values that bring the tip to each target, nearest to the seed first, and whose they are.
+    """Return different joint values that bring the tip to each target, nearest to the seed first, and their targets.
 
-    Those that stay above the support come before those that do not; what else is hit, their ways will tell.
+    Postures above the support come first. Other collisions are checked along the paths.
     """
     arm, table = task.arm, start_table(task.arm)
     starts = nearest_postures(table, target, _STARTS, task.usable)
@@ -194,7 +193,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
 
 
 def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
-    """The same postures with joints turned by full turns to where they are nearest to the seed within their limits."""
+    """Return the same postures, with joints turned by full turns to be nearest to the seed within their limits."""
     turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
     inside = (turned >= torch.as_tensor(arm.lower)) & (turned <= torch.as_tensor(arm.upper))
@@ -203,12 +202,12 @@ def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "
 
 @dataclass(frozen=True)
 class _Followed:
-    """Ways that were followed from a posture at their grasp.
+    """Paths from a posture at their grasp.
 
     Attributes:
         path: joint values at every waypoint.
-        lost: the waypoint nearest to the grasp that is not reached; -1 where all are.
-        hit: what jumps or is hit where all are reached; empty where the way can be gone.
+        lost: the unreached waypoint nearest to the grasp, -1 if all are reached.
+        hit: the jump or collision of a path whose waypoints are all reached, empty for a valid path.
     """
 
     path: Float[Tensor, "postures way joints"]
@@ -216,14 +215,14 @@ class _Followed:
     hit: list[str]
 
     def good(self, row: int) -> bool:
-        """Whether a way can be gone."""
+        """Tell whether a path is valid."""
         return self.lost[row] < 0 and not self.hit[row]
 
 
 def _followed(
     task: ArmTask, ways: SE3, q: Float[Tensor, "postures joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> _Followed:
-    """Follow each way from the posture at its grasp, with the hand's joints as they are at the pregrasp."""
+    """Follow each path from the posture at its grasp, with the hand's joints as they are at the pregrasp."""
     count, length = ways.translation.shape[:2]
     if not count:
         return _Followed(q.new_zeros(0, length, q.shape[1]), [], [])
@@ -244,7 +243,7 @@ def _followed(
 def _hits_on_way(
     task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> Hits:
-    """The deepest hits of each way: of the scene at every waypoint, of itself and the hand at its stages."""
+    """Return the deepest hits of each path: of the scene at every waypoint, of itself and the hand at its stages."""
     count = len(path)
     scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
     stages = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))

@@ -1,8 +1,8 @@
-"""A grasp as an executor needs it: one timed trajectory of arm and hand, with gates, so that it needs no geometry.
+"""A grasp for an executor: one timed trajectory of arm and hand with gates, so that it needs no geometry.
 
-At every gate all joints are at rest: an executor sends the rows up to a gate, looks whether it is reached, and sends
-the next ones. Between two gates the joints run along the grasp's own path by a cubic from rest to rest, whose greatest
-speed is 1.5 times the mean one.
+All joints rest at every gate. An executor sends the rows up to a gate, checks that it is reached, and sends the next.
+Between two gates the joints follow the grasp's own path by a cubic from rest to rest. Its greatest speed is 1.5 times
+the mean one.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Execution:
 
     Attributes:
         arm_joints, hand_joints: names, in the order of the columns. Joints that follow others are left out.
-        times: of each row from the start [s]; the first is zero.
+        times: of each row from the start [s]. The first is zero.
         arm: joint values of each row [rad] or [m].
         arm_speed: of the arm's joints there [rad/s] or [m/s].
         hand: joint targets of each row [rad] or [m].
@@ -104,7 +104,7 @@ def execution_of(
         grasp: with `Grasp.arm`.
         hand: that it was planned for.
         arm_speeds: greatest of the arm's joints [rad/s] or [m/s].
-        mass: of the object [kg]. None: nobody knows, so that the lift is gentle.
+        mass: of the object [kg]. None: unknown, so that the lift is gentle.
         pace: how fast all else moves.
 
     Raises:
@@ -113,7 +113,8 @@ def execution_of(
     if grasp.arm is None:
         raise ConfigError("execution: the grasp has no path of an arm; plan it with the restriction Reach")
     pace, path, (retreat, before, closed, lifted) = pace or ExecutionPace(), grasp.arm.positions, grasp.arm.stages
-    limits = np.concatenate([arm_speeds, _finger_speeds(hand, pace)])
+    fingers = np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
+    limits = np.concatenate([arm_speeds, fingers])
     low, high = hand.lower, hand.upper
     open_, touch, press = (np.clip(p.joint_positions, low, high) for p in (grasp.pregrasp, grasp.grasp, grasp.squeeze))
     shares = np.linspace(0.0, 1.0, closed - before + 1)[:, None]
@@ -152,14 +153,10 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, stages: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return what the joints press with when the object stops them at the grasp, within their limits [N·m] or [N]."""
+    """Return the joint efforts when the object stops the squeeze at the grasp, within their limits [N·m] or [N]."""
     stages = stages or GraspStagesConfig()
     gain = np.where(hand.slides, stages.slide_stiffness, stages.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
-
-
-def _finger_speeds(hand: HandModel, pace: ExecutionPace) -> Float[np.ndarray, "joints"]:
-    return np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
 
 
 def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
@@ -169,7 +166,7 @@ def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
 def _from_rest_to_rest(
     rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
-    """Return times of rows [s] that are evenly spaced along their path, and speeds, zero at both ends."""
+    """Return times [s] of rows evenly spaced along their path, and speeds, zero at both ends."""
     share = np.linspace(0.0, 1.0, len(rows))
     # The share that a cubic covers, 3t² − 2t³, solved for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)

@@ -1,14 +1,13 @@
 """Inverse kinematics of an arm for many poses at once: damped least squares within the joint limits.
 
 Tip and Jacobian are those of pytorch-kinematics. The damping follows the error's own square (T. Sugihara,
-Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IEEE T-RO 2011): strong far away and near
-singular postures, none at the end, where steps are Newton's. A joint at its limit that the step would push beyond is
-held there and the step is found without it. The loop is ours: it is five times faster than the library's solver, since
-it starts near and drops poses as they are reached (docs/arms.md).
+Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IEEE T-RO 2011). A joint that the step
+would push beyond its limit is held there, and the step is found without it. This loop is five times faster than the
+library's solver, since it starts near and drops poses as they are reached (docs/arms.md).
 
-Starts are the postures of a table whose tips are nearest. No pose is in reach whose tip, or a point fixed to the tip,
-is nearer to the shoulder or farther from it than in any posture of the table. Of hands drawn around objects at 0.3 to
-0.95 m this keeps 99.3 and 99.7 % of those that the shipped arms reach, and 18 and 4 % of the others.
+Starts are the postures of a table whose tips are nearest. A pose is out of reach if its tip, or a point fixed to the
+tip, is nearer to the shoulder or farther from it than in all postures of the table. Of hands drawn around objects at
+0.3 to 0.95 m this keeps 99.3 and 99.7 % of those that the shipped arms reach, and 18 and 4 % of the others.
 
 A pose out of reach has a reason: the joint whose limit is in the way, or that no posture gets there at all.
 """
@@ -60,14 +59,14 @@ _WEIGHTS = [1.0, 1.0, 1.0, RADIAN, RADIAN, RADIAN]
 _DAMPING, _LEAST_DAMPING = 0.05, 1e-7
 # No joint turns farther in one step [rad].
 _LONGEST_STEP = 0.6
-# Entries of a rotation matrix whose differences are the axis; a sine that rounding could make.
+# Entries of a rotation matrix whose differences are the axis, and a sine that rounding could make.
 _ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-7
 _HALF_TURN = (torch.pi, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Solutions:
-    """Joint values, and how far the tip is from where it should be.
+    """Joint values, and the error of the tip.
 
     Attributes:
         q: joint values within the limits, the nearest that were found [rad] or [m].
@@ -81,14 +80,14 @@ class Solutions:
 
 
 def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
-    """What moves and turns the tip to the target, base frame [m], [rad]."""
+    """Return what moves and turns the tip to the target, base frame [m], [rad]."""
     return torch.cat([target.translation - tip.translation, rotation_vector(target.rotation, tip.rotation)], -1)
 
 
 def rotation_vector(
     target: Float[Tensor, "batch 3 3"], current: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch 3"]:
-    """Axis times angle of the turn from one orientation to the other, base frame [rad]; half a turn is about x."""
+    """Return axis times angle of the turn between two orientations, base frame [rad]. Half a turn is about x."""
     turn = target @ current.transpose(-1, -2)
     # Twice the sine and twice the cosine of the angle.
     axis = turn[:, _ROWS, _COLUMNS] - turn[:, _COLUMNS, _ROWS]
@@ -102,12 +101,13 @@ def rotation_vector(
 def solve(
     arm: Arm, target: SE3, start: Float[Tensor, "batch joints"], steps: int, *, limited: bool = True
 ) -> Solutions:
-    """Follow the error from each start to its target, `T_base_tip`; rows that have arrived wait for the others.
+    """Follow the error from each start to its target, `T_base_tip`.
 
-    Computed in float32, which is a hundred times finer than the tolerances and takes two thirds of the time.
+    Rows that have arrived wait for the others. Computed in float32, which is a hundred times finer than the tolerances
+    and takes two thirds of the time.
 
     Args:
-        steps: at most so many.
+        steps: the most steps.
         limited: whether joints are kept within their limits.
     """
     limits = [torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper)]
@@ -140,7 +140,7 @@ def _step(
     q: Float[Tensor, "batch joints"],
     limits: Sequence[Tensor] | None,
 ) -> Float[Tensor, "batch joints"]:
-    """`Jᵀ (J Jᵀ + λ I)⁻¹ e` with rows of turning weighted, without joints that would leave their limits."""
+    """Return `Jᵀ (J Jᵀ + λ I)⁻¹ e` with rows of turning weighted, without joints that would leave their limits."""
     weight = wrong.new_tensor(_WEIGHTS)
     jacobian, wrong = jacobian * weight[:, None], wrong * weight
     if limits is not None:
@@ -185,7 +185,7 @@ class StartTable:
 # Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def start_table(arm: Arm) -> StartTable:
-    """The table of an arm, made once; the same every time."""
+    """Return the table of an arm, the same every time. It is made once."""
     q = random_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
     hits = hits_of_self(arm, arm_links(arm, q))
     q = q[(hits.depth <= 0).all(-1)] if hits.what else q
@@ -206,7 +206,7 @@ def _away(tip: SE3, shoulder: Float[Tensor, "3"]) -> Float[Tensor, "batch points
 
 
 def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[Tensor, "count joints"]:
-    """Joint values drawn evenly within the limits, and within half a turn of the middle where those are wider."""
+    """Draw joint values evenly within the limits, and within half a turn of the middle of wider limits."""
     middle = 0.5 * (arm.lower + arm.upper)
     half = np.where(arm.chain.slides, 0.5 * (arm.upper - arm.lower), np.minimum(0.5 * (arm.upper - arm.lower), np.pi))
     drawn = 2.0 * torch.rand(count, len(middle), generator=generator, dtype=torch.float64) - 1.0
@@ -214,14 +214,14 @@ def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[T
 
 
 def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
-    """Poses as vectors whose distance is that of position and rotation together [m]."""
+    """Return poses as vectors whose distance is that of position and rotation together [m]."""
     return torch.cat([tip.translation, _PER_ENTRY * tip.rotation.flatten(-2)], -1).float()
 
 
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Joint values of the entries nearest to poses `T_base_tip`, nearest first; of usable ones, where there are any."""
+    """Return joint values of the entries nearest to poses `T_base_tip`, nearest first, usable ones if there are any."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]
@@ -229,13 +229,13 @@ def nearest_postures(
 
 
 def reach_bounds(table: StartTable, usable: Bool[Tensor, "entries"]) -> Float[Tensor, "2 points"]:
-    """How far from the shoulder points fixed to the tip are at least and at most in usable postures [m]."""
+    """Return the least and greatest distances of points fixed to the tip from the shoulder in usable postures [m]."""
     away = table.away[usable] if usable.any() else table.away.new_full((1, len(_POINTS)), torch.nan)
     return torch.stack([away.amin(0), away.amax(0)])
 
 
 def within_reach(table: StartTable, bounds: Float[Tensor, "2 points"], tip: SE3) -> Bool[Tensor, "batch"]:
-    """Which poses `T_base_tip` are within the bounds; none where no posture is usable."""
+    """Return which poses `T_base_tip` are within the bounds, none without a usable posture."""
     away = _away(tip, table.shoulder)
     return ((away >= bounds[0]) & (away <= bounds[1])).all(-1)
 
@@ -246,10 +246,10 @@ _TOO_FAR, _NOWHERE = "farther than the arm reaches", "that no posture of the arm
 
 
 def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -> list[str]:
-    """Why each of the poses `T_base_tip` is not reached; found without limits, from `start` and from near postures.
+    """Return why each of the poses `T_base_tip` is not reached, solved without limits from `start` and near postures.
 
-    Of the postures that would get there the one counts that breaks its limits least, and of its joints the one that
-    breaks its own most. Empty where a posture within the limits gets there after all.
+    The posture that breaks its limits least counts, and its joint that breaks its own limit most. The reason is empty
+    if a posture within the limits gets there.
     """
     if not len(start):
         return []

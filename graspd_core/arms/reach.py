@@ -1,4 +1,4 @@
-"""The restriction that an arm can bring the hand there: which starts are drawn, which candidates are tried."""
+"""The restriction that an arm can bring the hand to a grasp: which starts are drawn, which candidates are tried."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _PROBES = 64
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """An arm that stands somewhere: only grasps that it can come to, take and lift are tried (docs/arms.md).
+    """An arm at a place: only grasps that it can reach and lift are tried (docs/arms.md).
 
     Each grasp gets the arm's joint values along its way, `Grasp.arm`.
 
@@ -55,7 +55,7 @@ class Reach:
     quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundReach:
-        """See `Restriction`. Raises ConfigError: the base's pose is none, or nobody says how the hand is mounted."""
+        """Bind the restriction, see `Restriction`. Raises ConfigError: a bad base pose, or the hand has no mount."""
         position, quaternion = (np.asarray(v, dtype=float) for v in (self.position, self.quaternion_wxyz))
         if position.shape != (3,) or not np.isfinite(position).all() or np.abs(position).max() > _FARTHEST:
             raise ConfigError(f"arm base: position {list(self.position)}; valid: three numbers up to {_FARTHEST:g} m")
@@ -102,7 +102,7 @@ class BoundReach(BoundRestriction):
         )
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Count the reasons why the arm takes no hand to the object, of some drawn around it."""
+        """Count the reasons why the arm cannot bring hands drawn around the object there."""
         task = self.task
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)
@@ -113,7 +113,7 @@ class BoundReach(BoundRestriction):
         return f"of {len(ways)} hands around the object: {told}" if told else ""
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Which initial poses are no farther away than the arm reaches, nor nearer; retreated and lifted ones too."""
+        """Return which initial poses are within the arm's reach, when retreated and lifted too."""
         task, at = self.task, torch.as_tensor(positions)
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
         retreat = drawn_back(at, rotation, torch.as_tensor(task.hand.approach))
@@ -125,7 +125,7 @@ class BoundReach(BoundRestriction):
         return np.isin(np.arange(len(at)), allowed.numpy())
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Each candidate with the arm's way, or why there is none."""
+        """Return each candidate with the arm's path, or the reason why there is none."""
         paths = arm_paths(self.task, grasps)
         return [
             Refusal(path) if isinstance(path, str) else replace(grasp, arm=path)

@@ -25,7 +25,7 @@ _YOUNG = 20_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
+    """Run the command line. Return the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
     # With arguments of its own this is a call within a process that began long ago.
     own_process = arguments is None
     began = process_began() if own_process else time.perf_counter()
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Wrong options are errors like any other: one line, no usage text before it."""
+    """A parser whose errors are a ConfigError like any other: one line, no usage text before it."""
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see {self.prog} --help)")

@@ -1,4 +1,4 @@
-"""`graspd hands`: the built-in hands; `graspd hands inspect`: what is in a hand, as text, picture and description."""
+"""`graspd hands`: the built-in hands. `graspd hands inspect`: one hand as text, picture and description."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graspd_core.hands.model import HandModel, all_joint_names
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     hands = commands.add_parser("hands")
     hands.set_defaults(run=run)
     actions = hands.add_subparsers(metavar="inspect", dest="action")
@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def run_inspect(options: argparse.Namespace) -> int:
-    """Print what is known of one hand."""
+    """Print, draw or describe one hand."""
     import torch
 
     from graspd_core.hands.library import load_hand
@@ -76,9 +76,9 @@ def run_inspect(options: argparse.Namespace) -> int:
 
 
 def as_text(hand: HandModel) -> str:
-    """A hand for a terminal: what it is, its tree, its joints, its palm, what was mended; angles in rad, lengths in m.
+    """Return a hand as lines for a terminal: tree, joints, palm and warnings, in rad and m.
 
-    Of the pairs of links those are counted that are checked against each other.
+    The pairs of links that are checked against each other are counted.
     """
     couplings = {mimic.name: mimic for mimic in hand.mimics}
     lines = [
@@ -119,7 +119,7 @@ def as_text(hand: HandModel) -> str:
 
 
 def as_yaml(hand: HandModel, urdf: str) -> str:
-    """A hand description that says what is known of a hand, to be edited; `urdf` is the path to write into it."""
+    """Return a hand description to edit, with `urdf` as the path in it."""
     lines = [f"urdf: {_quoted(urdf)}", "", "palm:", f"  link: {_quoted(hand.base_link)}"]
     lines += [f"  center: {_list(hand.palm_center)}", f"  normal: {_list(hand.palm_normal)}"]
     lines += ["", f"approach: {_list(hand.approach)}"]

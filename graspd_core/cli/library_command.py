@@ -1,4 +1,4 @@
-"""`graspd library`: verified grasps of known objects in a file, and what is in one."""
+"""`graspd library`: build and list files of verified grasps of known objects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("library")
     actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
     build = actions.add_parser("build", help="plan for meshes and add what holds; what is there already is kept")
@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0, 3 where an object got fewer grasps than asked for or none, 130 if interrupted."""
+    """Plan for all objects. Return the exit status: 0, 3 if an object got too few grasps, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources
@@ -58,7 +58,7 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan what an object lacks and add it; how many grasps it has then."""
+    """Plan what an object lacks and add it. Return the number of its grasps then."""
     from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
     from graspd_core.perception.load_scene import load_scene

@@ -1,4 +1,4 @@
-"""Options that commands share: planning, clouds out of files or bags, restrictions of grasps. And their last lines."""
+"""Options that commands share: planning, clouds out of files or bags, restrictions of grasps. Their summaries."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 # Metrics in the summary of a run.
 _SHOWN = ("payload", "least_friction", "penetration", "contact_area", "epsilon", "robustness")
-# Grasps that it lists; the others it counts.
+# Grasps that it lists. It counts the others.
 _FIRST = 3
 
 
 def add_planning_options(parser: argparse.ArgumentParser) -> None:
-    """Hand, number, method and trial of the grasps, and what is known of the object."""
+    """Add hand, number, method and trial of the grasps, and the object's mass and friction."""
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="graspd hands lists the names")
     parser.add_argument("-n", "--count", type=int, default=16, help="verified grasps wanted (default 16)")
     parser.add_argument("--method", default=None, metavar="NAME", help="instead of the preset's, at its defaults")
@@ -57,10 +57,9 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
 
 
 def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:
-    """The settings, and the arguments of `plan_grasps` but for the deadline; sets torch's threads.
+    """Return the settings and the arguments of `plan_grasps` except the deadline.
 
-    Raises:
-        ConfigError: an option is out of range, or the preset is unknown or malformed.
+    Sets torch's threads. Raises ConfigError: an option is out of range, or the preset is unknown or malformed.
     """
     import torch
 
@@ -81,13 +80,13 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
 
 
 def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> GraspResult:
-    """What a run comes to whose deadline passed while its object was loaded, from `began` on."""
+    """Return the result of a run whose deadline passed while its object was loaded, from `began` on."""
     taken = time.perf_counter() - began
     return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
-    """A few lines for a person; so many of the good grasps are `different`."""
+    """Return a few lines for a person. `different` counts the good grasps that are not copies."""
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)
@@ -112,12 +111,12 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
 
 
 def good_grasps(result: GraspResult) -> int:
-    """How many grasps are as sure as was asked for; they come first."""
+    """Return the number of grasps that are as sure as was asked for. They come first."""
     return sum(grasp.usable for grasp in result.grasps)
 
 
 def exit_status(result: GraspResult) -> int:
-    """Enough grasps, fewer, or interrupted."""
+    """Return the status for enough grasps, fewer, or an interruption."""
     if result.outcome is Outcome.CANCELLED:
         return EXIT_INTERRUPTED
     return EXIT_OK if result.outcome is Outcome.SUCCEEDED else EXIT_TOO_FEW
@@ -128,7 +127,7 @@ MOST_VIEWS = 100
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
-    """Which messages of a bag to take, and the frame to have them in."""
+    """Add which messages of a bag to take, and the frame to have them in."""
     parser.add_argument("--topic", default=None, help="of clouds or depth images, where a bag has several")
     parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="of the depth images' camera")
     parser.add_argument("--frame", default=None, help="put clouds into this frame by the bag's /tf and /tf_static")
@@ -138,7 +137,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_object_options(parser: argparse.ArgumentParser) -> None:
-    """Which of the things that a cloud shows is meant, and how clouds become scenes."""
+    """Add which object of a cloud is meant, and how clouds become scenes."""
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
@@ -156,7 +155,7 @@ def add_object_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_camera_option(parser: argparse.ArgumentParser) -> None:
-    """The camera of a depth image."""
+    """Add the camera of a depth image."""
     parser.add_argument(
         "--camera", type=Path, default=None, metavar="camera.json",
         help="that took the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)",
@@ -164,14 +163,14 @@ def add_camera_option(parser: argparse.ArgumentParser) -> None:
 
 
 def target_of(options: argparse.Namespace):
-    """The `Target` that the options name, if any."""
+    """Return the `Target` that the options name, if any."""
     from graspd_core.perception.segment.target_selection import Target
 
     return Target(point=np.array(options.target)) if options.target else None
 
 
 def scene_config_of(options: argparse.Namespace) -> SceneConfig:
-    """The settings in the file that the options name, else the defaults. Raises ConfigError."""
+    """Return the settings in the file that the options name, else the defaults. Raises ConfigError."""
     return load_scene_config(options.scene) if options.scene else SceneConfig()
 
 
@@ -184,10 +183,9 @@ def check_bag_options(options: argparse.Namespace) -> None:
 
 
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
-    """The clouds that the options choose, each with what it shows or why it cannot be used.
+    """Yield the clouds that the options choose, each with its cloud or the reason why it cannot be used.
 
-    Raises:
-        BagError: nothing can be read, or the frame wanted is not in the bag.
+    Raises BagError: nothing can be read, or the frame wanted is not in the bag.
     """
     transforms, place = None, CameraPlace(options.view_point, options.sensor_frame)
     told = set[str]()
@@ -213,11 +211,10 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
 
 
 def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """The chosen clouds as views of one scene, less those that cannot be used, which stderr counts.
+    """Return the chosen clouds as views of one scene.
 
-    Raises:
-        BagError: nothing can be read, none can be used, they are not in one frame, or they are too many and no limit
-            is set.
+    Unusable ones are counted on stderr. Raises BagError: nothing can be read, none can be used, they are not in one
+    frame, or they are too many without a limit.
     """
     views, names, refusals = [], set(), []
     for frame, seen in bag_views(path, options):
@@ -239,7 +236,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
 
 
 def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """The views of a cloud file, or those that the options choose from a bag; the first one unless they say more."""
+    """Return the views of a cloud file, or those that the options choose from a bag, by default the first."""
     from graspd_core.perception.cloud import cloud_files
 
     if not is_bag(path):
@@ -252,22 +249,6 @@ _FORMS = "box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"
 
 
 def add_restriction_options(parser: argparse.ArgumentParser) -> None:
-    """Steering, and an arm."""
-    _add_steering_options(parser)
-    _add_arm_options(parser)
-
-
-def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
-    """What the options ask for; none where they ask for nothing.
-
-    Raises:
-        ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
-    """
-    return (*_steering(options), *_reach(options))
-
-
-def _add_steering_options(parser: argparse.ArgumentParser) -> None:
-    """Approach, roll, region and avoided boxes; all in the object's frame."""
     group = parser.add_argument_group("steering (docs/usage.md)")
     group.add_argument(
         "--approach", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
@@ -284,6 +265,25 @@ def _add_steering_options(parser: argparse.ArgumentParser) -> None:
         "--avoid", type=float, nargs=6, action="append", default=[], metavar=("X", "Y", "Z", "SX", "SY", "SZ"),
         help="a box that no link enters: middle and edges [m]; may be given again",
     )  # fmt: skip
+    parser.add_argument(
+        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
+    )
+    parser.add_argument(
+        "--arm-base",
+        type=float,
+        nargs="+",
+        default=None,
+        metavar="N",
+        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
+    )
+
+
+def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
+    """Return the restrictions that the options ask for.
+
+    Raises ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
+    """
+    return (*_steering(options), *_reach(options))
 
 
 def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
@@ -330,21 +330,6 @@ def _region(words: list[str]) -> Region:
     return NearPoints(points, *numbers)
 
 
-def _add_arm_options(parser: argparse.ArgumentParser) -> None:
-    """Which arm, and where it stands."""
-    parser.add_argument(
-        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
-    )
-    parser.add_argument(
-        "--arm-base",
-        type=float,
-        nargs="+",
-        default=None,
-        metavar="N",
-        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
-    )
-
-
 def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
     if options.arm is None and options.arm_base is None:
         return ()
@@ -364,6 +349,6 @@ def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:
-    """Where a page is served."""
+    """Add the address of a served page."""
     parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
     parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")

@@ -20,7 +20,7 @@ from graspd_core.cli.running import EXIT_OK
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("reconstruct")
     parser.set_defaults(run=run)
     parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="cloud, depth image; of a bag its first cloud")
@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status."""
+    """Reconstruct a mesh and write it. Return the exit status."""
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
     from graspd_core.perception.cloud.depth_files import is_depth_image

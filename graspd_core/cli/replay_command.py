@@ -1,4 +1,4 @@
-"""`graspd replay`: the clouds of a recording in, grasps for each of them out, as they would have come over DDS."""
+"""`graspd replay`: the clouds of a recording in, grasps for each of them out, as the node would give them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class _Job:
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("replay")
     parser.set_defaults(run=run)
     parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
@@ -66,7 +66,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no cloud of any use."""
+    """Plan on every cloud. Return the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no usable one."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
                 result = _planned(job, options, hand, config, {**request, "settings": settings, "stop": interrupt.came})
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
-                # An empty table is an answer; a cloud that cannot be used is bad input.
+                # An empty table is an answer. A cloud that cannot be used is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
             print(_outcome_line(job, result, options.count), flush=True)
@@ -118,7 +118,7 @@ def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
 def _planned(
     job: _Job, options: argparse.Namespace, hand: HandModel, config: PlanConfig, request: dict[str, Any]
 ) -> GraspResult:
-    """Grasps on what a job shows, written where that was asked for. Raises a GraspdError: it shows no usable object."""
+    """Plan on a job's views and write the result if asked for. Raises a GraspdError: they show no usable object."""
     from graspd_core.io.grasps_json import save_result
     from graspd_core.planning.plan_grasps import plan_grasps
 
@@ -140,7 +140,7 @@ def _planned(
 
 
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
-    """One cloud after the other, or all of them together."""
+    """Yield one cloud after the other, or all of them together."""
     if options.fuse:
         views = merged_views(options.bag, options)
         yield _Job("fused", f"{len(views)} clouds fused", views)
@@ -155,7 +155,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
 
 
 def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
-    """What the views of a job show. Raises a GraspdError: they show no usable object."""
+    """Return the scene of a job's views. Raises a GraspdError: they show no usable object."""
     from graspd_core.perception.scene_from_views import scene_from_views
 
     if job.refusal:

@@ -1,4 +1,4 @@
-"""A running command: its exit status, its progress, its deadline, and what Ctrl-C does to it."""
+"""A running command: its exit status, progress and deadline, and its response to Ctrl-C."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """The first Ctrl-C or SIGTERM ends a run, which keeps what it has found so far; the second ends the process."""
+    """A context in which the first Ctrl-C or SIGTERM ends a run with its result so far, the second the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
 
     def __enter__(self) -> Interrupt:
-        # Signals belong to the main thread; in another one, who runs us keeps them.
+        # Signals belong to the main thread. In another thread, the caller keeps them.
         self._mine = threading.current_thread() is threading.main_thread()
         if self._mine:
             self._before = {number: signal.signal(number, self._handle) for number in _ENDS}
@@ -89,24 +89,25 @@ _AGAIN = 0.5
 
 
 class DeadlinePassed(BaseException):
-    """What a deadline ends the work with. No Exception: readers of files take every one of those for their own."""
+    """The end of work by a deadline. It is no Exception, because readers of files catch all of those as their own."""
 
 
 class Deadline:
-    """`seconds` after `began`, a `time.perf_counter()` value; None: never."""
+    """A time `seconds` after `began`, a `time.perf_counter()` value. None: never."""
 
     def __init__(self, seconds: float | None, began: float) -> None:
         self._end = None if seconds is None else began + seconds
 
     def left(self) -> float | None:
-        """Seconds left, more than none; None without a deadline."""
+        """Return the seconds left, more than zero, None without a deadline."""
         return None if self._end is None else max(self._end - time.perf_counter(), 1e-9)
 
     @contextmanager
     def cuts_short(self) -> Iterator[None]:
-        """Raise DeadlinePassed in the work inside once the deadline has passed; a library's long call ends first.
+        """Raise DeadlinePassed in the work inside once the deadline has passed.
 
-        Signals belong to the main thread: in another one, DeadlinePassed waits for the work's end.
+        A library's long call ends first. Signals belong to the main thread. In another one, DeadlinePassed waits for
+        the work's end.
         """
         if self._end is None:
             yield
@@ -124,7 +125,7 @@ class Deadline:
 
 @contextmanager
 def _alarm(end: float) -> Iterator[None]:
-    """Raise DeadlinePassed in the main thread at `end`, and again as long as a library takes that for its own error."""
+    """Raise DeadlinePassed in the main thread at `end`, and again while a library catches that as its own error."""
     armed = True
 
     def passed(number: int, frame: FrameType | None) -> None:
@@ -147,10 +148,10 @@ def _alarm(end: float) -> Iterator[None]:
 
 
 def process_began() -> float:
-    """When this process was started, a `time.perf_counter()` value; where the system does not say, now."""
+    """Return the start of this process, a `time.perf_counter()` value. If the system does not say it, now."""
     now = time.perf_counter()
     try:
-        # The 22nd field; the second, the program's name in brackets, may hold blanks.
+        # The 22nd field. The second, the program's name in brackets, may hold blanks.
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
     except (OSError, AttributeError, ValueError, IndexError):
@@ -160,7 +161,7 @@ def process_began() -> float:
 
 @dataclass(frozen=True)
 class Watched:
-    """How a run is followed in a browser; as it stands, by nobody.
+    """How a run is followed in a browser, by default not at all.
 
     Attributes:
         watch: hook of `plan_grasps`.
@@ -173,7 +174,7 @@ class Watched:
     show: Callable[[GraspResult], None] = lambda result: None
 
     def progress(self, reporter: ProgressHook) -> ProgressHook:
-        """The progress hook of a run that `reporter` follows too."""
+        """Return the progress hook of a run that `reporter` follows too."""
         told = self.told
         if told is None:
             return reporter

@@ -36,7 +36,7 @@ _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("synthesize")
     parser.set_defaults(run=run)
     parser.add_argument("object", metavar="OBJECT", help="mesh, cloud or depth image, or shape:NAME")
@@ -54,7 +54,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns the exit status."""
+    """Plan on one object. Return the exit status."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.perception.load_scene import load_scene
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
 def _report(
     options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
 ) -> None:
-    """Write what was found where that was asked for, and say it."""
+    """Write the result to the files asked for, and print a summary."""
     from graspd_core.io.grasps_json import save_result
     from graspd_core.verify.metrics import distinct
 

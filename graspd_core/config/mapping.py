@@ -1,4 +1,4 @@
-"""Config dataclasses from nested mappings and from YAML that a user wrote, with errors that name the key."""
+"""Config dataclasses from nested mappings and from a user's YAML, with errors that name the key."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _LARGEST_INTEGER = 2**63 - 1
 
 
 def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | None = None) -> T:
-    """Build a config dataclass from nested mappings; what they leave out is as in `start`, or as the class has it.
+    """Build a config dataclass from nested mappings.
 
-    Raises:
-        ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
+    Missing values are those of `start`, or the defaults of the class. Raises ConfigError: an unknown key or a value of
+    the wrong type, by its dotted name, with the valid choices.
     """
     fields = dataclasses.fields(typing.cast(Any, cls))
     factories = {f.name: f.default_factory for f in fields if f.default_factory is not dataclasses.MISSING}
@@ -36,7 +36,7 @@ def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | No
 def coerced(
     hints: Mapping[str, Any], values: Any, where: str, starts: Mapping[str, Any] = types.MappingProxyType({})
 ) -> dict[str, Any]:
-    """The values of a mapping, each as the type that `hints` names for its key. Raises ConfigError: see above."""
+    """Return a mapping's values, each as the type that `hints` names for its key. Raises ConfigError: see above."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
     unknown = sorted(map(shown, set(values) - set(hints)))
@@ -89,7 +89,7 @@ def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
 
 
-# Entries of a mapping once what it merges is in it; each `<<` may take in all of another mapping, twice and again.
+# Entries of a mapping once what it merges is in it. Each `<<` may take in all of another mapping, twice and again.
 _MOST_MERGED = 10_000
 
 
@@ -104,11 +104,10 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
-    """The tree of a YAML text, which knows its lines, and the value that it stands for; both None where it is empty.
+    """Return the node tree of a YAML text, which knows its lines, and its value.
 
-    Raises:
-        ValueError: it is not well-formed, or has something in it that only looks like a value: one line says what, and
-            its attribute `line` where.
+    Both are None for an empty text. Raises YamlError, a ValueError: the text is not well-formed, or a value is not what
+    its tag or its looks say.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)
@@ -121,7 +120,7 @@ def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
 
 
 class YamlError(ValueError):
-    """What is wrong with a YAML text, and in which line of it."""
+    """The problem of a YAML text and its line."""
 
     def __init__(self, line: int, problem: str) -> None:
         super().__init__(f"line {line}: {problem}")

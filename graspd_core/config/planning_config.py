@@ -1,4 +1,4 @@
-"""Settings of planning that every method shares, and how sure a verified grasp must be of what cameras saw."""
+"""Settings of planning that every method shares, and the certainty that a verified grasp of a seen object needs."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from graspd_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class ProblemConfig:
-    """How scene and hand are laid out as tensors; every method's poses become grasps and are ranked in these terms.
+    """How scene and hand are laid out as tensors. Every method's poses become grasps and are ranked in these terms.
 
     Attributes:
         candidates: contact candidates looked at by most steps.
         fine_candidates: contact candidates looked at while polishing.
         patch_size: how many of them make a patch that is drawn to the surface by itself, so that all of the hand comes
-            to touch; zero: of each rigid group of links the nearest candidate is drawn.
+            to touch. Zero: of each rigid group of links the nearest candidate is drawn.
         softness: how deep the hand gives, as flesh does [m]: the object is planned with as so much thinner, without its
             sharp points. Trials know nothing of it.
-        features: sharp points of the object looked at while polishing; more on large thin walls.
+        features: sharp points of the object looked at while polishing, more on large thin walls.
         directions: disturbance wrenches.
-        friction: coefficient planned with; below the object's own, so that contacts keep a margin.
-        confidence_floor: what a contact counts on surface that was only guessed; one where it was seen.
+        friction: coefficient planned with, below the object's own, so that contacts keep a margin.
+        confidence_floor: weight of a contact on surface that was only guessed, against one on seen surface.
     """
 
     candidates: int = 256
@@ -46,7 +46,7 @@ class GraspStagesConfig:
         effort_share: share of a joint's effort limit that the squeeze may use.
         clearance: distance from the object that the pregrasp opens to [m].
         open_steps: steps of the search for the pregrasp.
-        open_joint_rate: its step size of the joints [rad]; sliding ones take 0.05 m for a radian.
+        open_joint_rate: its step size of the joints [rad]. Sliding ones take 0.05 m for a radian.
         open_base_rate: its step size of the base [m].
     """
 
@@ -63,14 +63,14 @@ class GraspStagesConfig:
 
 @dataclass(frozen=True)
 class RoundsConfig:
-    """Rounds of optimiser and trial: where too few grasps held, what is missing is sought again from other starts.
+    """Rounds of optimiser and trial: if too few grasps held, the next round starts from other poses.
 
-    An effort of one is the method's settings as they are; less is that share of its steps, more is as many times its
+    An effort of one is the method's settings as they are. Less is that share of its steps, more is as many times its
     starts.
 
     Attributes:
         most: rounds at most.
-        first_budget: of the first round, on an object of known shape that stands alone; elsewhere it is one.
+        first_budget: effort of the first round on an object of known shape that stands alone, one for all others.
         growth: times as much effort with every further round.
     """
 
@@ -84,7 +84,7 @@ class RobustConfig:
     """Verified grasps tried again with the hand out of place by up to 5 mm and 5°: those that still hold come first.
 
     Attributes:
-        rank: whether that is done; it takes `trials` further hold trials for every verified grasp.
+        rank: whether that is done, by `trials` further hold trials for every verified grasp.
         trials: hold trials of each.
         hold_time: how long each of their six pulls lasts [s].
         friction: whether the least friction at which each verified grasp holds is measured.
@@ -130,11 +130,11 @@ class CertaintyConfig:
     """What a grasp of an object that cameras saw must survive to be called verified.
 
     Attributes:
-        probability: of holding on the true object, at least; 0 asks for trials of the likeliest shape alone, more for
+        probability: of holding on the true object, at least. 0 asks for trials of the likeliest shape alone, more for
             further ones (docs/clouds.md).
 
     Raises:
-        ConfigError: nothing is so sure.
+        ConfigError: no trials make a grasp so sure.
     """
 
     probability: float = 0.95

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from graspd_core.config.mapping import from_mapping, read_yaml
 from graspd_core.errors import ConfigError
 
-# Below these nothing is left to work with; every other number is above zero.
+# Below these nothing is left to work with. Every other number is above zero.
 _MINIMA = {"max_voxels": 1000, "neighbours": 4, "max_points": 1000, "max_faces": 100}
 
 
@@ -19,15 +19,15 @@ class SegmentationConfig:
     """How an object is cut out of a scene that depth cameras saw.
 
     Attributes:
-        roi_low: lower corner of the workspace, in the cloud's frame [m]; None: no bound.
-        roi_high: upper corner of the workspace, in the cloud's frame [m]; None: no bound.
+        roi_low: lower corner of the workspace, in the cloud's frame [m]. None: no bound.
+        roi_high: upper corner of the workspace, in the cloud's frame [m]. None: no bound.
         max_range: points farther than this from their camera are ignored [m].
-        voxel: side of the voxels that the scene is thinned by; finer than half of `gap` [m].
-        max_voxels: larger scenes get larger voxels; this bounds the time.
+        voxel: side of the voxels that the scene is thinned by, finer than half of `gap` [m].
+        max_voxels: larger scenes get larger voxels, which bounds the time.
         plane_tolerance: least height above the support that counts as above it, more where the camera is noisier [m].
         max_plane_tolerance: the most that this height may become where the camera is noisy [m].
-        plane_search_width: half width of the slab in which a plane is searched; wider for noisy cameras [m].
-        ransac_trials: planes that are tried; more where the support is a small share of the scene.
+        plane_search_width: half width of the slab in which a plane is searched, wider for noisy cameras [m].
+        ransac_trials: planes that are tried, more if the support is a small share of the scene.
         support_size: the smaller side of a support's visible part is at least this [m].
         support_margin: a flat part goes on so far beyond what was seen of it [m].
         support_area_ratio: area of a support over the area of what stands on it, at least.
@@ -40,7 +40,7 @@ class SegmentationConfig:
         smallest_object: things smaller than this are noise [m].
         largest_object: things larger than this are background: walls, floors, furniture [m].
         min_points: things seen by fewer points than this are noise.
-        border_width: what is this near to the edge of the image may go on beyond; some three pixels [rad].
+        border_width: what is this near to the edge of the image may go on beyond, some three pixels [rad].
         target_reach: a target point this near to a thing means that thing [m].
         target_share: a box or mask that covers this share of a thing means all of it.
         obstacle_range: other things are reported as far as this from the object [m].
@@ -81,14 +81,14 @@ class ReconstructionConfig:
     """How the views of an object become a closed mesh.
 
     Attributes:
-        max_points: points of all views together that are used; this bounds the time.
-        neighbours: points that each local plane is fitted to; more of them smooth noise and detail alike.
+        max_points: points of all views together that are used, which bounds the time.
+        neighbours: points that each local plane is fitted to. More smooth noise and detail alike.
         stray_distance: points farther than this from their neighbours' plane are flying pixels [m].
         outline_slack: cameras see outlines and surfaces to within this [m].
         surface_tolerance: a guessed point this near to a seen surface confirms the guess [m].
         open_share: a surface with a smaller share missing is not completed.
         revolution_share: a body of revolution explains this share of what was seen, at least.
-        symmetry_worth: a symmetry of a lower score is chance; the highest score is 2.6.
+        symmetry_worth: a symmetry of a lower score is chance. The highest score is 2.6.
         poisson: whose surface goes through the points: of a grid, then of Open3D where that does not fit, or of open3d.
         poisson_cell: the finest cells of Open3D's are about so wide: twice the camera's noise [m].
         min_cell: least cell of the grid that the surface is closed on, likewise [m].
@@ -120,7 +120,7 @@ class ObstacleConfig:
     """How the things beside the object become convex hulls that the hand keeps out of.
 
     Attributes:
-        padding: skin around what was seen; more keeps the hand farther away [m].
+        padding: skin around what was seen [m].
         part_size: a thing whose hull would hold the object, a tray, is split into parts of this size [m].
         min_points: things of fewer points are noise.
     """
@@ -146,10 +146,10 @@ class SceneConfig:
 
 
 def load_scene_config(path: str | Path) -> SceneConfig:
-    """Read the settings of a scene from a YAML file; what it leaves out has its default.
+    """Read the settings of a scene from a YAML file.
 
-    Raises:
-        ConfigError: no such file, malformed YAML, an unknown key (the valid ones are listed), or a bad value.
+    Missing ones have their defaults. Raises ConfigError: no such file, malformed YAML, an unknown key (the valid ones
+    are listed), or a bad value.
     """
     path = Path(path)
     config = from_mapping(SceneConfig, read_yaml(path), where=path.name)

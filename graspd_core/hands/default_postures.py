@@ -1,9 +1,9 @@
-"""A palm, an approach and two postures for a hand whose description names none. A hand description beats them.
+"""A palm, an approach and two postures, guessed for a hand whose description names none.
 
-Fingers are the chains that end in links which move no others; the palm is the link that all of them hang from. Where
-most fingers bend the same way (a human-like hand), the palm faces where they bend to: the linearised sweep of the
-fingertips from straight to mid-range. Where fingers bend or slide against each other (a gripper), the palm faces along
-them. The postures come from a search: fingertips around a small ball in front of the palm, and around a large one.
+Fingers are the chains that end in links which move no other link. The palm is the link that all of them hang from. In a
+human-like hand most fingers bend the same way. The palm faces where the fingertips move from straight to mid-range. In
+a gripper the fingers bend or slide against each other. The palm faces along them. A search finds the postures:
+fingertips around a small ball in front of the palm, and around a large one.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 60.0
 
 @dataclass(frozen=True, eq=False)
 class FingertipGoal:
-    """What the search looks for.
+    """What the search for a posture aims at.
 
     Attributes:
         ball: middle of the ball, base frame [m].
         radius: of the ball [m].
-        rest: the posture that joints stay near where they can [rad] or [m].
-        directions: unit, from the ball to each fingertip; None for any that are evenly around it.
-        weights: how much each fingertip's miss counts where directions are given, with a sum of one; None for evenly.
+        rest: the posture that joints stay near [rad] or [m].
+        directions: unit, from the ball to each fingertip, None for any that surround it evenly.
+        weights: of each fingertip's miss where directions are given, with a sum of one, None for equal ones.
         ball_fixed: whether the ball has to stay where it is.
     """
 
@@ -63,9 +63,9 @@ def around_ball(
     goal: FingertipGoal,
     surface: tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"]],
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "3"]]:
-    """The posture that puts the fingertips around a ball without overlap of links, and where the ball came to be.
+    """Return the posture that puts the fingertips around a ball without overlap of links, and the ball's final place.
 
-    Wrist joints stay put. Overlap is found by the points of `surface`, in link frames, and their links.
+    Wrist joints do not move. `surface` holds the points in link frames and their links, by which overlap is found.
     """
     kinematics = make_kinematics(hand, dtype=torch.float64)
     matrix = placement(hand.num_links, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
@@ -109,10 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """By how much the fingertips miss their places, and how one-sided they lie; `away` are their places from the ball.
-
-    In finger lengths and squared; fingertips whose directions are given lie as one-sided as these.
-    """
+    """Return how far the fingertips at `away` [m] miss their places, and how one-sided they lie [finger lengths²]."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -126,7 +123,7 @@ def _missed(
 
 
 def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Where each fingertip's ball lies from the middle one [m]: fingers side by side close side by side."""
+    """Return each fingertip's ball relative to the middle one [m], so that neighbouring fingers close side by side."""
     aside = np.zeros_like(fingers.roots)
     if fingers.mates.sum() > 1:
         knuckles, row = fingers.roots[fingers.mates], knuckle_row(fingers)
@@ -135,7 +132,6 @@ def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
 
 
 def _joined_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    """Which links are welded to each other, or one joint apart."""
     groups = hand.link_group
     above = np.where(hand.link_parent >= 0, groups[np.maximum(hand.link_parent, 0)], -1)[groups]
     return (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
@@ -150,7 +146,7 @@ _SPREAD = 0.7
 
 
 def default_palm(hand: HandModel) -> HandModel:
-    """The hand with a palm centre, a palm normal and an approach, and a warning that they are guessed."""
+    """Return the hand with a guessed palm centre, palm normal and approach, and a warning that they are guessed."""
     fingers = find_fingers(hand)
     normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
     warnings = [*hand.warnings, "palm guessed; name it in a hand description if it is wrong"]
@@ -163,7 +159,7 @@ def default_palm(hand: HandModel) -> HandModel:
 
 
 def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed")) -> HandModel:
-    """The hand with those postures guessed that `which` names, to suit its palm, and a warning that they are."""
+    """Return the hand with the postures that `which` names guessed for its palm, and a warning."""
     fingers = find_fingers(hand)
     ahead = hand.palm_center + _AHEAD * fingers.length * hand.palm_normal
     height = float(((fingers.tips - hand.palm_center) @ hand.palm_normal).mean())
@@ -191,7 +187,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
 
 
 def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """The direction in which a gripper's fingers point at mid-range, square to the line or plane that they stand on."""
+    """Return the direction in which a gripper's fingers point at mid-range, normal to the plane of their roots."""
     middle = middle_joints(hand, fingers)
     half_way = placed_tips(hand, fingers, middle) - fingers.roots
     along = units(half_way.mean(0), 1e-6)
@@ -209,10 +205,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Where each finger has the first joint that bends it, at a posture, base frame [m].
-
-    A joint that turns it about the direction `along` does not bend it, and may lie anywhere along its axis.
-    """
+    """Return the first joint of each finger that does not turn it about `along`, at a posture, base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):
@@ -226,7 +219,7 @@ def _first_bends(
 
 
 def _center(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The point of the palm's surface in front of which the fingers meet [m]."""
+    """Return the point of the palm's surface in front of which the fingers meet [m]."""
     surface = palm_points(hand, fingers)
     middle = 0.5 * (surface.min(0) + surface.max(0))
     if fingers.mates.any():
@@ -240,7 +233,7 @@ def _center(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -
 
 
 def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips"]:
-    """Weights with a sum of one that make the directions cancel as far as they can: two against one count as much."""
+    """Return weights with a sum of one that make the directions cancel as far as possible."""
     from scipy.optimize import nnls
 
     # A little ridge shares the weight between fingers on the same side.
@@ -250,10 +243,9 @@ def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips
 
 
 def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "tips 3"]:
-    """The side on which each finger of a gripper stands, in the palm's plane: there it opens, and no farther it closes.
+    """Return the side on which each finger of a gripper stands, in the palm's plane, zero for a finger alone.
 
-    Zero for a finger alone. Not the side that its tip is found on at some posture: fingers may have room to pass
-    through each other.
+    The side comes from the roots. The tips may pass through each other.
     """
     middle = middle_joints(hand, fingers)
     plane = np.eye(3) - np.outer(normal, normal)
@@ -267,11 +259,7 @@ def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Which way each finger of a human-like hand opens in the palm's plane.
-
-    Fingers that bend together straighten together, square to the row of their knuckles, and the thumb goes the other
-    way.
-    """
+    """Return the opening direction of each finger of a human-like hand in the palm's plane, the thumb's opposite."""
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

@@ -15,7 +15,7 @@ from graspd_core.hands.surface_points import surface_points
 # Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
 # the fourth leave a half, three around a circle or two against one leave a third or less.
 _ALIKE = 0.42
-# Directions within this cosine of each other are the same; a thumb's are not those of the fingers.
+# Directions within this cosine of each other are the same. A thumb's are not those of the fingers.
 _SAME_WAY = 0.7
 # From this cosine to the normal of a plane on, a finger stands up from it.
 _UPRIGHT = 0.5
@@ -32,8 +32,8 @@ class Fingers:
         tips: the fingertips in the base frame [m].
         palm: the group of links that all fingers hang from.
         wrist: joints that move the palm itself.
-        mates: the fingers of a human-like hand that bend the same way, without its thumb; none in a gripper.
-        bend: the unit direction in which they do, base frame; zero in a gripper.
+        mates: the fingers of a human-like hand that bend the same way, without its thumb. None in a gripper.
+        bend: the unit direction in which `mates` bend, base frame, zero in a gripper.
     """
 
     points: Float[np.ndarray, "tips 3"]
@@ -54,7 +54,7 @@ class Fingers:
 # Kept for the last few hands, which are hashed by identity.
 @lru_cache(maxsize=8)
 def find_fingers(hand: HandModel) -> Fingers:
-    """The chains that end in links which move no others, each with the far end of its last solids for a tip."""
+    """Find the chains that end in links which move no other link. The tip is the far end of the last solids."""
     groups = hand.link_group
     heads = np.unique(groups)
     above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}
@@ -92,7 +92,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """The middle of the points farthest from a finger's root; where that lies amid them, farthest from the palm's."""
+    """Return the middle of the points farthest from a finger's root, or from the palm if that lies amid the points."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
@@ -111,7 +111,7 @@ def _chain(group: int, above: dict[int, int]) -> list[int]:
 def _mates(
     hand: HandModel, points: LinkPoints, links: LinkNumbers, straight: LinkPoints, wrist: list[int]
 ) -> tuple[Bool[np.ndarray, "points"], Float[np.ndarray, "3"]]:
-    """Which fingers point and bend the same way, and which way they bend; none and zero for a gripper."""
+    """Return which fingers point and bend the same way, and their bending direction. None and zero for a gripper."""
     q = straight_joints(hand)
     travel = 0.5 * (hand.lower + hand.upper) - q
     travel[wrist] = 0.0
@@ -126,16 +126,13 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Whether two fingers stand on the plane of all three's roots, as a gripper's against its third.
-
-    A human-like hand's lie in it: those two with a thumb.
-    """
+    """Tell whether two fingers stand on the plane of all three roots. Those of a human-like hand lie in it."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 
 
 def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
-    """Surface points of the palm, or where the fingers join it if it has no solids, base frame [m]."""
+    """Return surface points of the palm, base frame [m]. Without solids: the roots of the fingers."""
     poses = link_poses(hand, straight_joints(hand))
     found = _group_surface(hand, poses, fingers.palm, 400, np.random.default_rng(0))
     return found if len(found) else fingers.roots
@@ -151,29 +148,29 @@ def _group_surface(
 
 
 def placed_tips(hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "tips 3"]:
-    """Fingertips at a posture, base frame [m]."""
+    """Return the fingertips at a posture, base frame [m]."""
     return in_base(link_poses(hand, q), fingers.points, fingers.links)
 
 
 def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """The direction in which the knuckles of two mates or more lie side by side."""
+    """Return the direction in which the knuckles of two mates or more lie side by side."""
     knuckles = fingers.roots[fingers.mates]
     return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
 
 
 def straight_joints(hand: HandModel) -> Float[np.ndarray, "joints"]:
-    """Joints at zero, or as near as they come."""
+    """Return joint values at zero, or as near as the limits allow."""
     return np.clip(0.0, hand.lower, hand.upper)
 
 
 def middle_joints(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "joints"]:
-    """Joints at mid-range, those that carry the palm straight."""
+    """Return joint values at mid-range, with the wrist straight."""
     middle = 0.5 * (hand.lower + hand.upper)
     middle[fingers.wrist] = straight_joints(hand)[fingers.wrist]
     return middle
 
 
 def units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
-    """Unit vectors; zero where shorter than `least`."""
+    """Return unit vectors, zero for those shorter than `least`."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)

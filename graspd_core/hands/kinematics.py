@@ -1,8 +1,8 @@
-"""Forward kinematics, batched over postures and parallel over the links of equal depth; a hand at a posture as a mesh.
+"""Forward kinematics, batched over postures and parallel over links of equal depth. A hand at a posture as a mesh.
 
-Everything is differentiable in the joint values; gradients are exact. Formulas: Rodrigues' rotation formula
-`R = I + sin(q) K + (1 - cos(q)) K²`, multiplied into each joint's constant offset beforehand, so that one link's local
-transform is a sum of three constant matrices.
+All functions of tensors are differentiable in the joint values with exact gradients. Formula: Rodrigues' rotation `R =
+I + sin(q) K + (1 - cos(q)) K²`, multiplied into each joint's constant offset beforehand. So a link's local transform is
+a sum of three constant matrices.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh, joined
 
-# Joint values of one posture; points [m] and the link of each; `T_base_link` of every link, turns and origins [m].
+# Joint values of one posture. Points [m] and their links. `T_base_link` of every link: rotations and origins [m].
 JointValues = Float[np.ndarray, "joints"]
 LinkPoints = Float[np.ndarray, "points 3"]
 LinkNumbers = Int[np.ndarray, "points"]
@@ -31,16 +31,16 @@ RETREAT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """A hand's constants as tensors on one device. Links are regrouped by depth; `order` undoes it.
+    """A hand's constants as tensors on one device. Links are regrouped by depth, and `order` undoes it.
 
     Attributes:
         constant, sine, cosine: `T_parent_link = constant + sin(q) sine + cos(q) cosine`, upper three rows.
-        slide: what a prismatic joint adds to the translation per metre; None where no joint is prismatic.
+        slide: what a prismatic joint adds to the translation per metre, None if no joint is prismatic.
         joint: the actuated joint of each regrouped link (0 where fixed: its coefficients are zero).
-        multiplier, shift: a coupled link's joint is at multiplier · q + shift; None where no joint is coupled.
+        multiplier, shift: a coupled link's joint is at multiplier · q + shift, None if no joint is coupled.
         level_sizes: number of links at each depth, the base's level first.
-        level_parents: per depth from 2 on, each link's parent within the level above; None where one to one.
-        order: position of each link of the hand in the regrouped list; None where it is the same.
+        level_parents: per depth from 2 on, each link's parent within the level above, None if one to one.
+        order: position of each link of the hand in the regrouped list.
     """
 
     constant: Float[Tensor, "links 3 4"]
@@ -58,7 +58,7 @@ class Kinematics:
 def make_kinematics(
     hand: HandModel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Kinematics:
-    """What `forward` needs; made once for a hand, device and dtype, and kept for the last few of them."""
+    """Return what `forward` needs. The last few results are kept."""
     return _make_kinematics(hand, torch.device(device), dtype)
 
 
@@ -95,7 +95,7 @@ def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) 
 
 
 def forward(kinematics: Kinematics, q: Float[Tensor, "batch joints"]) -> SE3:
-    """`T_base_link` of every link at joint values q [rad] or [m]: a batch of hands by links."""
+    """Return `T_base_link` of every link at joint values q [rad] or [m]: a batch of hands by links."""
     k = kinematics
     values = q[:, k.joint]
     if k.multiplier is not None and k.shift is not None:
@@ -116,11 +116,10 @@ def forward(kinematics: Kinematics, q: Float[Tensor, "batch joints"]) -> SE3:
 def placement(
     num_links: int, points: Float[Tensor, "points 3"], links: Int[Tensor, "points"], *, directions: bool = False
 ) -> Float[Tensor, "points columns"]:
-    """A constant matrix that places link-frame points (or directions, which are only turned) by one product.
+    """Return a constant matrix that places link-frame points (or directions) by one product.
 
-    Row p holds the homogeneous coordinates of point p in the four columns of its link, so that `place_points` is one
-    matrix product for the whole batch: half the time of gathering a rotation per point, whose backward pass is a
-    scatter.
+    Row p holds the homogeneous coordinates of point p in the four columns of its link. `place_points` is then one
+    matrix product for the whole batch, twice as fast as gathering a rotation per point.
     """
     matrix = points.new_zeros(len(points), num_links, 4)
     rows = torch.arange(len(points), device=points.device)
@@ -130,7 +129,7 @@ def placement(
 
 
 def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[Tensor, "batch points 3"]:
-    """Points of a `placement` in the base frame [m], for the link poses that `forward` gives."""
+    """Return the points of a `placement` in the base frame [m], at the link poses of `forward`."""
     batch = links.rotation.shape[0]
     poses = torch.cat([links.rotation, links.translation[..., None]], dim=-1)
     # Written out: of no pose at all, the number of rows could not be told from the size.
@@ -139,7 +138,7 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
 
 
 def placed_points(matrix: Float[Tensor, "points columns"]) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"]]:
-    """The points of a `placement` in the frames of their links [m], and their links."""
+    """Return the points of a `placement` in link frames [m], and their links."""
     columns = matrix.unflatten(1, (-1, 4))
     links = columns[..., 3].argmax(1)
     return columns[torch.arange(len(links), device=links.device), links, :3], links
@@ -151,7 +150,7 @@ def points_in_base(
     points: Float[Tensor, "points 3"],
     links: Int[Tensor, "points"],
 ) -> Float[Tensor, "batch points 3"]:
-    """Link-frame points at joint values q, base frame [m]. For a fixed set of points keep its `placement` instead."""
+    """Return link-frame points at joint values q, base frame [m]. For a fixed set of points keep its `placement`."""
     poses = forward(kinematics, q)
     return place_points(placement(poses.translation.shape[1], points, links), poses)
 
@@ -159,10 +158,10 @@ def points_in_base(
 def point_jacobian(
     hand: HandModel, q: JointValues, points: LinkPoints, links: LinkNumbers
 ) -> Float[np.ndarray, "points 3 joints"]:
-    """Geometric Jacobian of link-frame points, base frame, at one posture: `dx = J dq`, joint torques `τ = Σ Jᵀ f`.
+    """Return the geometric Jacobian of link-frame points, base frame, at one posture: `dx = J dq`, `τ = Σ Jᵀ f`.
 
-    A revolute joint with axis a through o moves a point x behind it by `a × (x − o)`, a prismatic one by `a`, and an
-    actuated joint by the sum over all that follow it, each times its multiplier.
+    A revolute joint with axis a through o moves a point x behind it by `a × (x − o)`, a prismatic one by `a`. Coupled
+    joints add to the column of the joint that they follow, times their multipliers.
     """
     rotation, translation = link_poses(hand, q)
     x = in_base((rotation, translation), points, links)
@@ -180,13 +179,13 @@ def point_jacobian(
 
 
 def link_poses(hand: HandModel, q: JointValues) -> LinkPoses:
-    """`T_base_link` of every link at one posture in float64 numpy [m]."""
+    """Return `T_base_link` of every link at one posture in float64 numpy [m]."""
     links = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q)[None].double())[0]
     return links.rotation.numpy(), links.translation.numpy()
 
 
 def in_base(poses: LinkPoses, points: LinkPoints, links: LinkNumbers) -> LinkPoints:
-    """Link-frame points in the base frame [m], at the poses that `link_poses` gives."""
+    """Return link-frame points in the base frame [m], at the poses of `link_poses`."""
     rotations, translations = poses
     return np.einsum("pij,pj->pi", rotations[links], points) + translations[links]
 
@@ -197,7 +196,7 @@ def drawn_back(
     approach: Float[Tensor, "3"],
     distance: float = RETREAT,
 ) -> Float[Tensor, "*batch 3"]:
-    """Return where base frames stand [m] that are moved straight back against the hand's approach direction."""
+    """Return the positions of base frames [m], moved straight back against the hand's approach direction."""
     return position - distance * (rotation @ approach)
 
 
@@ -208,7 +207,7 @@ def retreat_posture(hand: HandModel, pregrasp: Posture, distance: float = RETREA
 
 
 def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
-    """The number of joints between each link and the base."""
+    """Return the number of joints between each link and the base."""
     depth = np.zeros(len(parent), dtype=np.int64)
     for link, above in enumerate(parent):
         if above >= 0:
@@ -217,7 +216,7 @@ def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
 
 
 def _coefficients(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The four constant 3x4 matrices of each link (see `Kinematics`), in the hand's link order."""
+    """Return the four constant 3x4 matrices of each link (see `Kinematics`), in the hand's link order."""
     count = hand.num_links
     constant, sine, cosine, slide = (np.zeros((count, 3, 4)) for _ in range(4))
     for link in range(count):
@@ -236,7 +235,7 @@ def _coefficients(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
 
 def hand_mesh(hand: HandModel, q: JointValues) -> TriangleMesh:
-    """Every collision primitive at joint values q, base frame [m]: closed bodies that overlap, not one solid.
+    """Return all collision primitives at joint values q as one mesh of overlapping closed bodies, base frame [m].
 
     Curved faces are inscribed, with vertices on the true surface.
     """
@@ -246,7 +245,7 @@ def hand_mesh(hand: HandModel, q: JointValues) -> TriangleMesh:
 
 
 def primitive_mesh(primitive: Primitive) -> TriangleMesh:
-    """One primitive, triangulated, in the frame of its link [m]."""
+    """Return one primitive, triangulated, in the frame of its link [m]."""
     import trimesh
 
     size = primitive.size

@@ -28,18 +28,18 @@ DEFAULT_EFFORT, DEFAULT_FORCE = 0.7, 40.0
 
 
 def hand_names() -> tuple[str, ...]:
-    """Names of the hands that graspd ships with."""
+    """Return the names of the hands that graspd ships with."""
     return tuple(sorted(path.stem for path in (config_dir() / "hands").glob("*.yaml")))
 
 
 def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = "") -> HandModel:
-    """A hand by its name, by the path of its description (.yaml) or of a bare URDF (.urdf, .xml).
+    """Load a hand by its name, or from a description (.yaml), a bare URDF or MJCF (.urdf, .xml) or a MANO file (.pkl).
 
-    A bare URDF loads with a guessed palm and guessed postures, and a warning in `HandModel.warnings`. `prefix` is put
-    before the names of joints and links, which on a robot with two hands, or a base_link of its own, must differ.
+    A bare URDF gets a guessed palm and guessed postures, and a warning in `HandModel.warnings`. `prefix` is put before
+    the names of joints and links. Two hands on one robot need different names.
 
     Raises:
-        HandError: no such hand or file, or one that cannot be used: the message names the file and the culprit.
+        HandError: no such hand or file, or it cannot be used. The message names the file and the culprit.
     """
     if candidates < 1:
         raise HandError(f"candidates={candidates}: at least 1 is needed")
@@ -69,12 +69,10 @@ def _prefixed(hand: HandModel, prefix: str) -> HandModel:
 
 
 def read_hand_file(path: Path, root_link: str | None = None) -> HandModel:
-    """The hand of a URDF or an MJCF file, as `read_urdf` gives it; the root element decides which it is.
+    """Read a URDF or an MJCF file, as the root element decides.
 
-    Where `root_link` is given, of a URDF that holds a whole robot, the hand is that link and what hangs on it.
-
-    Raises:
-        HandError: it is neither, cannot be used, or has nothing that could touch an object.
+    `root_link` of a URDF names the link where the hand begins. Raises HandError: the file is neither, cannot be used,
+    or has no shape that could touch an object.
     """
     root = read_xml(path)
     readers = {"robot": read_urdf, "mujoco": read_mjcf}
@@ -117,7 +115,7 @@ _APART = 0.2
 
 
 def doubts(hand: HandModel) -> tuple[str, ...]:
-    """Say what a loaded hand can hardly have: efforts of a machine, an open linkage, fingers on two palms."""
+    """Return warnings of what a hand can hardly have: efforts of a machine, an open linkage, fingers on two palms."""
     rotations, translations = link_poses(hand, np.clip(0.0, hand.lower, hand.upper))
     linkages = _open_linkages(hand, rotations, translations)
     return (*_strong_joints(hand), *linkages, *_palms(hand, translations))
@@ -136,7 +134,7 @@ def _strong_joints(hand: HandModel) -> tuple[str, ...]:
 def _open_linkages(
     hand: HandModel, rotations: Float[np.ndarray, "links 3 3"], translations: Float[np.ndarray, "links 3"]
 ) -> tuple[str, ...]:
-    """Free joints side by side on one link, of which one moves nothing but its own link: half of a closed linkage."""
+    """Warn of free joints side by side on one link, if one of them moves only its own link: an open linkage."""
     parents = {link: int(hand.link_group[hand.link_parent[link]]) for link in np.flatnonzero(hand.link_joint >= 0)}
     coupled = {mimic.link for mimic in hand.mimics}
     free = [link for link in parents if link not in coupled and hand.joint_kind[link] == "revolute"]
@@ -156,7 +154,7 @@ def _open_linkages(
 
 
 def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple[str, ...]:
-    """Two links far apart, neither above the other, which fingers hang from."""
+    """Warn of two links far apart, neither above the other, which fingers hang from."""
     counts = Counter(int(hand.link_parent[link]) for link in np.flatnonzero(hand.link_joint >= 0))
     branches = sorted(link for link, count in counts.items() if count > 1)
 
@@ -174,7 +172,7 @@ def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple
 
 @lru_cache
 def hand_hash(name: str) -> str:
-    """Hash of a hand's URDF and description. Raises HandError: there is no such hand, or it cannot be used."""
+    """Return the hash of a hand's URDF and description. Raises HandError: no such hand, or it cannot be used."""
     hand = load_hand(name, candidates=1)
     boxed = config_dir() / "hands" / f"{name}.yaml"
     files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]

@@ -1,14 +1,12 @@
 """Signed distance of points to a link's collision primitives, negative inside.
 
-Distances to boxes, spheres, capsules and cylinders are exact [m]. Their gradients are exact where the distance is
-differentiable; on a centre or an axis, where it is not, they are zero (see `se3.safe_norm`), never NaN. Two
-approximations: inside a union the depth to the nearest single primitive's surface is a lower bound of the depth below
-the union's surface, and a hull's distance is the greatest of its face planes' distances, exact inside and a lower
-bound outside near edges and corners.
+Distances to boxes, spheres, capsules and cylinders are exact [m], and so are their gradients where they exist. On a
+centre or an axis the gradient is zero (see `se3.safe_norm`). Two approximations: inside a union, the depth to the
+nearest single primitive is a lower bound. The distance to a hull is the greatest to its face planes:
+exact inside and a lower bound outside near edges and corners.
 
-`CollisionTensors` hold all primitives of a hand at once, for the distance of object points to every link: boxes and
-round solids (cylinders; spheres and capsules count as swept points and segments) are exact; hulls are left to the
-contact candidates. Gradients are exact where the distance is smooth.
+`CollisionTensors` hold all boxes and round solids of a hand at once, for the distance of object points to every link.
+Hulls are left to the contact candidates.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.se3 import SE3, safe_norm
 
-# Points, and a distance of each; a size of a solid, one for all points or one for each [m].
+# Points and their distances. A size of a solid, one for all points or one for each [m].
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
 _Length = float | Float[Tensor, "*#batch"]
 # Primitives of which planes and bounds are remembered: those of the most crowded hand.
@@ -34,7 +32,7 @@ _MOST = 2048
 
 
 def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
-    """Signed distance [m] of points in the link's frame to one primitive."""
+    """Return the signed distance [m] of points in the link's frame to one primitive."""
     rotation, translation = (torch.as_tensor(a).to(points) for a in (primitive.rotation, primitive.translation))
     local = (points - translation) @ rotation
     size = primitive.size
@@ -51,11 +49,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
-    """Depth [m] of points in a link's frame inside the union of its primitives, zero outside and for a bare link.
-
-    Primitives are only asked about points within their bounding boxes: a hand of many fine meshes has a hundred
-    thousand planes.
-    """
+    """Return the depth [m] of points in a link's frame inside the union of its primitives, zero outside."""
     depth = np.zeros(len(points))
     near = np.flatnonzero(within_bounds(hand.primitives_of[link], points))
     for primitive in hand.primitives_of[link]:
@@ -68,7 +62,7 @@ def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3
 def within_bounds(
     primitives: Sequence[Primitive], points: Float[np.ndarray, "points 3"], margin: float = 0.0
 ) -> Bool[np.ndarray, "points"]:
-    """Which points in the link's frame lie within the bounding box of its primitives, or up to `margin` [m] off it."""
+    """Return which points lie within `margin` [m] of the bounding box of the primitives, in the link's frame."""
     if not primitives:
         return np.zeros(len(points), dtype=bool)
     low, high = _bounds_of_all(tuple(primitives))
@@ -83,7 +77,7 @@ def _bounds_of_all(primitives: tuple[Primitive, ...]) -> tuple[Float[np.ndarray,
 
 @lru_cache(maxsize=_MOST)
 def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Least and greatest coordinates of a primitive in its link's frame [m]; those of a box about it if it is round."""
+    """Return the least and greatest coordinates of a primitive in its link's frame [m]."""
     if primitive.kind == "hull":
         corners = primitive.vertices @ primitive.rotation.T + primitive.translation
         return corners.min(0), corners.max(0)
@@ -95,7 +89,7 @@ def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 
 @lru_cache(maxsize=_MOST)
 def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Float[np.ndarray, "planes"]]:
-    """Distinct face planes `n·x = d` of a hull in its own frame: outward unit normals and offsets [m]."""
+    """Return the distinct face planes `n·x = d` of a hull in its own frame: outward unit normals and offsets [m]."""
     cross = scaled_normals(primitive.vertices, primitive.faces)
     area = np.linalg.norm(cross, axis=1)
     keep = area > 1e-14
@@ -107,24 +101,24 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
 
 
 def sphere_sdf(points: _Places, radius: _Length) -> _Distances:
-    """Distance [m] to a sphere about the origin."""
+    """Return the distance [m] to a sphere about the origin."""
     return safe_norm(points) - radius
 
 
 def capsule_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
-    """Distance [m] to a capsule along z: all points within `radius` of the segment |z| ≤ `half_length`."""
+    """Return the distance [m] to a capsule: all points within `radius` of the segment |z| ≤ `half_length`."""
     z = points[..., 2]
     beyond = z.sign() * (z.abs() - half_length).clamp_min(0.0)
     return safe_norm(torch.cat([points[..., :2], beyond[..., None]], -1)) - radius
 
 
 def box_sdf(points: _Places, half_extents: Float[Tensor, "*#batch 3"]) -> _Distances:
-    """Distance [m] to an axis-aligned box about the origin."""
+    """Return the distance [m] to an axis-aligned box about the origin."""
     return corner_sdf(points.abs() - half_extents)
 
 
 def cylinder_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
-    """Distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
+    """Return the distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
     return corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
 
 
@@ -139,11 +133,11 @@ _AT_ONCE, _AT_ONCE_ELSEWHERE = 2**21, 2**25
 
 @dataclass(frozen=True, eq=False)
 class CollisionTensors:
-    """Primitives in one common form: a box of half extents `core`, swept by `radius`; cylinders are round boxes.
+    """Primitives in one common form: a box of half extents `core`, swept by `radius`. Cylinders are round boxes.
 
     Attributes:
         rotation, translation: `T_link_primitive` [m].
-        core: half extents of a box, or (radius, radius, half length) of a cylinder; zero-width for swept solids [m].
+        core: half extents of a box, or (radius, radius, half length) of a cylinder, zero-width for swept solids [m].
         radius: sweep radius of spheres and capsules, zero for others [m].
         is_round: one where x and y are one radial coordinate.
         link: link of each primitive.
@@ -158,7 +152,7 @@ class CollisionTensors:
 
 
 def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
-    """The hand's boxes and round solids as tensors; kept like `make_kinematics`."""
+    """Return the hand's boxes and round solids as tensors. The last few results are kept."""
     return _make_collision_tensors(hand, torch.device(device), dtype)
 
 
@@ -193,7 +187,7 @@ def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.
 def solid_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Signed distance [m] of base-frame points to every solid, negative inside, for the link poses of `forward`."""
+    """Return the signed distance [m] of base-frame points to every solid, negative inside, at poses of `forward`."""
 
     def whole(links: SE3, points: Tensor) -> Tensor:
         return _distance(_to_solids(solids, links, points), solids.core, solids.radius, solids.is_round)
@@ -204,7 +198,7 @@ def solid_distance(
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """A cheap lower bound of `solid_distance` [m]: largest coordinate of the offset from the bounding box."""
+    """Return a cheap lower bound of `solid_distance` [m]: the largest coordinate of the offset from the box."""
 
     def whole(links: SE3, points: Tensor) -> Tensor:
         return (_to_solids(solids, links, points).abs() - (solids.core + solids.radius[:, None])).amax(-1)
@@ -233,7 +227,7 @@ def _to_solids(
 def pair_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch pairs 3"], which: Int[Tensor, "batch pairs"]
 ) -> Float[Tensor, "batch pairs"]:
-    """Signed distance [m] of base-frame points each to one solid."""
+    """Return the signed distance [m] of base-frame points, each to one solid."""
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)
@@ -241,7 +235,7 @@ def pair_distance(
 
 
 def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, "*batch"]) -> _Distances:
-    """Signed distance [m] of points in the frame of a solid to it, each to one."""
+    """Return the signed distance [m] of points in the frame of a solid, each to one solid."""
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 

@@ -1,4 +1,4 @@
-"""What a hand is: a frozen tree of links with joints, masses, collision primitives and contact candidates.
+"""A hand as a frozen tree of links with joints, masses, collision primitives and contact candidates.
 
 Link frames are the URDF's. The base frame is the frame of `base_link`. Metres, radians, kilograms, newton metres.
 """
@@ -30,9 +30,9 @@ class Primitive:
     Attributes:
         link: index of the link it belongs to.
         kind: what solid it is.
-        rotation: `R_link_primitive`; capsules and cylinders lie along the primitive's z axis.
+        rotation: `R_link_primitive`, capsules and cylinders lie along the primitive's z axis.
         translation: the primitive's origin in the link frame [m].
-        size: box: three half extents; sphere: radius; capsule and cylinder: radius, half length; hull: empty [m].
+        size: [m] three half extents (box), radius (sphere), radius and half length (capsule, cylinder), none (hull).
         vertices: corners of a hull in the primitive's frame, empty for other kinds [m].
         faces: triangles of a hull, counter-clockwise seen from outside.
     """
@@ -48,12 +48,12 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint that is coupled to an actuated one: its value is `multiplier · q[joint] + offset`.
+    """A joint coupled to an actuated one: its value is `multiplier · q[joint] + offset`.
 
     Attributes:
         name: of the coupled joint.
         link: the link that it moves.
-        joint: the actuated joint that it follows; chains of coupled joints are resolved.
+        joint: the actuated joint that it follows, chains of coupled joints resolved.
         multiplier: its travel for one radian or metre of that joint.
         offset: its value where that joint is at zero [rad] or [m].
     """
@@ -82,7 +82,7 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A hand as loaded. Links are in depth-first order, link 0 is `base_link`; joints in depth-first order too.
+    """A hand as loaded. Links and joints are in depth-first order. Link 0 is `base_link`.
 
     Joints are the actuated ones throughout: coupled joints follow from them (`mimics`), and only what leaves graspd
     lists them too (`all_joint_names`).
@@ -100,12 +100,12 @@ class HandModel:
         palm_normal: unit direction out of the palm, base frame.
         approach: unit direction in which the hand moves towards an object, base frame.
         link_parent: each link's parent, -1 for the base.
-        link_joint: the actuated joint that moves the link against its parent, directly or coupled; -1 where none does.
+        link_joint: the actuated joint that moves the link against its parent, directly or coupled, -1 for none.
         link_offset_rotation, link_offset_translation: `T_parent_link` at joint value zero [m].
         joint_axis: unit axis of the link's own joint in the link frame, zero where fixed.
         joint_kind: kind of the joint between link and parent.
         link_group: links welded to each other by fixed joints share a number.
-        link_mass: [kg]; zero where the description gives none.
+        link_mass: [kg], zero if the description gives none.
         link_com: centre of mass, link frame [m].
         link_inertia: about the centre of mass, in link axes [kg·m²].
         primitives: collision solids.
@@ -193,7 +193,7 @@ class HandModel:
 
     @cached_property
     def link_joint_names(self) -> tuple[str, ...]:
-        """Name of the joint that moves each link against its parent, coupled ones too; empty where none does."""
+        """Name of the joint that moves each link against its parent, coupled ones too, empty for none."""
         names = [self.joint_names[joint] if joint >= 0 else "" for joint in self.link_joint.tolist()]
         for mimic in self.mimics:
             names[mimic.link] = mimic.name
@@ -232,11 +232,11 @@ class HandModel:
 
 
 def all_joint_names(hand: HandModel) -> tuple[str, ...]:
-    """Names of all movable joints, coupled ones too, in depth-first order: what goes to files and messages."""
+    """Return the names of all movable joints, coupled ones too, depth-first, as files and messages hold them."""
     return tuple(name for name in hand.link_joint_names if name)
 
 
 def all_joint_positions(hand: HandModel, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "movable"]:
-    """Values of `all_joint_names` at actuated values q [rad] or [m]."""
+    """Return the values of `all_joint_names` at actuated values q [rad] or [m]."""
     moved = hand.link_joint >= 0
     return hand.link_multiplier[moved] * q[hand.link_joint[moved]] + hand.link_shift[moved]

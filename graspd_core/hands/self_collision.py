@@ -1,11 +1,8 @@
-"""Spheres that fill the links, for a cheap differentiable self-collision term; which links overlap at a posture.
+"""Spheres that fill the links, for a cheap differentiable self-collision term. Overlap of links at a posture.
 
-The spheres are an approximation by choice: spheres bulge out of the flat faces of long boxes by up to a fifth of their
-half thickness, and leave edges and corners bare. Metrics use signed distances instead.
-
-The term looks at every pair of spheres, so that they are bounded: solids thinner than a few millimetres get spheres
-that bulge, and of those of a hand of many or large solids only the ones are kept that stick out of each other
-farthest.
+The spheres approximate: they bulge out of the flat faces of long boxes by up to a fifth of the half thickness. Metrics
+use signed distances instead. The term looks at every pair of spheres, so their number is bounded. Thin solids get
+spheres that bulge. Crowded hands keep the spheres that stick out farthest.
 """
 
 from __future__ import annotations
@@ -21,9 +18,9 @@ from graspd_core.hands.link_distance import depth_inside
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import dense_samples, kept, parent_groups
 
-# The most spheres of a rigid group of links, and of a hand; one of more groups than that has one for each.
+# The most spheres of a rigid group of links, and of a hand. One of more groups than that has one for each.
 MOST_OF_GROUP, MOST_OF_HAND = 64, 160
-# The finest radius that solids are filled with [m]; they may themselves be smaller.
+# The finest radius that solids are filled with [m]. They may themselves be smaller.
 _FINEST = 0.003
 # What the spheres of a crowded hand leave bare where there are enough, and a disc around its one sphere [m].
 _BARE, _RIM = 0.001, 0.01
@@ -33,7 +30,7 @@ _BARE, _RIM = 0.001, 0.01
 def collision_spheres(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "spheres 3"], Float[np.ndarray, "spheres"], Int[np.ndarray, "spheres"]]:
-    """Centres in link frames [m], radii [m] and links of spheres that fill the solids, at most `MOST_OF_HAND`."""
+    """Return centres in link frames [m], radii [m] and links of at most `MOST_OF_HAND` spheres that fill the solids."""
     centers, radii, links = [], [], []
     for primitive in hand.primitives:
         at, radius = _fill(primitive)
@@ -52,9 +49,9 @@ def collision_spheres(
 def _spread(
     centers: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"], groups: Int[np.ndarray, "n"]
 ) -> Int[np.ndarray, "kept"]:
-    """The largest sphere of each group, then whichever sticks farthest out of those of its group that were chosen.
+    """Choose the largest sphere of each group, then always the one that sticks farthest out of those chosen.
 
-    So chosen, they leave about as much bare everywhere: farthest-point sampling (Gonzalez 1985).
+    This is farthest-point sampling (Gonzalez 1985).
     """
     # Farther out than any sphere can stick: nothing of its group has been chosen.
     bare = 1e3 + radii
@@ -71,7 +68,7 @@ def _spread(
 
 
 def _fill(primitive: Primitive) -> tuple[Float[np.ndarray, "spheres 3"], float]:
-    """Sphere centres in the primitive's frame and their common radius [m]."""
+    """Return sphere centres in the primitive's frame and their common radius [m]."""
     size = primitive.size
     if primitive.kind == "sphere":
         return np.zeros((1, 3)), size[0]
@@ -121,9 +118,9 @@ def link_overlaps(
     points: Float[np.ndarray, "samples 3"],
     links: Int[np.ndarray, "samples"],
 ) -> Float[np.ndarray, "postures links links"]:
-    """Greatest depth [m] of each link's surface samples (link frames) inside each other link, symmetric, 0 where clear.
+    """Return the greatest depth [m] of each link's surface samples (link frames) inside each other link, symmetric.
 
-    Adjacent pairs are reported like any other: mask with `hand.adjacent`.
+    Adjacent pairs are included: mask them with `hand.adjacent`.
     """
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q).double())
     owner = torch.as_tensor(links)
@@ -140,17 +137,16 @@ def link_overlaps(
 
 
 def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) -> Float[np.ndarray, "postures"]:
-    """Greatest depth [m] of a contact candidate inside a link that is not adjacent to its own, hulls included."""
+    """Return the greatest depth [m] of a contact candidate inside a link that is not adjacent to its own."""
     overlap = link_overlaps(hand, q, hand.candidate_points, hand.candidate_link)
     return np.where(hand.adjacent, 0.0, overlap).max((1, 2))
 
 
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    """Pairs of links that are never checked against each other, remembered on disk by the hand's content.
+    """Return the pairs of links that are never checked against each other, remembered on disk by the hand's content.
 
-    Welded links; links with one joint between them; links with two joints between them that never do more than graze
-    (boxes stand for rounded knuckles, whose corners would otherwise block the joint); and pairs that overlap in the
-    open posture or in every sampled posture.
+    These are links welded or one joint apart, and links two joints apart that at most graze, as boxes stand for rounded
+    knuckles. Pairs that overlap in the open posture or in every sampled posture are adjacent too.
     """
     build = lambda: {"adjacent": _adjacent_links(hand)}  # noqa: E731
     return kept(hand, "adjacent", hand.num_links, {"adjacent": (hand.num_links,)}, build)["adjacent"]

@@ -1,8 +1,8 @@
-"""How deep the solids of a hand are in each other: by separating axes, for links that are not adjacent.
+"""How deep the solids of links that are not adjacent overlap, by separating axes.
 
-Two boxes are apart along a normal of one of them or across an edge of each, so that the least overlap along these
-fifteen directions is exact. Round solids are looked at along three more; where an edge meets a rim, the depth that
-these give is somewhat too large. Hulls have no part in it. Gradients are exact where one direction is the least.
+Two boxes are apart along a face normal of one or across an edge of each. The least overlap along these fifteen
+directions is exact. Round solids take three more directions. Where an edge meets a rim the depth is somewhat too large.
+Hulls are left out. Gradients are exact where one direction is the least.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _RATHER_FACES = 1e-6
 
 
 def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs of solids, hulls left out, whose links are not adjacent."""
+    """Return the pairs of solids, without hulls, whose links are not adjacent."""
     link = np.array([p.link for p in hand.primitives if p.kind != "hull"], dtype=np.int64)
     return np.argwhere(np.triu(~hand.adjacent[np.ix_(link, link)], 1))
 
@@ -31,7 +31,7 @@ def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
 def solid_overlaps(
     solids: CollisionTensors, pairs: Int[Tensor, "pairs 2"], links: SE3
 ) -> tuple[Int[Tensor, "overlaps"], Float[Tensor, "overlaps"]]:
-    """The rows of the pairs that overlap in a batch of link poses, and how deep they do [m], differentiable."""
+    """Return the rows of the pairs that overlap in a batch of link poses, and their depth [m], differentiable."""
     placed = links[:, solids.link].compose(SE3(solids.rotation, solids.translation))
     apart = placed.translation[:, pairs[:, 0]] - placed.translation[:, pairs[:, 1]]
     reach = (solids.core.norm(dim=-1) + solids.radius)[pairs].sum(-1)
@@ -56,7 +56,7 @@ def solid_overlaps(
 def _width(
     solids: CollisionTensors, which: Int[Tensor, "n"], local: Float[Tensor, "n directions 3"]
 ) -> Float[Tensor, "n directions"]:
-    """Half the extent of each solid along directions in its own frame [m]."""
+    """Return half the extent of each solid along directions in its own frame [m]."""
     core, round_one = solids.core[which][:, None], solids.is_round[which][:, None] > 0
     x, y, z = local.abs().unbind(-1)
     radial = (x * x + y * y).clamp_min(1e-24).sqrt()

@@ -1,8 +1,7 @@
 """The hand's outer surface as points: contact candidates for the optimiser, dense samples for the metrics.
 
-The outer surface is what can touch something: points inside another solid welded to the same link are left out, and so
-are those that stay inside the next link of the chain at every value of the joint between them. Random points are
-uniform by area. Feature points are what a sparse random set misses: edges, corners and rims.
+Points inside another solid of the same rigid group are left out, and points that stay inside the next link at every
+joint value. Random points are uniform by area. Feature points add edges, corners and rims.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Samples = tuple[Points, LinkNumbers, Float[np.ndarray, "points"]]
 
 
 def primitive_area(primitive: Primitive) -> float:
-    """Surface area [m²]."""
+    """Return the surface area [m²]."""
     size = primitive.size
     if primitive.kind == "box":
         return 8.0 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
@@ -45,7 +44,7 @@ def primitive_area(primitive: Primitive) -> float:
 
 
 def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[Points, Points]:
-    """`count` random surface points [m] and their outward normals."""
+    """Draw `count` random surface points [m] and their outward normals."""
     if primitive.kind == "box":
         points, normals = _box(np.asarray(primitive.size), count, rng)
     elif primitive.kind == "hull":
@@ -56,7 +55,7 @@ def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -
 
 
 def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
-    """Points on edges and rims at most `spacing` [m] apart, their mean normals, and which of them are corners."""
+    """Return points on edges and rims at most `spacing` [m] apart, their mean normals, and which are corners."""
     if primitive.kind == "box":
         points, normals, corner = _box_edges(np.asarray(primitive.size), spacing)
     elif primitive.kind == "cylinder":
@@ -72,7 +71,7 @@ def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points
 
 
 def outermost(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
-    """The points that lie farthest out along `count` directions, which are spread evenly."""
+    """Return the points that lie farthest out along `count` evenly spread directions."""
     # By parts: a fine mesh has a hundred thousand points.
     parts = np.array_split(even_directions(count), -(-count // 64), axis=1)
     return points[np.unique(np.concatenate([(points @ part).argmax(0) for part in parts]))]
@@ -96,7 +95,7 @@ def _box(half: Float[np.ndarray, "3"], count: int, rng: np.random.Generator) -> 
 
 
 def _round(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[Points, Points]:
-    """Sphere, capsule and cylinder: a barrel, and caps that are half balls or discs."""
+    """Sample spheres, capsules and cylinders: a barrel, and caps that are half balls or discs."""
     radius = primitive.size[0]
     half = primitive.size[1] if len(primitive.size) > 1 else 0.0
     flat = primitive.kind == "cylinder"
@@ -164,7 +163,7 @@ _MOST_DRAWN = 200
 _MOST_FEATURES = 20_000
 # Of the candidates, the most that may be corners chosen beforehand.
 _CORNER_SHARE = 0.3
-# Spacing of candidates is inversely proportional to these; a surface that faces the grasp has 1.
+# Spacing of candidates is inversely proportional to these. A surface that faces the grasp has 1.
 _TIP_WEIGHT, _EDGE_WEIGHT, _BACK_WEIGHT = 2.0, 1.25, 0.5
 
 
@@ -180,17 +179,13 @@ class _Pool:
     corner: Bool[np.ndarray, "points"]
 
     def take(self, keep: np.ndarray) -> _Pool:
-        """The points that a mask or an index array chooses."""
+        """Return the points that a mask or an index array chooses."""
         return _Pool(*(array[keep] for array in vars(self).values()))
 
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """The hand with `count` contact candidates, the same of every such hand; itself where it has as many.
-
-    Raises:
-        HandError: fewer than one.
-    """
+    """Return the hand with `count` contact candidates, itself if it has as many. Raises HandError: fewer than one."""
     if count < 1:
         raise HandError(f"candidates={count}: at least 1 is needed")
     if count == len(hand.candidate_link):
@@ -205,12 +200,11 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
 
 
 def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, LinkNumbers]:
-    """Evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
+    """Return evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
 
-    Corners of boxes that face the grasp are always in, since they are what sinks in unnoticed; then farthest-point
-    sampling (Gonzalez 1985) within each rigid group of links, denser on fingertips and sparser on backs (`_weights`).
-    The order is that of the sampling: the first n of many cover the hand evenly too. They lie on a link's skin where it
-    has one.
+    Corners of boxes that face the grasp come first. Then farthest-point sampling (Gonzalez 1985) runs within each rigid
+    group, denser on fingertips and sparser on backs (`_weights`). The first n of many cover the hand evenly too.
+    Candidates lie on a link's skin if it has one.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
@@ -235,12 +229,10 @@ def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, 
 
 
 def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Samples:
-    """At least `count` random points of the outer surface for judging: points in link frames [m], links, areas [m²].
+    """Return at least `count` random points of the outer surface: points in link frames [m], links, areas [m²].
 
-    Independent of the candidates. The areas sum to the area of the hand's outer surface.
-
-    Raises:
-        HandError: hardly any of its surface is outer surface.
+    They are independent of the candidates. The areas sum to the area of the outer surface. Raises HandError: hardly any
+    of its surface is outer surface.
     """
     rng = np.random.default_rng(seed)
     drawn, pool = count, _exposed(hand, _random_pool(hand, count, rng))
@@ -253,7 +245,7 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
 
 
 def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
-    """`dense_samples`, remembered on disk by the hand's content."""
+    """Return `dense_samples`, remembered on disk by the hand's content."""
 
     def build() -> dict[str, np.ndarray]:
         points, links, areas = dense_samples(hand, count=count, seed=seed)
@@ -266,7 +258,7 @@ def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
 def kept(
     hand: HandModel, what: str, rows: int, shapes: Mapping[str, tuple[int, ...]], build: Callable[[], cache.Arrays]
 ) -> cache.Arrays:
-    """What `build` samples of this hand, or sampled of one of the same content, remembered on disk.
+    """Return what `build` samples of a hand of this content, remembered on disk.
 
     Args:
         what: name of the samples and all settings that they depend on.
@@ -287,7 +279,6 @@ def kept(
 def _pool(
     hand: HandModel, parts: Sequence[tuple[np.ndarray, ...]], areas: np.ndarray, corner: Bool[np.ndarray, "points"]
 ) -> _Pool:
-    """The points and normals of each of the hand's primitives together."""
     points, normals = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     counts = [len(part[0]) for part in parts]
     links, source = np.repeat([p.link for p in hand.primitives], counts), np.repeat(np.arange(len(counts)), counts)
@@ -313,7 +304,7 @@ def _feature_pool(hand: HandModel) -> _Pool:
 
 
 def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
-    """The points of the pool that lie on the outer surface."""
+    """Return the points of the pool that lie on the outer surface."""
     pool = pool.take(~_covered_in_group(hand, pool))
     groups, above = hand.link_group[pool.links], parent_groups(hand)
     always = np.ones(len(pool.points), dtype=bool)
@@ -333,7 +324,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 
 
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
-    """Points inside another solid of their rigid group, on a face glued to one, or flush with an earlier one."""
+    """Return which points lie inside another solid of their group, on a face glued to one, or flush with another."""
     poses = link_poses(hand, hand.open_posture)
     placed = in_base(poses, pool.points, pool.links)
     raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)
@@ -357,7 +348,7 @@ def _by_group(hand: HandModel) -> dict[int, list[tuple[int, Primitive]]]:
 
 
 def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[np.ndarray, "points"]:
-    """Signed distance [m] of base-frame points to one primitive, at one posture; infinite off its bounds."""
+    """Return the signed distance [m] of base-frame points to one primitive at one posture, infinite off its bounds."""
     rotations, translations = poses
     local = (points - translations[primitive.link]) @ rotations[primitive.link]
     distance = np.full(len(local), np.inf)
@@ -368,9 +359,9 @@ def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[n
 
 
 def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
-    """By group number: the nearest group with solids that the group's first link hangs from, -1 where there is none.
+    """Return for each group the nearest group with solids that it hangs from, -1 for none.
 
-    Bare groups are passed over: a joint of several axes is modelled by hinges with massless links between them.
+    Groups without solids are passed over: a joint of several axes consists of hinges with massless links between them.
     """
     parent = hand.link_parent
     above = np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)
@@ -383,9 +374,9 @@ def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
 
 
 def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
-    """How densely each point's surroundings deserve candidates, and whether the point faces the grasp.
+    """Return the density of candidates around each point, and whether the point faces the grasp.
 
-    A link faces where closing the hand takes it; the palm faces along its normal. A fingertip is the outer half of a
+    A link faces where closing the hand moves it, the palm faces along its normal. A fingertip is the outer half of a
     rigid group that ends a finger.
     """
     poses = rotations, origins = link_poses(hand, hand.open_posture)
@@ -412,7 +403,7 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
 def _farthest(
     points: Points, groups: LinkNumbers, weights: Float[np.ndarray, "points"], chosen: np.ndarray, count: int
 ) -> Int[np.ndarray, "picked"]:
-    """Farthest-point sampling of weighted distances; points of different groups are infinitely far from each other."""
+    """Run farthest-point sampling on weighted distances. Points of different groups are infinitely far apart."""
     members = {group: np.flatnonzero(groups == group) for group in np.unique(groups)}
 
     def mates(index: int) -> np.ndarray:

@@ -58,11 +58,11 @@ class BagFrame:
     def view(
         self, transforms: TransformBuffer | None = None, target: str | None = None, place: CameraPlace = ORIGIN
     ) -> PointCloud:
-        """What the camera saw, in its own frame or in `target`; a cloud's camera stood at `place`.
+        """Return what the camera saw, in its own frame or in `target`. The camera of a cloud stood at `place`.
 
         Raises:
             CloudError: the message is broken or shows nothing.
-            TransformError: where the frame stood in `target` is not known for that time.
+            TransformError: the pose of the frame in `target` is not known for that time.
         """
         # A driver that does not stamp its messages leaves zero: then the newest transform has to do.
         lookup = no_lookup if transforms is None else lambda to, of: transforms.lookup(to, of, self.stamp or None)
@@ -78,7 +78,7 @@ class BagFrame:
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a path looks like a recording: a storage file, or a directory with one or its metadata in it."""
+    """Tell whether a path looks like a recording: a storage file, or a directory with one or its metadata."""
     path = Path(path)
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_storage_files(path))
@@ -86,16 +86,15 @@ def is_bag(path: str | Path) -> bool:
 
 
 def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
-    """The topics of a recording, by name. Raises BagError: not a bag, or a broken one."""
+    """Return the topics of a recording, by name. Raises BagError: not a bag, or a broken one."""
     with _opened(path) as reader:
         return _topics(reader)
 
 
 def read_transforms(path: str | Path) -> TransformBuffer:
-    """All that a recording says of frames (/tf and /tf_static), from its beginning to its end.
+    """Read all transforms of a recording (/tf and /tf_static).
 
-    Raises:
-        BagError: not a bag, a broken one, or one without transforms.
+    Raises BagError: not a bag, a broken one, or one without transforms.
     """
     buffer = TransformBuffer(history=None)
     with _opened(path) as reader:
@@ -116,12 +115,12 @@ def read_frames(
     every: int = 1,
     limit: int | None = None,
 ) -> Iterator[BagFrame]:
-    """The clouds of a recording, or its depth images with their camera, in the order of recording.
+    """Yield the clouds of a recording, or its depth images with their camera, in the order of recording.
 
     Args:
         path: a rosbag2 directory, or one of its storage files (.mcap, .db3).
-        topic: of PointCloud2 or of depth images; None takes the only one there is, clouds before depth images.
-        info_topic: CameraInfo of the depth images; None takes `camera_info` beside them, or the only one there is.
+        topic: of PointCloud2 or of depth images. None takes the only one there is, clouds before depth images.
+        info_topic: CameraInfo of the depth images. None takes `camera_info` beside them, or the only one there is.
         every: take one of so many.
         limit: end after so many taken.
 
@@ -153,10 +152,9 @@ def read_frames(
 
 
 def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
-    """Recorded messages as they lie there (CDR) and their time of recording [ns]; all topics, or those named.
+    """Yield recorded messages as stored (CDR) with their time of recording [ns], of all topics or those named.
 
-    Raises:
-        BagError: not a bag, a broken one, or a topic that is not in it.
+    Raises BagError: not a bag, a broken one, or a topic that is not in it.
     """
     with _opened(path) as reader:
         known = {topic.name: topic for topic in _topics(reader)}
@@ -170,7 +168,7 @@ def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[B
 
 @cache
 def jazzy_types() -> Any:
-    """The message types of ROS 2 Jazzy, for bags that do not carry their own definitions."""
+    """Return the message types of ROS 2 Jazzy, for bags that do not carry their own definitions."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -208,7 +206,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
 
 
 def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, Any]]:
-    """Messages in order of their times of recording; those of one time in the order of the file."""
+    """Yield messages by time of recording, those of one time in the order of the file."""
     if not connections:
         return
     messages = reader.messages(connections=connections)
@@ -223,10 +221,7 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
 
 
 def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
-    """The message; its type as Jazzy defines it, else as the bag does.
-
-    A bag that gives a known type other fields would else make messages that nobody here can read.
-    """
+    """Return the message, its type as Jazzy defines it, since fields of a bag's own definition could not be read."""
     kind, known = connection.msgtype, jazzy_types()
     types = known if kind in known.fielddefs else reader.typestore
     try:
@@ -273,7 +268,6 @@ def _is_depth(path: str | Path, reader: Any, topic: BagTopic) -> bool:
 
 
 def _image_name(topic: str) -> str:
-    """The name of an image whose packed form comes on `topic`."""
     return re.sub("/compressed(Depth)?$", "", topic)
 
 

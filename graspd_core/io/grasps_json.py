@@ -26,7 +26,7 @@ _LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
 
 
 def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig) -> dict[str, Any]:
-    """A result as JSON-ready values; lengths in metres, angles in radians, forces in newtons unless a key says so."""
+    """Return a result as JSON-ready values: metres, radians and newtons unless a key names another unit."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -61,7 +61,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
 
 
 def _hand(hand: HandModel) -> dict[str, Any]:
-    """Whose joints these are, which of them follow others, and where the hand sits on an arm."""
+    """Return the hand's joints, their couplings, and its mount on an arm."""
     return {
         "name": hand.name,
         "urdf": hand.urdf,
@@ -76,10 +76,10 @@ def _hand(hand: HandModel) -> dict[str, Any]:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a path that no file can be written to, before the work that would be lost; makes missing directories.
+    """Refuse a path that cannot be written before the work that would be lost.
 
-    Raises:
-        ConfigError: the path is a directory, or its directory cannot be made or written to.
+    Makes missing directories. Raises ConfigError: the path is a directory, or its directory cannot be made or written
+    to.
     """
     if path.is_dir():
         raise ConfigError(f"{path}: is a directory; give the name of a file to write")
@@ -101,7 +101,7 @@ def save_result(
     frame: str = "",
     stamp: float | None = None,
 ) -> None:
-    """Write a result; the file appears whole or not at all. `frame` and `stamp` [s] name what its poses are in."""
+    """Write a result, whole or not at all. `frame` and `stamp` [s] name the frame and time of its poses."""
     document = result_document(result, target, hand, config)
     document |= {"frame": frame} if frame else {}
     document |= {"stamp": stamp} if stamp is not None else {}
@@ -110,7 +110,7 @@ def save_result(
 
 
 def save_text(path: Path, text: str) -> None:
-    """Write a file that appears whole or not at all; makes missing directories."""
+    """Write a file that appears whole or not at all. Makes missing directories."""
     save_bytes(path, text.encode())
 
 
@@ -143,10 +143,9 @@ def _arm(path: ArmPath) -> dict[str, Any]:
 
 
 def grasp_figures(grasp: Grasp) -> dict[str, Any]:
-    """Metrics and trials of a grasp as JSON-ready values.
+    """Return metrics and trials of a grasp as JSON-ready values, null for what is not measured or not finite.
 
-    Every metric of the registry has a key, which names its unit; trials are in [m] and [rad]. What was not measured and
-    what is not finite is null.
+    Every metric of the registry has a key, which names its unit. Trials are in [m] and [rad].
     """
     metrics = grasp.metrics or {}
     return {
@@ -186,11 +185,7 @@ def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
 
 
 def load_document(path: str | Path) -> dict[str, Any]:
-    """Read a grasps file.
-
-    Raises:
-        FormatError: missing, not JSON, of another format or of an unknown version.
-    """
+    """Read a grasps file. Raises FormatError: missing, not JSON, of another format or of an unknown version."""
     path = Path(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
@@ -207,13 +202,10 @@ def load_document(path: str | Path) -> dict[str, Any]:
 
 
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
-    """The grasps of a document that `load_document` read, in rank order; the squeeze has the grasp's base pose.
+    """Return the grasps of a document that `load_document` read, in rank order.
 
-    Joint positions are those of the actuated joints, as everywhere in graspd: coupled ones follow from them. Metrics
-    that this version does not know are left out.
-
-    Raises:
-        FormatError: a grasp lacks a key, or holds something there that is of the wrong kind or not finite.
+    The squeeze has the grasp's base pose. Joint positions are those of the actuated joints. Metrics that this version
+    does not know are left out. Raises FormatError: a grasp lacks a key, or a value is of the wrong kind or not finite.
     """
     try:
         hand = document["hand"]
@@ -258,7 +250,7 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
-    """A grasp of version 1 with its trials as version 2 writes them; the reason was that of the last trial."""
+    """Return a grasp of version 1 with its trials in the form of version 2. The reason belongs to the last trial."""
     # Files written before there was a lift trial have no such key.
     tried = {name: values["metrics"].get(name) for name in ("hold", "lift")}
     tried = {name: trial for name, trial in tried.items() if trial is not None}

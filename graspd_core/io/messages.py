@@ -1,4 +1,4 @@
-"""What sensor messages hold, as arrays: live ones, those of a bag, and all objects with the attributes of ROS."""
+"""Sensor messages as arrays: live ones, recorded ones, and all objects with the attributes of ROS."""
 
 from __future__ import annotations
 
@@ -34,22 +34,21 @@ _AHEAD = 0.8
 
 
 def stamp_of(message: Any) -> int:
-    """Time of a stamped message's header [ns]."""
+    """Return the time of a stamped message's header [ns]."""
     stamp = message.header.stamp
     return stamp.sec * SECOND + stamp.nanosec
 
 
 def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
-    """The finite points of a sensor_msgs/PointCloud2, in row order, in the cloud's own frame and unit.
+    """Return the finite points of a sensor_msgs/PointCloud2, in row order, in the cloud's own frame and unit.
 
-    Raises:
-        CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
+    Raises CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
     """
     return points_from_layout(_layout(message))
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Every point of a sensor_msgs/PointCloud2 in its place, NaN and infinite ones too. Raises CloudError as above."""
+    """Return all points of a PointCloud2 in their places, NaN and infinite too. Raises CloudError as above."""
     return organised_points(_layout(message))
 
 
@@ -68,21 +67,21 @@ def _layout(message: Any) -> CloudLayout:
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where a cloud's camera stood; nothing given: at the origin of the cloud's frame.
+    """The position of a cloud's camera, the origin of the cloud's frame by default.
 
-    `view_point`, in the cloud's frame [m], goes before `sensor_frame`, at whose origin it stood. It looked along z if
-    the name of its frame ends in optical_frame (REP 103).
+    `view_point`, in the cloud's frame [m], goes before `sensor_frame`, the frame at whose origin the camera stood. The
+    camera looked along z if the name of its frame ends in optical_frame (REP 103).
     """
 
     view_point: tuple[float, float, float] | None = None
     sensor_frame: str = ""
 
     def cloud(self, message: Any, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]) -> PointCloud:
-        """Return a sensor_msgs/PointCloud2 as its camera saw it; `lookup` gives `T_target_source` of two frames.
+        """Return a sensor_msgs/PointCloud2 as its camera saw it. `lookup` gives `T_target_source` of two frames.
 
         Raises:
-            CloudError: as `points_from_message`, or the pixels show that the camera stood elsewhere.
-            TransformError: nothing tells where the camera's frame stood.
+            CloudError: as `points_from_message`, or the pixels show that the camera stood at another place.
+            TransformError: the pose of the camera's frame is not known.
         """
         T, frame = np.eye(4), message.header.frame_id
         if self.view_point is not None:
@@ -105,9 +104,9 @@ def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
 
 
 def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
-    """Return what speaks against a frame's name: by REP 103 cameras look along z in optical frames, along x in bodies.
+    """Return a warning if points, seen from the frame's origin, contradict its name, else an empty text.
 
-    The points are seen from the frame's origin. Empty: nothing, or the name says neither.
+    By REP 103 cameras look along z in optical frames, along x in body frames.
     """
     named = "z" if "optical" in frame else "x" if frame.endswith(("_link", "_frame")) else ""
     reach = np.linalg.norm(points, axis=1)
@@ -126,12 +125,10 @@ def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
 
 
 def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
-    """The camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P without any for a rectified one.
+    """Return the camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P alone for a rectified one.
 
-    Binning and region of interest count: the camera is that of the image as sent.
-
-    Raises:
-        CloudError: it is not calibrated, or of a distortion model that is not known.
+    Binning and region of interest count: the camera is that of the image as sent. Raises CloudError: it is not
+    calibrated, or of an unknown distortion model.
     """
     # Drivers of cameras without distortion often leave P empty.
     by_projection = rectified and info.p[0] > 0
@@ -149,10 +146,9 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
 
 
 def image_size(message: Any) -> tuple[int, int]:
-    """Return width and height of a depth image, packed or not, or of the images that a CameraInfo is of [pixels].
+    """Return width and height [pixels] of a depth image, packed or not, or of the images of a CameraInfo.
 
-    Raises:
-        CloudError: a packed image that does not say it.
+    Raises CloudError: a packed image does not say it.
     """
     if hasattr(message, "roi"):
         bins = max(message.binning_x, 1), max(message.binning_y, 1)
@@ -163,7 +159,7 @@ def image_size(message: Any) -> tuple[int, int]:
 
 
 def depth_from_message(image: Any) -> DepthImage:
-    """Depth [m] of a sensor_msgs/Image or CompressedImage, 0 where there is none. Raises CloudError: no depth."""
+    """Return the depth [m] of a sensor_msgs/Image or CompressedImage, 0 for none. Raises CloudError: no depth."""
     if hasattr(image, "format"):
         return depth_from_compressed(memoryview(image.data), image.format)
     return depth_from_bytes(
@@ -197,8 +193,7 @@ def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple
 def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
     """Return what a depth image shows, in the camera's optical frame. The arguments are those of `depth_and_camera`.
 
-    Raises:
-        CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
+    Raises CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
     """
     depth, camera = depth_and_camera(image, info, rectified=rectified)
     cloud = cloud_from_depth(depth, camera)
@@ -208,7 +203,7 @@ def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) 
 
 
 def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
-    """Put a tf2_msgs/TFMessage into a buffer; transforms that make no sense are left out and named, one line each."""
+    """Put a tf2_msgs/TFMessage into a buffer. Return a line for each invalid transform, which is left out."""
     refused = []
     for item in message.transforms:
         try:
@@ -220,7 +215,7 @@ def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tu
 
 
 def _pose(transform: Any) -> Float[np.ndarray, "4 4"]:
-    """The matrix of a geometry_msgs/Transform; NaN where its quaternion is no rotation."""
+    """Return the matrix of a geometry_msgs/Transform, NaN if its quaternion is no rotation."""
     from scipy.spatial.transform import Rotation
 
     turn, move = transform.rotation, transform.translation

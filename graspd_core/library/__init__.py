@@ -1,1 +1,1 @@
-"""Grasps of objects that were planned before: kept in a file, and used again."""
+"""Verified grasps of known objects: kept in a file, and used again."""

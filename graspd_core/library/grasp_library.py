@@ -1,9 +1,7 @@
 """A file of verified grasps: SQLite, a transaction a record.
 
-An entry is known by the content of mesh and hand, and by the physics that its grasps were tried with.
-
-The journal is a write-ahead log: readers go on while one writes, and who is killed while it writes loses the record
-that it was writing. Each call opens the file and closes it, so that a library takes no memory between two of them.
+An entry is known by the content of mesh and hand, and by the physics of its trials. The journal is a write-ahead log:
+readers go on while one writes, and a killed writer loses its own record only. Each call opens the file and closes it.
 """
 
 from __future__ import annotations
@@ -43,9 +41,9 @@ class LibraryEntry:
     """An object at one size, a hand, and physics.
 
     Attributes:
-        name: what the object is called: of its file, with the scale where that is not 1.
-        source: absolute path of its file, or shape:NAME; empty for a mesh that had no file.
-        file_sha256: hash of the file's content; empty likewise.
+        name: of the object: that of its file, with the scale if that is not 1.
+        source: absolute path of its file, or shape:NAME, empty for a mesh without a file.
+        file_sha256: hash of the file's content, empty likewise.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.
         mass: [kg].
@@ -68,13 +66,13 @@ class LibraryEntry:
 
     @property
     def key(self) -> str:
-        """By content: not what object and hand are called."""
+        """Hash of the content, which does not depend on the names of object and hand."""
         content = (self.mesh_sha256, self.hand_content, self.mass, self.friction, self.verify)
         return digest(content)[:32]
 
 
 def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") -> LibraryEntry:
-    """The entry of an object as it was loaded."""
+    """Return the entry of an object as it was loaded."""
     shape = target.source.startswith(SHAPE_PREFIX)
     source = absolute(target.source) if shape or Path(target.source).is_file() else ""
     called = target.source.removeprefix(SHAPE_PREFIX) if shape else Path(target.source).stem
@@ -93,12 +91,12 @@ def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") 
 
 
 def absolute(source: str) -> str:
-    """The source as it is found from anywhere."""
+    """Return the source with an absolute path."""
     return source if source.startswith(SHAPE_PREFIX) else str(Path(source).resolve())
 
 
 def source_hash(source: str) -> str:
-    """Hash of the content of a mesh file or a shape. Raises MeshError: it cannot be read."""
+    """Return the hash of the content of a mesh file or a shape. Raises MeshError: it cannot be read."""
     if source.startswith(SHAPE_PREFIX):
         return content_hash(make_shape(source.removeprefix(SHAPE_PREFIX)))
     try:
@@ -116,7 +114,7 @@ def _file_hash(path: str, changed: int, size: int) -> str:
 
 @lru_cache(maxsize=8)
 def hand_hash(hand: HandModel) -> str:
-    """Hash of all that a grasp and its trials depend on; a prefix of names does not count."""
+    """Return the hash of all that a grasp and its trials depend on. A prefix of names does not count."""
     mimics = tuple((m.link, m.joint, m.multiplier, m.offset) for m in hand.mimics)
     content = (getattr(hand, item.name) for item in fields(hand) if item.name not in _NO_CONTENT)
     return digest((*content, mimics))
@@ -141,7 +139,7 @@ CREATE INDEX by_source ON records (source);
 
 @dataclass(frozen=True)
 class GraspLibrary:
-    """A library in a file; `checked` says whether it is one.
+    """A library in a file. `checked` verifies the file.
 
     Attributes:
         path: of the file. SQLite keeps two more beside it, of the same name with -wal and -shm, while it is in use.
@@ -150,7 +148,7 @@ class GraspLibrary:
     path: Path
 
     def create(self) -> None:
-        """Make an empty library where there is no file yet, or one that was left empty. Raises FormatError."""
+        """Make an empty library if there is no file yet, or an empty one. Raises FormatError."""
         if self.path.exists() and self.path.stat().st_size:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -160,7 +158,7 @@ class GraspLibrary:
             base.executescript(f"BEGIN IMMEDIATE; {head} {_SCHEMA} COMMIT;")
 
     def checked(self) -> GraspLibrary:
-        """This library. Raises FormatError: there is no file, it is none of this version, or it is torn."""
+        """Check the file and return this library. Raises FormatError: it is missing, of another version, or torn."""
         with self._reading() as base:
             (told,) = base.execute("PRAGMA quick_check(1)").fetchone()
         if told != "ok":
@@ -168,7 +166,7 @@ class GraspLibrary:
         return self
 
     def entries(self, **wanted: str | float) -> list[tuple[LibraryEntry, int]]:
-        """Entries whose columns have the values wanted, and how many grasps each holds; by name."""
+        """Return the entries whose columns have the wanted values, and the number of grasps of each, by name."""
         where = " AND ".join(f"{column} = ?" for column in wanted) or "1"
         question = f"SELECT {', '.join(_COLUMNS)}, grasps FROM records WHERE {where} ORDER BY name, hand"
         with self._reading() as base:
@@ -176,21 +174,21 @@ class GraspLibrary:
         return [(LibraryEntry(*row[:-1]), row[-1]) for row in rows]
 
     def names(self) -> list[str]:
-        """What its objects are called, each once."""
+        """Return the names of its objects, each once."""
         with self._reading() as base:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
-        """Entries of the same content whose grasps held under as much as wanted, the most first."""
+        """Return entries of the same content whose trials were at least as strict as wanted, strictest first."""
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
-        """The verified grasps of an entry, in the object frame; none where it is not in the library.
+        """Return the verified grasps of an entry, in the object frame, none for an unknown entry.
 
         Raises:
-            FormatError: the library is torn, or the record is.
+            FormatError: the library or the record is torn.
         """
         with self._reading() as base:
             row = base.execute("SELECT document FROM records WHERE key = ?", (entry.key,)).fetchone()
@@ -199,7 +197,7 @@ class GraspLibrary:
     def add(
         self, entry: LibraryEntry, target: ObjectModel, hand: HandModel, config: PlanConfig, grasps: Sequence[Grasp]
     ) -> int:
-        """Put grasps behind those that the entry has; how many it has then.
+        """Append verified grasps to an entry. Return the number that it has then.
 
         Args:
             entry: of `target` and `hand`.
@@ -240,7 +238,7 @@ class GraspLibrary:
 
     @contextmanager
     def _reading(self, write: bool = False) -> Iterator[sqlite3.Connection]:
-        """The file, seen to be a library of this version; in a transaction where it is to be written."""
+        """Open the file and check its version. A write runs in a transaction."""
         if not self.path.is_file():
             raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` makes a library")
         with self._told(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
@@ -262,7 +260,7 @@ class GraspLibrary:
 
     @contextmanager
     def _told(self) -> Iterator[None]:
-        """SQLite's errors as ours."""
+        """Turn SQLite's errors into FormatError."""
         try:
             yield
         # Another process holds it for long, the disk is full, or nothing may be written there.
@@ -281,7 +279,7 @@ class GraspLibrary:
 
 
 def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryEntry]:
-    """Those whose grasps held under as much as `verify` asks, the most first. Raises ConfigError: it is unknown."""
+    """Return the entries tried at least as strictly as `verify`, strictest first. Raises ConfigError: it is unknown."""
     if verify not in STRICTNESS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(STRICTNESS)}")
     enough = [entry for entry in entries if STRICTNESS[entry.verify] >= STRICTNESS[verify]]

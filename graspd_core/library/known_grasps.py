@@ -1,9 +1,8 @@
-"""Grasps of an object that a library knows, in the scene that it is in now; what is missing is planned and added.
+"""Grasps of a known object in the present scene. Missing ones are planned and added to the library.
 
-A name or a mesh file says which object is meant, and an error says what the library has instead.
-
-On an object with nothing about it they are as good as on the day that they were tried. Where something stands about it,
-a hand that would reach into that is refused, one that comes near is tried again, and all others stay as they are.
+A name or a mesh file says which object is meant. An error says what the library has instead. Stored grasps are as good
+as when they were tried if nothing stands near. Otherwise a hand that would collide is refused, one that comes near is
+tried again, and all others stay.
 """
 
 from __future__ import annotations
@@ -49,10 +48,7 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """What grasps are to hold under: mass [kg] and friction of the object, and the trials.
-
-    A mass that nobody knows, None, is whatever the library has.
-    """
+    """What grasps must hold under: mass [kg] and friction of the object, and the trials. A mass of None accepts any."""
 
     mass: float | None
     friction: float
@@ -69,12 +65,12 @@ class Physics:
 
 
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
-    """The entry of an object that the library calls so, for a hand; None: for any.
+    """Return the entry of an object of that name, for a hand, None for any hand.
 
-    Of several masses and frictions the one asked for; where there is but one, that, since the object is known.
+    Of several masses and frictions it takes the wanted one, a single one always.
 
     Raises:
-        ConfigError: the library does not know the name, or not with this hand or physics, or several objects have it.
+        ConfigError: the name is unknown, or not with this hand or physics, or several objects have it.
         MeshError: the object's file has changed since.
     """
     called = [entry for entry, _ in library.entries(name=name)]
@@ -106,10 +102,10 @@ def entry_by_file(
     *,
     required: bool = True,
 ) -> LibraryEntry | None:
-    """The entry of a mesh file, or shape:NAME, at a scale; None where the library lacks it and it is not required.
+    """Return the entry of a mesh file, or shape:NAME, at a scale. None if it is missing and not required.
 
     Raises:
-        ConfigError: the library does not know its content, or not at this scale, with this hand or this physics.
+        ConfigError: the content is unknown, or not at this scale, with this hand or this physics.
         MeshError: it cannot be read, or has changed since the library was made.
     """
     path = absolute(str(source))
@@ -180,17 +176,17 @@ def known_grasps(
     wanted: Wanted = list,
     stop: StopHook | None = None,
 ) -> GraspResult:
-    """At most `count` grasps that the library has of the scene's object, all verified; none where it does not know it.
+    """Return at most `count` verified grasps that the library has of the scene's object, none for an unknown one.
 
     Args:
         library: from `GraspLibrary(path).checked()`.
-        scene: known by its mesh, friction and mass, if that was given; support and obstacles are looked at.
+        scene: known by its mesh, friction and mass, if that was given. Support and obstacles count.
         hand: known by its content.
         count: grasps wanted.
         restrictions: as of `plan_grasps`.
-        verify: trials that they must have passed; stricter ones are good too.
-        wanted: chooses of the stored grasps those that may be given.
-        stop: polled; true ends the trials.
+        verify: trials that they must have passed. Stricter ones are good too.
+        wanted: chooses the stored grasps that may be given.
+        stop: polled, true ends the trials.
 
     Raises:
         FormatError: the library is torn, of another version or not there.
@@ -217,7 +213,7 @@ def known_grasps(
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
-    """Grasps of a library as a result of `count` wanted, which took so long."""
+    """Return grasps of a library as a result of `count` wanted, which took `seconds`."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
     told = f"{len(grasps)} grasps of the library {library.path.name}"
     return result_of(grasps, count, method="library", timing=timing, message=told)
@@ -237,10 +233,11 @@ def known_or_planned(
     name: str = "",
     **request: Any,
 ) -> GraspResult:
-    """What the library has, and what is missing of `count` grasps from `plan_grasps`, whose verified ones are added.
+    """Return grasps of the library, and plan the rest of `count`.
 
-    `wanted` chooses which grasps count, stored and planned ones; `name` is what the library is to call the object;
-    all else is as of `plan_grasps`. A library that cannot be written is a warning in the result.
+    The verified ones are added to the library. `wanted` chooses which grasps count, stored and planned ones. `name` is
+    the object's name in the library. All else is as of `plan_grasps`. A library that cannot be written is a warning in
+    the result.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
@@ -284,9 +281,9 @@ def add_planned(
     verify: str,
     name: str = "",
 ) -> int:
-    """Put the verified grasps of a run into the library, with the trial of the object alone. Return how many it has.
+    """Add the verified grasps of a run to the library, with the trial of the object alone.
 
-    Raises FormatError: the library cannot be written.
+    Returns their number. Raises FormatError: the library cannot be written.
     """
     if verify == "none":
         return 0
@@ -302,7 +299,7 @@ def add_planned(
 def _held(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], verify: str, stop: StopHook
 ) -> Iterable[tuple[Grasp, str]]:
-    """Each grasp, tried again where something stands near, and why it is none here; one at a time."""
+    """Yield each grasp, tried again if something stands near, and why it is refused, empty if it is not."""
     scene, far = near_scene(scene)
     near = [moved_grasp(grasp, -far) for grasp in grasps]
     gaps = clearance(scene, hand, near)
@@ -325,10 +322,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Least distance [m] of each hand to support and obstacles from its retreat to its squeeze, negative inside.
-
-    Infinite where it can reach none.
-    """
+    """Return the least distance [m] of each hand to support and obstacles, retreat to squeeze, infinite without."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

@@ -1,1 +1,1 @@
-"""Meshes: read, mended, measured; signed distance, convex parts, sharp features, authored shapes."""
+"""Meshes: read, mended, measured. Signed distance, convex parts, sharp features, authored shapes."""

@@ -1,9 +1,8 @@
 """COLLADA (.dae) meshes: the surface only, without the libraries that read the whole format.
 
-Read are triangles, strips, fans, polylists and polygons of every geometry that the visual scene instances, through the
-scene's node transforms, in metres by the file's `<unit>`. Faces with more than three corners are cut into a fan, which
-is exact for the convex ones that modellers write. The file's up axis is ignored, as ROS viewers do: a URDF's origins
-are written to that. Format: COLLADA 1.4.1 specification, Khronos Group, 2008.
+It reads triangles, strips, fans, polylists and polygons of every geometry that the visual scene instances, with the
+node transforms, in metres by the file's `<unit>`. Polygons are cut into fans, which is exact for convex ones. The up
+axis is ignored, as ROS viewers do. Format: COLLADA 1.4.1 specification, Khronos Group, 2008.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ _FACES = ("triangles", "tristrips", "polylist", "polygons", "trifans")
 
 
 def read_dae(path: Path) -> TriangleMesh:
-    """All surfaces of a COLLADA file, joined, in the file's coordinates [m].
+    """Read all surfaces of a COLLADA file, joined, in the file's coordinates [m].
 
     Raises:
-        ValueError: the file is not COLLADA, declares entities, holds no faces, or misses something that it refers to.
+        ValueError: the file is not COLLADA, declares entities, holds no faces, or refers to something missing.
         OSError: it cannot be read.
     """
     data = path.read_bytes()
@@ -43,7 +42,7 @@ def read_dae(path: Path) -> TriangleMesh:
 
 
 class _Builder(ET.TreeBuilder):
-    """Builds the tree, and refuses what could define entities, in whichever encoding it is written."""
+    """A tree builder that refuses document type declarations in any encoding."""
 
     def doctype(self, *_: object) -> None:
         raise ValueError("a document type declaration is refused")
@@ -80,7 +79,7 @@ def _joined(root: ET.Element) -> TriangleMesh:
 
 
 def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tuple[np.ndarray, ET.Element]]:
-    """Every geometry below the nodes, with its pose in the scene."""
+    """Return every geometry below the nodes, with its pose in the scene."""
     placed: list[tuple[np.ndarray, ET.Element]] = []
     stack = [(np.eye(4), node) for node in reversed(roots)]
     visits = 0
@@ -101,7 +100,7 @@ def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tu
 
 
 def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
-    """The product of a node's transforms, in the order in which they are written."""
+    """Return the product of a node's transforms, in the order in which they are written."""
     pose = np.eye(4)
     for element in node:
         if element.tag not in ("matrix", "translate", "rotate", "scale"):
@@ -124,7 +123,7 @@ def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
 def _surface(
     geometry: ET.Element, named: dict[str, ET.Element]
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Vertices and faces of a geometry in its own frame; parts that share vertices share them here too."""
+    """Return vertices and faces of a geometry in its own frame. Parts that share vertices share them here too."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     known: dict[ET.Element, tuple[int, int]] = {}
     for element in geometry.iterfind("mesh/*"):

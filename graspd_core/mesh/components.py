@@ -1,7 +1,6 @@
-"""Pieces of one mesh: tiny ones that float clear are dropped, bodies that stand apart are told.
+"""Pieces of one mesh. Tiny floating pieces are dropped, and separate bodies are reported.
 
-Scanners and careless exports leave floating pieces. A hand grasps bodies apart as one rigid thing, which they may not
-be.
+Scanners and careless exports leave floating pieces. A hand grasps separate bodies as if they were one rigid body.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ TINY, STAYS = 0.05, 0.98
 
 
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """The mesh without its small components, and how many they were.
+    """Return the mesh without its small components, and their number.
 
-    A small component shares no vertex with the rest, is tiny, and lies farther from all that is not tiny than it is
-    large: a bump, a screw's head or a loose triangle that touches the body stays.
+    A small component shares no vertex with the rest, is tiny, and lies farther from the rest than it is large. A bump,
+    a screw's head or a loose triangle that touches the body stays.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1
@@ -49,7 +48,7 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
 
 
 def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
-    """Number of the piece that each face belongs to; pieces share no vertex."""
+    """Return the number of the piece that each face belongs to. Pieces share no vertex."""
     a, b, c = mesh.faces.T
     rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
     shared = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
@@ -73,7 +72,7 @@ _SAMPLES = 4096
 
 
 def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
-    """How many bodies there are, and the gap from the largest to what is nearest to it [m]; infinite about one.
+    """Return the number of bodies, and the gap from the largest to its nearest [m], infinite for one body.
 
     What lies within the largest, as the inside of a hollow wall does, belongs to it.
     """
@@ -99,7 +98,7 @@ def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
 def _points(
     mesh: TriangleMesh, pieces: Int[np.ndarray, "faces"]
 ) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Corners of all faces and points spread over them by area, and the piece that each is of."""
+    """Return the corners of all faces, points spread over them by area, and the piece of each point."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
@@ -115,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Those of the points `among` that belong to the most extended piece, or to pieces that are joined to it."""
+    """Return which of the points `among` belong to the most extended piece, or to pieces joined to it."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

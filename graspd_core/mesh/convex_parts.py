@@ -1,8 +1,8 @@
-"""Convex parts that fill an object and leave its hollows hollow, by greedy planar cuts.
+"""Convex parts that fill an object and leave its hollows hollow, by greedy planar cuts. Metres, in the object's frame.
 
 A cluster of surface points stands for the convex hull of its points. The cluster whose hull reaches farthest outside
-the object (measured in the signed distance field) is cut by the plane that leaves the least of that, until no hull
-bulges by more than the tolerance or the parts are used up. All in metres, in the object's frame.
+the object, by the signed distance grid, is cut by the plane that leaves the least bulge. This goes on until no hull
+bulges by more than the tolerance or the parts are used up.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from graspd_core.mesh.sdf import GridSDF
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
-# Points and hull samples that a bulge is measured on; the parts themselves are hulls of all their points.
+# Points and hull samples that a bulge is measured on. The parts themselves are hulls of all their points.
 TRIAL_POINTS, TRIAL_SAMPLES = 320, 100
 # Cuts lie between so many slices of equal thickness. They are compared on segments between pairs of points, given as
-# shares of the list of points that cover all pairs evenly (Roberts' sequence); the best are compared by their hulls.
+# shares of the list of points that cover all pairs evenly (Roberts' sequence). The best are compared by their hulls.
 SLICES, SHORTLIST = 12, 3
 PAIRS = np.modf(np.arange(1, 2001)[:, None] * [0.7548776662, 0.5698402910])[0]
 # Two clusters are compared on the segments between all pairs of so many points of each.
@@ -50,7 +50,7 @@ Points = Float[np.ndarray, "_ 3"]
 
 @dataclass(frozen=True)
 class _Cut:
-    """The points with `points @ direction` below and above `offset`."""
+    """A plane that splits points by whether `points @ direction` is below or above `offset`."""
 
     direction: Float[np.ndarray, "3"]
     offset: float
@@ -64,13 +64,13 @@ def convex_parts(
     max_parts: int = 64,
     surface_points: int = SURFACE_POINTS,
 ) -> tuple[TriangleMesh, ...]:
-    """Convex closed meshes whose union approximates the object.
+    """Return convex closed meshes whose union approximates the object.
 
     Args:
-        sdf: the object's distance grid, which tells what lies outside.
+        sdf: the object's distance grid, which says what lies outside.
         tolerance: how far a part may reach outside the object [m] (98th percentile of its surface) before it is cut.
-        max_parts: parts at most; an object that needs more keeps its last parts bulging.
-        surface_points: that the parts are made of, and up to half as many of the mesh's vertices.
+        max_parts: parts at most. An object that needs more keeps its last parts bulging.
+        surface_points: number of points that the parts are made of, plus up to half as many vertices of the mesh.
     """
     points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], surface_points // 2),
                         surface_samples(mesh, surface_points, 0)[0]])  # fmt: skip
@@ -115,11 +115,11 @@ def _best_cut(sdf: GridSDF, cluster: Points) -> _Cut | None:
 
 
 def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
-    """The best cut across each axis of space and of the cluster, at most `SHORTLIST`, best first.
+    """Return the best cut across each axis of space and of the cluster, at most `SHORTLIST`, best first.
 
-    Segments between points of a cluster lie in its hull; how far their middles are outside the object tells how much
-    of the hull is. A cut leaves the segments that have both ends on one side: the mean over all pairs of that side,
-    times its points, stands for the volume of its bulge. One set of segments compares all cuts, and no hull is needed.
+    Segments between points of a cluster lie in its hull, so the distance of their middles outside the object samples
+    the bulge. A cut leaves the segments with both ends on one side. Their mean, times the points of that side, stands
+    for the volume of the bulge there. One set of segments compares all cuts without a hull.
     """
     pairs = (PAIRS * len(cluster)).astype(int)
     outside = (_outside(sdf, cluster[pairs].mean(1)) - _blur(sdf, cluster)).clip(0)
@@ -135,7 +135,7 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     share = np.arange(1, SLICES) / SLICES
     # Where no segment shows anything, halves are as good as any.
     left = left_below / np.maximum(below, 1) + left_above / np.maximum(above, 1) + 1e-9 * np.abs(share - 0.5)
-    # Fewer than four points a side span no hull; a side thinner than the overlap would get the other side back.
+    # Fewer than four points a side span no hull. A side thinner than the overlap would get the other side back.
     thin = span[:, None] * np.minimum(share, 1 - share) < 2 * OVERLAP
     left[(below < 4) | (above < 4) | thin] = np.inf
     best = left.argmin(1)
@@ -160,10 +160,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching clusters, least bulge first, while that stays in tolerance, and on until `most` are left.
-
-    Pairs are ordered by what the segments between the two show of the bulge, until it is their turn to be measured.
-    """
+    """Join touching clusters, least bulge first, while that stays in tolerance, and on until `most` are left."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -220,7 +217,6 @@ def _quantile(values: Float[np.ndarray, "_"], share: float) -> float:
 
 
 def _hull(points: Points) -> ConvexHull | None:
-    """None where the points are too few or lie in a plane."""
     if len(points) < 4:
         return None
     try:
@@ -230,7 +226,7 @@ def _hull(points: Points) -> ConvexHull | None:
 
 
 def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
-    """One point per equal share of the hull's area. Leaner than `surface_samples`: called hundreds of times."""
+    """Return one point per equal share of the hull's area, faster than `surface_samples`."""
     a, b, c = hull.points[hull.simplices].transpose(1, 0, 2)
     # Twice the area, without np.cross: that costs as much as all the rest.
     (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
@@ -255,14 +251,14 @@ def _evenly(points: Points, count: int) -> Float[np.ndarray, "count 3"]:
 
 
 def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
-    """Unit directions spread evenly on a golden spiral, a column each."""
+    """Return unit directions spread evenly on a golden spiral, a column each."""
     turn = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1 - 2 * turn / count), np.pi * (1 + 5**0.5) * turn
     return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
-    """The hull of at most `most` of the points: extremes along even directions, then whichever is farthest out."""
+    """Return the hull of at most `most` of the points: extremes along even directions, then always the farthest out."""
     hull = _hull(points)
     if hull is None:
         return _slab(points)
@@ -285,7 +281,7 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
 
 
 def _slab(points: Points) -> TriangleMesh:
-    """A flat cluster as a plate one millimetre thick, across its thinnest direction."""
+    """Return a flat cluster as a plate one millimetre thick, across its thinnest direction."""
     _, principal = np.linalg.eigh(np.cov(points.T))
     lift = principal[:, 0] * OVERLAP
     spread = np.vstack([points - lift, points + lift])

@@ -1,7 +1,7 @@
 """Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres.
 
-Files that hold no mesh, or half of one, are refused by what they are. Guesses at the unit of a file are offered in
-messages, never applied.
+Files that hold no mesh, or half of one, are refused by what they are. A guess at the unit of a file goes into a message
+and is never applied.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ REMEDIES = {
 
 
 def unit_advice(size: float, scale: float = 1.0) -> str:
-    """What to pass so that a thing of `size` [m] across becomes one that a hand can grasp, the likeliest first.
+    """Return the scales that turn `size` [m] into the size of a graspable object, the likeliest first.
 
     Args:
-        scale: what was passed already; the advice is to pass something else in its stead.
+        scale: what was passed already. The advice replaces it.
     """
     # Of absurd numbers, whose ratio overflows, too.
     given = min(max(size / scale, 1e-200), 1e200)
@@ -79,12 +79,12 @@ _OTHERS = (
 )
 # What is looked at of either end [bytes].
 _LOOK = 4096
-# A binary STL: its header with the number of triangles, and each triangle [bytes]; more of them nobody writes.
+# A binary STL: its header with the number of triangles, and each triangle [bytes]. Nobody writes more triangles.
 _HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
 
 
 def refuse_broken(path: Path) -> None:
-    """Raise MeshError for a file that is something else than a mesh, or an STL or OBJ that was cut off."""
+    """Raise MeshError for a file that is no mesh, or an STL or OBJ that was cut off."""
     with path.open("rb") as file:
         head = file.read(_LOOK)
         size = file.seek(0, os.SEEK_END)
@@ -112,7 +112,7 @@ def _cut_stl(head: bytes, tail: bytes, size: int) -> str:
 
 
 def _cut_obj(tail: bytes) -> str:
-    """What of its last line is missing, where it has no end; a file may leave out the last line's end alone."""
+    """Return what is missing of an unfinished last line, empty for a whole one."""
     line = tail.replace(b"\r", b"\n").rpartition(b"\n")[2].decode("utf-8", errors="replace")
     words = line.split()
     if not words or words[0] not in ("v", "vn", "f"):
@@ -132,22 +132,22 @@ def _is_number(word: str) -> bool:
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
 
 # Points for the volume of a mesh that is not one closed body: about 1 % of volume, 0.3 s. A Sobol sequence, because a
-# lattice aligned with a wall counts its layers wrong; it is evenest at powers of two.
+# lattice aligned with a wall counts its layers wrong. It is evenest at powers of two.
 SPREAD_POINTS = 2**15
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
-    """Read a mesh file; the parts of a scene are joined in place, and coordinates multiplied by `scale`.
+    """Read a mesh file. Parts of a scene are joined in place, and coordinates multiplied by `scale`.
 
     Raises:
-        MeshError: the file is missing, a directory, of an unknown ending, something else than a mesh, cut off,
-            unreadable, or holds no finite surface.
+        MeshError: the file is missing, a directory, of an unknown ending, no mesh, cut off, unreadable, or holds no
+            finite surface.
     """
     return read_mesh(path, scale=scale)[0]
 
 
 def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """As `load_mesh`, and what was found wrong with the file, one sentence each."""
+    """Read a mesh file like `load_mesh`, with its defects, one sentence each."""
     path = Path(path)
     _refuse_path(path)
     if not (np.isfinite(scale) and scale > 0):
@@ -167,7 +167,7 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
 
 
 def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
-    """Write a mesh; the ending chooses the format. Raises MeshError for an ending that cannot be written."""
+    """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written."""
     import trimesh
 
     path = Path(path)
@@ -181,10 +181,10 @@ def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
 def check_mesh(
     mesh: TriangleMesh, source: str, most_faces: int | None = None, *, scale: float = 1.0, dusty: bool = False
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """A cleaned mesh and what was found wrong with it, one sentence each.
+    """Return a cleaned mesh and its defects, one sentence each.
 
-    Drops vertices that no face uses, merges coincident ones, drops degenerate and repeated faces, and makes
-    neighbouring faces wind alike. Position and scale are left alone.
+    Drops vertices that no face uses, merges coincident ones, drops degenerate and repeated faces, and makes the winding
+    consistent. Position and scale stay.
 
     Args:
         most_faces: a mesh of more is simplified to about this many.
@@ -218,17 +218,14 @@ def check_mesh(
         warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
-    # Simplifying can tear a surface; that is no fault of the input, and the winding number bears it.
+    # Simplifying can tear a surface. That is no fault of the input, and the winding number bears it.
     if not topology.is_closed(clean) and not topology.is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
     return clean, (*_doubted_size(clean, source, scale), *warnings)
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """At most about `faces` triangles, by quadric edge collapse; a smaller mesh is returned as it is.
-
-    Another `aggressiveness` takes the edges in another order.
-    """
+    """Reduce a mesh to about `faces` triangles by quadric edge collapse, in an order that `aggressiveness` changes."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:
@@ -241,17 +238,17 @@ def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> Tria
 
 
 def content_hash(mesh: TriangleMesh) -> str:
-    """SHA-256 of the vertices (float64) and faces (int64), hexadecimal."""
+    """Return the SHA-256 of the vertices (float64) and faces (int64), hexadecimal."""
     digest = hashlib.sha256(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
 
 
 def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Volume [m³], centre of mass [m] and inertia about it per unit density [m⁵] of the enclosed solid.
+    """Return volume [m³], centre of mass [m] and inertia about it per unit density [m⁵] of the enclosed solid.
 
-    Exact for one closed, consistently wound body; otherwise summed over points where the winding number says
-    inside (about 1 % of volume). A surface that encloses nothing counts as a solid of its bounding box.
+    Exact for one closed, consistently wound body. Otherwise summed over points that the winding number calls inside, to
+    about 1 % of volume. A surface that encloses nothing counts as a solid of its bounding box.
     """
     far = topology.far_centre(mesh.vertices)
     if far.any():
@@ -273,7 +270,7 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
 def surface_samples(
     mesh: TriangleMesh, count: int, seed: int
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
-    """Points spread evenly by area, and the unit normals of their faces."""
+    """Return points spread evenly by area, and the unit normals of their faces."""
     rng = np.random.default_rng(seed)
     cross = topology.scaled_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(cross, axis=1)
@@ -317,7 +314,7 @@ def _refuse_path(path: Path) -> None:
 
 
 def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """The mesh without vertices that no face uses, and a warning of them; MeshError where what is left is no mesh."""
+    """Drop vertices that no face uses, with a warning. Raises MeshError if the rest is no mesh."""
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise MeshError(f"{source}: empty mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces)")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -334,7 +331,7 @@ def _strays_told(source: str, strays: int) -> tuple[str, ...]:
 
 
 def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
-    """A warning where a size is odd, none where it is usual, and MeshError where it is absurd."""
+    """Return a warning for an odd size, none for a usual one. Raises MeshError for an absurd one."""
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
         advice = unit_advice(size, scale) if size > 0 else "its vertices all lie in one point"
@@ -347,7 +344,7 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
-    """Coincident vertices merged and degenerate and repeated faces dropped, and how many of each."""
+    """Merge coincident vertices, and drop and count degenerate and repeated faces."""
     vertices, faces = topology.merge_vertices(mesh)
     distinct = topology.drop_degenerate(vertices, faces)
     unique = topology.drop_repeated(distinct)
@@ -357,7 +354,7 @@ def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
 
 
 def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Volume, centre and inertia of a closed body, wound either way: sums over tetrahedra with a corner at zero."""
+    """Return volume, centre and inertia of a closed body, wound either way, by tetrahedra with a corner at zero."""
     corners = mesh.vertices[mesh.faces]
     sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     total, middle = sixfold.sum(), corners.sum(1)

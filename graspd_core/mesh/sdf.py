@@ -1,8 +1,8 @@
 """Signed distance on a grid: exact at the nodes near the surface, sampled by trilinear interpolation.
 
 Negative inside, metres. Gradient: autograd of `sample_sdf` gives the derivative of the interpolated distance, which
-jumps between cells; the returned normal is interpolated by itself from exact directions and is the smoother of the two.
-Beyond the grid both are those of the distance to one extrapolated surface point. Building carries no gradient.
+jumps between cells. The returned normal is interpolated from exact directions and is smoother. Beyond the grid both are
+those of the distance to one extrapolated surface point. Building carries no gradient.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PADDING = 0.015
 
 # Nodes up to this many cells from the surface have the exact distance: all eight nodes of every cell that it crosses.
 BAND = 3**0.5
-# Nodes a side of a block, of which the middle one is exact; how often nodes look at their neighbours' closest points.
+# Nodes a side of a block, whose middle node is exact. Sweeps in which nodes look at their neighbours' closest points.
 _BLOCK, _SWEEPS = 3, 3
 
 
@@ -46,7 +46,7 @@ class GridSDF:
         field: φ [m], then the unit normal ∇φ, at each node.
         origin: the first node [m].
         spacing: side of a cell, which is a cube [m], a scalar tensor.
-        half: half of the box's sides [m]; stored, because a count of nodes would have to go to the GPU at every sample.
+        half: half of the box's sides [m], stored so that no count of nodes goes to the GPU at every sample.
     """
 
     field: Float[Tensor, "4 x y z"]
@@ -55,7 +55,7 @@ class GridSDF:
     half: Float[Tensor, "3"]
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> GridSDF:
-        """The same grid elsewhere."""
+        """Return the same grid on another device and in another type."""
         return GridSDF(*(x.to(device=device, dtype=dtype) for x in vars(self).values()))
 
 
@@ -84,13 +84,13 @@ def build_sdf(
 ) -> GridSDF:
     """Sample a mesh's signed distance on at most `resolution`³ nodes, laid out by `grid_layout`.
 
-    The sign is the generalised winding number's, so open, overlapping, doubled and inverted surfaces are welcome; a
-    surface that encloses nothing has φ ≥ 0 everywhere (`is_solid` tells). Distances up to √3 cells (`BAND`) are exact.
-    Beyond, a node's direction is that to a point of the surface that is not always its closest: |φ| is never too small,
-    and too large by at most half a cell, by 0.03 in the mean (tested on the shapes; ten scans: 0.43 and 0.02).
+    The sign is that of the generalised winding number, so open, overlapping, doubled and inverted surfaces are welcome.
+    A surface that encloses nothing has φ ≥ 0 everywhere (`is_solid` tells). Distances up to √3 cells (`BAND`) are
+    exact. Beyond, a node points to a surface point that is not always its closest. There |φ| is never too small, and
+    too large by at most half a cell, by 0.03 in the mean (tested on the shapes, ten scans: 0.43 and 0.02).
 
     Args:
-        resolution: nodes along each side of a cube; another object has as many in all, and the finer cells.
+        resolution: nodes along each side of a cube. Another object has as many in all, and finer cells.
         padding: free space kept around the bounding box [m], at most half the object's extent.
     """
     layout = grid_layout(mesh, resolution, padding)
@@ -110,7 +110,7 @@ def build_sdf(
 
 
 def grid_layout(mesh: TriangleMesh, resolution: int, padding: float = PADDING) -> GridLayout:
-    """The finest cubic cells that cover the padded bounding box with at most `resolution`³ nodes."""
+    """Return the finest cubic cells that cover the padded bounding box with at most `resolution`³ nodes."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     extent = float((high - low).max())
     sides = high - low + 2 * min(padding, extent / 2)
@@ -128,11 +128,10 @@ def grid_layout(mesh: TriangleMesh, resolution: int, padding: float = PADDING) -
 def sample_sdf(
     sdf: GridSDF, points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-    """Signed distance [m] and outward unit normal at points of the object frame, differentiable in the points.
+    """Return signed distance [m] and outward unit normal at points of the object frame, differentiable in the points.
 
-    Outside the grid: with b the point clamped to the grid, c = b − φ(b) n(b) is taken for the closest surface point x
-    has, which is continuous at the border and errs by less than the offset from the grid times the angle that the true
-    direction turns along it.
+    Outside the grid, with b the point clamped to the grid, c = b − φ(b) n(b) replaces the closest surface point. This
+    is continuous at the border.
     """
     half = sdf.half
     unit = points / half - (sdf.origin / half + 1)
@@ -143,7 +142,7 @@ def sample_sdf(
     channels = sampled.reshape(4, -1)
     phi, gradient = channels[0].reshape(points.shape[:-1]), channels[1:].T.reshape(points.shape)
     # Inside the grid `from_surface` is the gradient times a positive number, so the two lengths cancel exactly
-    # and no branch is needed. Any positive reach does where φ is not; a millimetre keeps float32 clear of zero.
+    # and no branch is needed. Any positive reach does where φ is not. A millimetre keeps float32 clear of zero.
     reach = phi.clamp_min(1e-3)
     from_surface = (unit - clamped) * half + reach[..., None] * gradient
     length = safe_norm(from_surface)
@@ -151,15 +150,15 @@ def sample_sdf(
 
 
 def is_solid(sdf: GridSDF) -> bool:
-    """Whether any node is inside; an open sheet, or a wall much thinner than a cell, has none."""
+    """Tell whether any node is inside. An open sheet, or a wall much thinner than a cell, has none."""
     return bool((sdf.field[0] < 0).any())
 
 
 def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tuple[_Vectors, _Vectors]:
-    """Points of the surface, exactly the closest ones within `BAND`, and the normals of their faces, zero beyond it.
+    """Return surface points, exactly the closest ones within `BAND`, and the normals of their faces, zero beyond it.
 
-    The middle node of each block is exact too. Its distance less the way to a node bounds the node's distance from
-    below, which tells what can lie in the band. The other nodes start with the point of their middle node.
+    The middle node of each block is exact too. Its distance less the way to a node is a lower bound of the node's
+    distance, which tells what can lie in the band. The other nodes start with the point of their middle node.
     """
     counts = nodes.shape[1:]
     middles = [np.minimum(np.arange(_BLOCK // 2, n + _BLOCK // 2, _BLOCK), n - 1) for n in counts]
@@ -182,7 +181,7 @@ def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tupl
 
 
 def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
-    """Give each node, in place, the point of its neighbour where that is nearer to it, along each axis and back."""
+    """Give each node, in place, the point of a neighbour that is nearer to it, along each axis and back."""
     for axis in range(3):
         # Views with this axis first: what is written to them is written to the arrays.
         at, to, best = np.moveaxis(nodes, axis + 1, 1), np.moveaxis(closest, axis + 1, 1), np.moveaxis(squared, axis, 0)
@@ -196,12 +195,11 @@ def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
 
 
 def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: float) -> Bool[np.ndarray, "x y z"]:
-    """The nodes' side of the surface.
+    """Return which nodes lie inside.
 
-    Around a closed surface the winding number is constant wherever one can walk without crossing it, and two
-    neighbouring nodes that are both half a cell away have none of it between them: one question answers for each such
-    region. So near, distances are exact. Through the holes of an open surface the number changes in mid-air, so every
-    node is asked.
+    Around a closed surface the winding number is constant in each region without surface. Two neighbouring nodes that
+    are both half a cell away have no surface between them, so one query answers for the region. Around an open surface
+    the number changes in mid-air, so every node is queried.
     """
     from scipy.ndimage import label
 
@@ -222,7 +220,7 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
 def _field(
     offset: _Vectors, normals: _Vectors, inside: Bool[np.ndarray, "x y z"], spacing: float
 ) -> Float[np.ndarray, "4 x y z"]:
-    """φ and its unit gradient (x − c)/φ; on the surface the gradient is the face's normal, turned outwards."""
+    """Return φ and its unit gradient (x − c)/φ. On the surface the gradient is the face's normal, turned outwards."""
     distance = _length(offset)
     phi = np.where(inside, -distance, distance)
     far = distance > NEAR_SURFACE * spacing

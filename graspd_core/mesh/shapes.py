@@ -1,8 +1,8 @@
 """Authored test objects, each the size of something a hand picks up.
 
 Curved surfaces are tessellated with vertices on the true surface, so that a mesh has up to 1 % less volume. The mug
-(cup and handle) and the hammer (shaft and head) are overlapping closed bodies: their inside is where the winding number
-is not zero.
+(cup and handle) and the hammer (shaft and head) are overlapping closed bodies. Their inside has a winding number other
+than zero.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ HEAD_HALF = (0.045, 0.015, 0.015)
 
 
 def make_shape(name: str) -> TriangleMesh:
-    """The authored shape of that name [m]. Raises MeshError for an unknown name."""
+    """Build the authored shape of that name [m]. Raises MeshError for an unknown name."""
     if name not in SHAPES:
         raise MeshError(f"unknown shape {name!r}; valid shapes: {', '.join(sorted(SHAPES))}")
     return SHAPES[name]()
@@ -133,7 +133,7 @@ def _ribbon(outer: Float[np.ndarray, "n 2"], inner: Float[np.ndarray, "n 2"], ha
 
 
 def _stitch(rings: Float[np.ndarray, "rows columns 3"], wrap_rows: bool) -> TriangleMesh:
-    """Join consecutive closed rings by triangles; rings that are single points become poles."""
+    """Join consecutive closed rings by triangles. Rings that are single points become poles."""
     rows, columns = rings.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     low = index if wrap_rows else index[:-1]
@@ -171,7 +171,7 @@ SHAPES: dict[str, Callable[[], TriangleMesh]] = {
 
 
 def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
-    """Shapes, mesh files and the meshes of folders. Raises MeshError: there is no such thing."""
+    """Return shapes, mesh files and the meshes of folders. Raises MeshError: a source does not exist."""
     found: list[str] = []
     for source in sources:
         path = Path(source)
@@ -188,7 +188,7 @@ def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
 
 @lru_cache
 def object_hash(source: str) -> str:
-    """Hash of the content of a shape or a mesh file. Raises MeshError: there is no such thing."""
+    """Return the hash of the content of a shape or a mesh file. Raises MeshError: it does not exist."""
     if source.startswith("shape:"):
         return content_hash(make_shape(source.removeprefix("shape:")))
     path = Path(source)

@@ -1,6 +1,6 @@
 """Points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
 
-A hand sampled every few millimetres does not notice an edge that sinks in between its samples; these points do.
+A hand sampled every few millimetres misses an edge that sinks in between its samples. These points do not.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL) -> tuple[Points, float]:
-    """Evenly spread surface points [m] with less than a probe's depth of material below them.
+    """Return evenly spread surface points [m] with less than a probe's depth of material below them.
 
-    A point a depth d below a flat or gently curved surface is d away from it; below an edge or in a thin wall it is
-    nearer. At most `count` of them, more where that is too few for thin walls, fewer on a smooth object, possibly
-    none. Each is the farthest from all before, so that the first of them are evenly spread too.
+    A point a depth d below a flat surface is d away from it. Below an edge or in a thin wall it is nearer. There are at
+    most `count` points, more for thin walls, fewer on a smooth object, possibly none. Each is the farthest from all
+    before, so that the first of them are evenly spread too.
 
     Args:
-        pool: how many places are looked at, of vertices, of edges, and half as many of faces.
+        pool: number of candidate places: of vertices, of edges, and half as many of faces.
 
     Returns:
         The points, and the share of the surface with less than two probe depths of material below it: near one for
@@ -59,7 +59,10 @@ def _is_thin(query: DistanceQuery, points: Points, normals: Points, probe: float
 
 
 def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray, "points 3"]:
-    """Points evenly along the edges where faces meet at more than 20°, or end [m]. Return `count`, or none."""
+    """Return `count` points evenly along the edges where faces meet at over 20°, or end [m].
+
+    None without such edges.
+    """
     scaled, faces = scaled_normals(mesh.vertices, mesh.faces), mesh.faces
     normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
     sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]))
@@ -80,7 +83,7 @@ def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray
 
 
 def farthest_points(points: Points, count: int) -> np.ndarray:
-    """Indices of at most `count` points by farthest-point sampling, starting from the first."""
+    """Return the indices of at most `count` points by farthest-point sampling, starting from the first."""
     if len(points) == 0:
         return np.zeros(0, dtype=int)
     columns = np.ascontiguousarray(points.T)
@@ -103,10 +106,10 @@ def farthest_first(
 
     Args:
         size: how many points there are.
-        count: how many are chosen at most; all of `chosen` are.
+        count: how many are chosen at most, but all of `chosen`.
         chosen: indices of the first ones.
         distances: of a chosen point to its mates, in any unit that grows with the distance.
-        mates: the points that a chosen point counts for; all others are infinitely far from it.
+        mates: the points that a chosen point counts for. All others are infinitely far from it.
     """
     picked, gap = [int(index) for index in chosen], np.full(size, np.inf)
     for number in range(max(min(count, size), len(picked))):
@@ -118,7 +121,7 @@ def farthest_first(
 
 
 def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
-    """An order of points in which those that follow each other lie near each other, by halving along the widest side.
+    """Return an order in which successive points lie near each other, by halving along the widest side.
 
     Every sixteen from the first lie together, and so do any eight or four of them.
     """
@@ -132,10 +135,7 @@ def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
 
 
 def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
-    """Vertices, points along edges, and surface samples, with normals: the places where something sharp may be.
-
-    At most `size` of each.
-    """
+    """Return vertices, points along edges, and surface samples, with normals, at most `size` of each."""
     scaled = scaled_normals(mesh.vertices, mesh.faces)
     vertex_normals = np.zeros_like(mesh.vertices)
     for corner in range(3):

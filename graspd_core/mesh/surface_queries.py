@@ -1,8 +1,8 @@
 """Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64. No grid, no gradient.
 
-Signed distances are what metrics are measured with: negative where the generalised winding number (Barill et al. 2018)
-says inside. It needs no closed, oriented or single surface: open, overlapping, doubled and inverted ones have an inside
-too. Rays alone go by Open3D (Embree), which takes half a second to import: no plan on a mesh needs it.
+Signed distances, which metrics use, are negative inside by the generalised winding number (Barill et al. 2018). Open,
+overlapping, doubled and inverted surfaces have an inside too. Only rays use Open3D (Embree), which takes half a second
+to import. No plan on a mesh needs them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graspd_core.types import TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class DistanceQuery:
-    """A mesh prepared for questions of distance; safe to ask from several threads."""
+    """A mesh prepared for queries of distance, safe to use from several threads."""
 
     surface: Surface
     tree: WindingTree
@@ -33,7 +33,7 @@ def make_distance_query(mesh: TriangleMesh) -> DistanceQuery:
 def signed_distance(
     query: DistanceQuery, points: Float[np.ndarray, "n 3"], *, reach: float = np.inf
 ) -> Float[np.ndarray, "n"]:
-    """Distance [m] to the nearest triangle, negative where the winding number says inside.
+    """Return the distance [m] to the nearest triangle, negative inside by the winding number.
 
     Points farther than `reach` [m] from the bounding box get their distance to the box, a lower bound above `reach`.
     """
@@ -45,16 +45,16 @@ def signed_distance(
 
 
 def inside(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Whether the winding number says inside; needs no distance."""
+    """Return which points are inside by the winding number, without a distance."""
     return is_inside(query.tree, points)
 
 
 def unsigned_distance(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Distance [m] to the nearest triangle on either side; needs no winding number."""
+    """Return the distance [m] to the nearest triangle on either side, without a winding number."""
     return surface_distance(query.surface, points)
 
 
-# Points per call: igl holds Python's lock during one, so this bounds how long other threads wait (about 2 ms).
+# Points per call: libigl holds Python's lock during one, so this bounds how long other threads wait (about 2 ms).
 _POINTS_AT_ONCE = 256
 # Accuracy scales of the tree: at the coarse one numbers are off by up to 0.3 at a quarter of the fine one's cost.
 _COARSE, _FINE = 1.0, 2.0
@@ -84,7 +84,7 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
     import igl
 
     low, high, centre = mesh.vertices.min(0), mesh.vertices.max(0), mesh.vertices.mean(0)
-    # Centred, because the tree's expansion loses digits far from the origin; cut up, because the tree sums every face
+    # Centred, because the tree's expansion loses digits far from the origin. Cut up, because the tree sums every face
     # that is long for its distance, which makes slivers ten times slower.
     cut = cut_long_faces(TriangleMesh(mesh.vertices - centre, mesh.faces), float((high - low).max()) / 10)
     tree = igl.FastWindingNumberBVH()
@@ -93,7 +93,7 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
 
 
 def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """Whether points lie inside: a winding number beyond one half, of either sign; outside the bounding box, never."""
+    """Return which points lie inside: a winding number beyond one half, of either sign, within the bounding box."""
     inside = np.all((points >= tree.low) & (points <= tree.high), axis=1)
     asked = points[inside] - tree.centre
     number = _numbers(tree, asked, _COARSE)
@@ -104,7 +104,7 @@ def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[
 
 
 def winding_inside(mesh: TriangleMesh, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """`is_inside` for one set of points; for several, keep the mesh's tree."""
+    """Return `is_inside` for one set of points. For several, keep the mesh's tree."""
     return is_inside(make_winding_tree(mesh), points)
 
 
@@ -114,17 +114,13 @@ def _numbers(tree: WindingTree, points: Float[np.ndarray, "n 3"], accuracy: floa
     return np.concatenate(numbers) if numbers else np.zeros(0)
 
 
-# Questions per call: libigl holds Python's lock during one, so this bounds how long other threads wait (about 1 ms).
-_CHUNK = 256
-
-
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A mesh prepared for many queries.
 
     Attributes:
         mesh: its arrays as libigl takes them: contiguous, float64 [m] and int64.
-        normals: of the faces, unit; zero where a face has no area.
+        normals: of the faces, unit, zero for a face without area.
         hierarchy: the `igl.AABB`.
     """
 
@@ -147,14 +143,14 @@ def make_surface(mesh: TriangleMesh) -> Surface:
 
 
 def surface_distance(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Unsigned distance to the nearest triangle [m]; infinite for a point that is not finite."""
+    """Return the unsigned distance to the nearest triangle [m], infinite for a point that is not finite."""
     return np.sqrt(_nearest(surface, points)[0])
 
 
 def closest_points(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The closest surface points [m] and the unit normals of their faces; NaN of points that are not finite."""
+    """Return the closest surface points [m] and the unit normals of their faces, NaN for points that are not finite."""
     squared, faces, closest = _nearest(surface, points)
     # libigl leaves the face and the point unset where no distance is finite.
     found = np.isfinite(squared)
@@ -176,10 +172,9 @@ _AROUND = _AROUND[np.abs(_AROUND).any(1)] / np.linalg.norm(_AROUND[np.abs(_AROUN
 def pressed_points(
     surface: Surface, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The surface points next to `points` [m], and outward unit normals of the surface there, as near to `normals` as
-    can be.
+    """Return the closest surface points [m], and the outward unit normals there that are nearest to `normals`.
 
-    On a face this is the face's own normal. On an edge or a corner every direction between those of its faces is one.
+    On a face this is the face's own normal. On an edge or a corner every direction between those of its faces counts.
     """
     closest, own = closest_points(surface, points)
     around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]
@@ -201,7 +196,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Of rays from the origin: how many `directions` long until they hit (infinite: never), face index, unit normal."""
+    """Cast rays from the origin. Return the lengths in `directions` (infinite: no hit), faces and unit normals."""
     import open3d as o3d
 
     # Embree counts in float32: about the mesh's centre it need not be near the origin.
@@ -217,12 +212,12 @@ def first_hits(
 def _nearest(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Integer[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Squared distance [m²], face and point of the surface nearest to each point."""
+    """Return squared distance [m²], face and point of the surface nearest to each point."""
     vertices, faces = surface.mesh.vertices, surface.mesh.faces
     points = np.ascontiguousarray(points, dtype=float)
     # One call at least: without points, too, the arrays have their shapes.
-    starts = range(0, max(len(points), 1), _CHUNK)
-    parts = [surface.hierarchy.squared_distance(vertices, faces, points[i : i + _CHUNK]) for i in starts]
+    starts = range(0, max(len(points), 1), _POINTS_AT_ONCE)
+    parts = [surface.hierarchy.squared_distance(vertices, faces, points[i : i + _POINTS_AT_ONCE]) for i in starts]
     squared, face, closest = (np.concatenate(part) for part in zip(*parts, strict=True))
     # The wheel says long long, which NumPy holds to be another type.
     return squared, face.astype(np.int64), closest

@@ -1,7 +1,4 @@
-"""What the vertices and faces of a triangle soup say of its surface, and how to tidy them.
-
-Rows of integers, and the voxels that points lie in, are packed into single numbers.
-"""
+"""Topology of a triangle soup, and its repair. Rows of integers and voxels are packed into single numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from graspd_core.types import TriangleMesh
 
 
 def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
-    """One number for each row, in the order of the rows; equal where rows are.
+    """Return one number for each row, in the order of the rows, equal for equal rows.
 
     NumPy sorts numbers several times as fast as rows, and lets other threads run meanwhile.
     """
@@ -30,7 +27,7 @@ def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
 
 
 def voxel_keys(points: Float[np.ndarray, "n k"], size: float) -> Int[np.ndarray, "n"]:
-    """One number for the cell of side `size` that each point lies in, in the order of the cells' coordinates."""
+    """Return one number for the cell of side `size` of each point, in the order of the cells' coordinates."""
     return packed_rows(np.floor(points / size).astype(np.int64))
 
 
@@ -42,7 +39,7 @@ MERGE_DISTANCE = 1e-6
 
 
 def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
-    """Vertices of one lattice cell of 1 µm become one."""
+    """Merge the vertices of each lattice cell of 1 µm."""
     low = mesh.vertices.min(0)
     cells = np.round((mesh.vertices - low) / MERGE_DISTANCE).astype(np.int64)
     _, first, inverse = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
@@ -50,9 +47,9 @@ def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
 
 
 def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """The mesh without the vertices that no face uses, and how many those were.
+    """Return the mesh without the vertices that no face uses, and their number.
 
-    A face that names a vertex twice uses none; it comes to name one vertex three times.
+    A face that names a vertex twice uses none. It comes to name one vertex three times.
     """
     a, b, c = mesh.faces.T
     used = np.zeros(len(mesh.vertices), dtype=bool)
@@ -64,13 +61,13 @@ def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
 
 
 def scaled_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"]:
-    """Normals of faces, as long as twice their area [m²]."""
+    """Return the normals of faces, as long as twice their area [m²]."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     return np.cross(b - a, c - a)
 
 
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """The faces with an area (height above 1e-9 of the longest side)."""
+    """Return the faces with an area (height above 1e-9 of the longest side)."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.linalg.norm(scaled_normals(vertices, faces), axis=1)
     longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
@@ -78,7 +75,7 @@ def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3
 
 
 def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """The first face on each set of three vertices, whatever its winding."""
+    """Return the first face on each set of three vertices, whatever its winding."""
     _, first = np.unique(packed_rows(np.sort(faces, axis=1)), return_index=True)
     return faces[np.sort(first)]
 
@@ -88,7 +85,7 @@ def _edges(faces: Faces) -> Int[np.ndarray, "edges 2"]:
 
 
 def is_oriented(faces: Faces) -> bool:
-    """Whether every edge between just two faces is walked once in either direction."""
+    """Tell whether every edge between just two faces is walked once in either direction."""
     edges = _edges(faces)
     low, high = edges.min(1), edges.max(1)
     _, which, counts = np.unique(low * (int(faces.max()) + 1) + high, return_inverse=True, return_counts=True)
@@ -97,7 +94,7 @@ def is_oriented(faces: Faces) -> bool:
 
 
 def is_closed(mesh: TriangleMesh) -> bool:
-    """Every edge has an even number of faces."""
+    """Tell whether every edge has an even number of faces."""
     a, b = _edges(mesh.faces).T
     _, counts = np.unique(np.minimum(a, b) * len(mesh.vertices) + np.maximum(a, b), return_counts=True)
     return bool((counts % 2 == 0).all())
@@ -116,7 +113,10 @@ def orient(vertices: Vertices, faces: Faces) -> Faces:
 
 
 def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
-    """The same surface with no edge above `longest` [m], by halving longest edges; corners of faces no longer meet."""
+    """Return the same surface with no edge above `longest` [m].
+
+    Longest edges are halved. Faces share no corners then.
+    """
     corners = mesh.vertices[mesh.faces]
     done = []
     while len(corners):
@@ -138,12 +138,12 @@ _FAR = 100.0
 
 
 def far_centre(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
-    """The middle of a thing that is farther from the origin than a hundred times its size [m]; else zero."""
+    """Return the middle of a body if it is farther from the origin than a hundred times its size [m], else zero."""
     low, high = vertices.min(0), vertices.max(0)
     centre = (low + high) / 2
     return centre if np.linalg.norm(centre) > _FAR * (high - low).max() else np.zeros(3)
 
 
 def moved_mesh(mesh: TriangleMesh, offset: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """The mesh elsewhere; itself where the offset is zero."""
+    """Return the mesh moved by an offset [m], the mesh itself for zero."""
     return TriangleMesh(mesh.vertices + offset, mesh.faces) if offset.any() else mesh

@@ -38,7 +38,7 @@ _AT_ONCE = 128
 _KNOCK_COST = 100.0
 # A score that no candidate has.
 _WORST = -1e3
-# Share of the grasps asked for that the ranking expects to hold, below which a method searches again; and how far apart
+# Share of the grasps asked for that the ranking expects to hold, below which a method searches again, and how far apart
 # the seeds of two searches are: not those of two rounds.
 _LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
 

@@ -47,7 +47,7 @@ _SETTLING = structs.Pregrasp(
 _CONE_EDGES = 8
 # Weights of an even spread of the load and of normal forces that sum to one, against balance.
 _RIDGE, _SUM = 0.5, 10.0
-# Newton's method ends at this squared slope; it takes ten steps at most, but for what is not a number.
+# Newton's method ends at this squared slope. It takes ten steps at most, but for what is not a number.
 _CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
 
@@ -327,7 +327,7 @@ class Squeeze:
     Attributes:
         joints: position targets [rad] or [m].
         forces: on the object, one per link [N].
-        imbalance: norm of the net wrench over the sum of forces; one where there is no balance to be had.
+        imbalance: norm of the net wrench over the sum of forces, one without a balance.
     """
 
     joints: Float[Tensor, "batch joints"]

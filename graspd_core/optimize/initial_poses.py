@@ -26,13 +26,13 @@ from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, aligning_rotation, normalize, quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
 
-# Tilt of the palm against the hull's normal [rad]; how far the palm is put from the object [m].
+# Tilt of the palm against the hull's normal [rad], and the palm's distance from the object [m].
 _TILT, _PALM_STANDOFF = 0.35, (0.005, 0.05)
 # How far from open to closed the fingers are whose tips are put to the object, and how far from it [m].
 _SHARE_CLOSED, _TIP_STANDOFF = (0.2, 0.8), (-0.01, 0.01)
 # Places drawn for each start kept, surface points that tell the object's width, and how much width matters [m].
 _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
-# Among obstacles more places are drawn; how deep a hand reaches into one [m] that makes its place e times rarer, and
+# Among obstacles more places are drawn. How deep a hand reaches into one [m] that makes its place e times rarer, and
 # how far a hand is lifted off the support to stay above it [m].
 _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
 # Pools drawn at most where restrictions forbid starts, and how far apart the seeds of two pools are.
@@ -85,12 +85,11 @@ def draw_starts(
     """Draw `count` seeded starts with the palm on the object's convex hull, at places that the hand can span.
 
     This follows the published initialisation of Grasp'D (a random surface point, palm towards it, random roll). Points
-    are on the hull, so that no palm starts inside a hollow. Place and roll favour narrow cross-sections.
-    A share `fingertips` of the starts has half-closed fingers, and the middle between the fingertips in place of the
-    palm: an open hand does not reach what is small or low on a table.
-    Hands that would reach into obstacles, or could not have come there, are drawn last.
-    With restrictions, starts are drawn until enough are allowed, or `_MOST_POOLS` times as many were drawn: then there
-    are fewer than `count`, perhaps none.
+    are on the hull, so that no palm starts inside a hollow. Place and roll favour narrow cross-sections. A share
+    `fingertips` of the starts has half-closed fingers, and the middle between the fingertips in place of the palm: an
+    open hand does not reach what is small or low on a table. Hands that would reach into obstacles, or could not have
+    come there, are drawn last. With restrictions, starts are drawn until enough are allowed, or `_MOST_POOLS` times as
+    many were drawn: then there are fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)

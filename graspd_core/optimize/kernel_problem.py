@@ -135,7 +135,7 @@ def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
     order = np.argsort(links.numpy(), kind="stable")
     width = _padded(len(order))
     weight = np.zeros((len(order), width))
-    # The upper triangle has each pair once; in another order of spheres a pair may come to lie below.
+    # The upper triangle has each pair once. In another order of spheres a pair may come to lie below.
     both = hand.spheres.weight + hand.spheres.weight.T
     weight[:, : len(order)] = np.triu(both.numpy()[np.ix_(order, order)], 1)
     centers = _points(spheres.numpy()[order], links.numpy()[order], arrays)

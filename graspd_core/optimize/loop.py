@@ -100,7 +100,7 @@ class Hooks:
         stop: true ends the run within one step.
         deadline: `time.perf_counter()` value at which the run ends within one step.
         interval: least time between reports [s].
-        watch: called with the best poses so far at every report; None if nobody looks.
+        watch: called with the best poses so far at every report, None for no call.
     """
 
     report: Callable[[int, int, float], None] = field(default=lambda step, steps, loss: None)

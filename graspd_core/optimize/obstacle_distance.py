@@ -52,7 +52,7 @@ class ObstacleTensors:
         corner_radii: of the balls about them [m].
         sphere_matrix: places the proxy spheres likewise.
         sphere_radii: of the proxy spheres [m].
-        normal: of the support, into the free side; None without a support.
+        normal: of the support, into the free side, None without a support.
         offset: n·x of the support's points [m].
         sdfs: signed distances of the things that this hand can reach.
         approach: unit direction in which the hand comes to its pregrasp, base frame.
@@ -178,9 +178,10 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 
 @torch.no_grad()
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
-    """Return the least of `obstacle_gaps` of each hand [m]; a thing farther away than `wide` does not count.
+    """Return the least of `obstacle_gaps` of each hand [m].
 
-    Only links near an obstacle's grid are looked at: in a bin, of a hand and five obstacles, a tenth of all.
+    An obstacle farther away than `wide` does not count. Only links near an obstacle's grid are looked at: in a bin, of
+    a hand and five obstacles, a tenth of all.
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:

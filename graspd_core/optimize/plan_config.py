@@ -148,8 +148,7 @@ def to_mapping(config: PlanConfig) -> dict[str, Any]:
 def plan_config(values: Any, where: str = "config") -> PlanConfig:
     """Build the settings of a run from a preset's nested mappings.
 
-    Raises:
-        ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
+    Raises ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
     """
     named = values.get("method", _DEFAULT_METHOD) if isinstance(values, Mapping) else _DEFAULT_METHOD
     row = method_row(named, where)

@@ -96,7 +96,7 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
         (staged.overlap / 0.001).clamp_max(5.0),
         _links_touching(staged.contact_set),
         count,
-        shares.sum(-1) ** 2 / (shares**2).sum(-1).clamp_min(1e-9),  # Contacts that share the load; 0: no force.
+        shares.sum(-1) ** 2 / (shares**2).sum(-1).clamp_min(1e-9),  # Contacts that share the load, 0 without force.
         (shares[..., None] * arms).sum(1).norm(dim=-1),
         normals.sum(1).norm(dim=-1) / count,
         *_spread(normals, count).unbind(0),

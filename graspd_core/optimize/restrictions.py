@@ -21,7 +21,7 @@ from graspd_core.optimize.loop import Positions, Values
 from graspd_core.perception.scene import Obstacle, Scene, moved_grasp, moved_obstacle
 from graspd_core.types import Grasp
 
-# Initial poses as rows: origins of the base [m], unit quaternions wxyz, joint values; and which of them are allowed.
+# Initial poses as rows: origins of the base [m], unit quaternions wxyz, joint values, and which of them are allowed.
 Places = Float[np.ndarray, "batch 3"]
 Turns = Float[np.ndarray, "batch 4"]
 JointRows = Float[np.ndarray, "batch joints"]
@@ -34,7 +34,7 @@ class Roll:
 
     Attributes:
         side: unit vector square to the hand's approach, base frame.
-        zero: unit vector that `side` points along at a roll of 0, once made square to the approach; object frame.
+        zero: unit vector that `side` points along at a roll of 0, once made square to the approach, object frame.
         angle: wanted, right-handed about the approach [rad].
         tolerance: either way [rad].
     """
@@ -57,10 +57,10 @@ class Aim:
     """Where starts are wanted.
 
     Attributes:
-        direction: unit direction of approach, object frame; None: any.
+        direction: unit direction of approach, object frame. None: any.
         angle: greatest angle between it and a hand's approach [rad].
-        roll: about the approach; None: any.
-        places: points of the surface that the palm is to face [m]; None: any.
+        roll: about the approach. None: any.
+        places: points of the surface that the palm is to face [m]. None: any.
     """
 
     direction: Float[np.ndarray, "3"] | None = None
@@ -83,8 +83,7 @@ class Restriction(Protocol):
     def bind(self, scene: Scene, hand: HandModel) -> BoundRestriction:
         """Return the restriction for this scene and this hand.
 
-        Raises:
-            ConfigError: it is malformed, or does not fit the scene or the hand.
+        Raises ConfigError: it is malformed, or does not fit the scene or the hand.
         """
         ...
 

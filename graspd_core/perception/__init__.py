@@ -1,1 +1,1 @@
-"""From what cameras and files give to a scene."""
+"""Scenes from cameras and files."""

@@ -1,4 +1,4 @@
-"""A scene from whatever names an object: a mesh file, a cloud file, an authored shape, or a mesh."""
+"""A scene from a mesh file, a cloud file, a depth image, an authored shape, or a mesh."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def load_scene(
 
     Args:
         source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
-        mass: [kg]; None assumes the heavy end of what the volume allows, and warns of it.
+        mass: [kg]. None assumes the heavy end of what the volume allows, and warns of it.
         friction: Coulomb coefficient between hand and object.
         scale: factor on the file's coordinates to make them metres.
-        resolution: the distance grid has at most the cube of it in nodes; `plan_grasps` goes by its preset.
-        target: which of the things in a cloud is meant.
+        resolution: the distance grid has at most the cube of it in nodes. `plan_grasps` goes by its preset.
+        target: which object of a cloud is meant.
         alone: a cloud shows the object and nothing else.
-        view_point: where a cloud's camera stood [m]; None: where its file says, else at the origin.
+        view_point: position of a cloud's camera [m]. None: that of its file, else the origin.
         settings: how a cloud becomes a scene.
-        camera: file of the camera that took a depth image, which `source` is then (docs/clouds.md); there `scale` is
+        camera: file of the camera that took the depth image `source` (docs/clouds.md). There `scale` is
             metres per unit of depth, and 1 leaves it to the camera's file.
 
     Raises:
@@ -93,7 +93,7 @@ def load_scene(
 def scaled_views(
     source: str | Path, camera: str | Path | None, scale: float = 1.0, view_point: Sequence[float] | None = None
 ) -> list[PointCloud]:
-    """What a cloud file or a depth image shows [m], as `load_scene` takes it. Raises CloudError: see there."""
+    """Return the views of a cloud file or a depth image [m]. Raises CloudError: see `load_scene`."""
     if camera is not None:
         if view_point is not None:
             raise CloudError(f"view_point: {source} is a depth image, which tells where its camera stood")

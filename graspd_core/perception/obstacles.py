@@ -1,9 +1,8 @@
-"""What stands around the object: hulls that the hand keeps out of, of what was seen, or of shapes known as a whole.
+"""Obstacles about the object: hulls that the hand avoids, of seen points or of shapes known as a whole.
 
-The back of a neighbour is not seen. Each is taken for the convex hull of its points and of their shadow on the table
-(what is seen is carried straight down), so that what lies beneath overhangs counts as full, and what hides behind the
-seen face counts only as far as the hull spans it: thin, on purpose, because a guess that bulges would block free space.
-A thing that goes round the object, whose hull would hold it, is taken in parts.
+The back of a neighbour is not seen. Its obstacle is the convex hull of its points and their shadow on the table, so
+space beneath overhangs counts as full. Behind the seen face the hull is thin on purpose, because a bulging guess would
+block free space. An object that surrounds the target is split into parts.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _TARGET_SAMPLES = 2000
 # about a ball has half of it, a box a quarter too large every way still 0.5, things that only touch have nothing.
 _SAME = 0.3
 _OVERLAP_SAMPLES = 4000
-# Of what is seen of a shape near the object [m²]; and the least and most points of one.
+# Area of a sample of a shape near the object [m²], and the least and most samples of one.
 _AREA_OF_A_SAMPLE = 1e-4
 _FEWEST, _MOST = 200, 4000
 _CORNERS = 200
@@ -49,13 +48,13 @@ def make_obstacles(
     reach: float,
     settings: ObstacleConfig | None = None,
 ) -> tuple[Obstacle, ...]:
-    """Neighbours from their seen points, in the frame of the points [m].
+    """Return the obstacles of neighbours from their seen points, in the frame of the points [m].
 
     Args:
-        points: those of each thing; things of too few finite points are left out.
-        support: what they stand on, if anything; their points are extruded down to it.
+        points: those of each object. Objects of too few finite points are left out.
+        support: what they stand on, if anything. Their points are extruded down to it.
         target: the object to grasp.
-        reach: things farther than this from the object are left out [m].
+        reach: objects farther than this from the target are left out [m].
         settings: of the hulls.
     """
     settings = settings or ObstacleConfig()
@@ -82,7 +81,7 @@ def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
-    """The points, parted by a grid of cubes, or of columns that stand on the support."""
+    """Split the points by a grid of cubes, or of columns that stand on the support."""
     if support is None:
         local = points
     else:
@@ -94,7 +93,7 @@ def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.
 
 
 def padded_hull(points: Points, support: Plane | None, padding: float) -> TriangleMesh:
-    """The closed convex surface about points, their projection onto the support, and a skin of `padding` [m]."""
+    """Return the closed convex surface about points, their projection onto the support, and a skin of `padding` [m]."""
     corners = points
     if support is not None:
         height = points @ support.normal - support.offset
@@ -109,15 +108,15 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
 def with_neighbours(
     scene: Scene, things: Mapping[str, Sequence[TriangleMesh]], settings: SceneConfig | None = None
 ) -> Scene:
-    """The scene with things about the object, by name, as obstacles; what is far away costs next to nothing.
+    """Return the scene with collision objects about the object as obstacles, by name.
 
-    A thing that fills the object's own place is the object as a planning scene holds it: it is left out, and a warning
-    of the object says so. What does not rise above the support is the support, and is left out too.
+    An object that fills the target's own place is the target in a planning scene. It is left out, with a warning. An
+    object that does not rise above the support is left out too. Objects far away cost next to nothing.
 
     Args:
         scene: of the object.
         things: closed shapes of each, in the object's frame [m].
-        settings: how near things are taken (`segmentation.obstacle_range`), and the hulls (`obstacles`).
+        settings: how near objects are taken (`segmentation.obstacle_range`), and the hulls (`obstacles`).
     """
     settings = settings or SceneConfig()
     mesh, reach = scene.object.mesh, settings.segmentation.obstacle_range
@@ -138,7 +137,7 @@ def with_neighbours(
 
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
-    """What the hulls of points share, of what they fill together; 0 where one is flat."""
+    """Return the shared volume of the hulls of points, divided by that of their union, 0 for a flat one."""
     try:
         hulls = [ConvexHull(_hull_corners(a)), ConvexHull(_hull_corners(b))]
     except QhullError:
@@ -158,7 +157,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Points whose hull is that of the shape within a box: of its surface and of the box's corners."""
+    """Return points whose hull is that of the shape within a box: of its surface and of the box's corners."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

@@ -1,1 +1,1 @@
-"""What a run is made of besides its searches: its clock, its rounds, and the trials of what was found."""
+"""A run: its rounds, its restrictions, and the reasons why an object cannot be held."""

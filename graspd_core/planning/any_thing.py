@@ -1,8 +1,8 @@
-"""The next thing of a scene: of all things seen, one with a grasp that is sure enough, else with the surest one.
+"""The next object of a scene: of all objects seen, one with a sure grasp, else the surest ones.
 
-Things are looked at in an order that costs nothing: those that nothing was tried on in vain first, then those whose
-top is highest, since nothing lies on them. A thing gets one round of the planner as long as it never failed. The first
-with a verified grasp ends the search, so that a request costs little more than one of a single thing.
+Objects without failures come first, then the highest, since nothing lies on them. An object without failures gets one
+round of the planner. The first verified grasp ends the search, so a request costs little more than one for a single
+object.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _SAME_PLACE = 0.04
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """A grasp that was tried in vain, or a thing that had none.
+    """A grasp that failed, or an object without one.
 
     Attributes:
-        place: the middle of the thing's points [m].
-        grasp: its posture at the grasp; None where none was tried.
+        place: the middle of the object's points [m].
+        grasp: its posture at the grasp, None if none was tried.
     """
 
     place: Float[np.ndarray, "3"]
@@ -51,14 +51,14 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class ThingPlan:
-    """What is known of one thing of a scene.
+    """The plan for one object of a scene.
 
     Attributes:
         points: that show it [m].
-        scene: it among the others; None where none could be made.
-        result: of planning; None without a scene.
-        grasp: the best one, verified or not; None where there is none.
-        reason: why there is no verified grasp; empty where there is.
+        scene: the object among the others, None if none could be made.
+        result: of planning, None without a scene.
+        grasp: the best one, verified or not, None for none.
+        reason: why there is no verified grasp, empty if there is one.
         looked_at: whether a grasp was looked for in this request.
     """
 
@@ -76,7 +76,7 @@ class ThingPlan:
 
     @property
     def surety(self) -> float:
-        """How likely its grasp holds; more than one where it is verified, less than zero where there is none."""
+        """Probability that its grasp holds, more than one for a verified grasp, less than zero for none."""
         if self.grasp is None:
             return -1.0
         return (self.grasp.probability or 0.0) + float(self.grasp.verdict is Verdict.VERIFIED)
@@ -95,19 +95,19 @@ def plan_any_thing(
     on_thing: Callable[[ThingPlan], None] | None = None,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
-    """Plan for the things seen until one has a verified grasp, and return all of them, the surest first.
+    """Plan for the objects seen until one has a verified grasp, and return all of them, the surest first.
 
     Args:
         views: what each camera saw [m].
         hand: that grasps.
         settings: of the way from clouds to scenes.
-        surface: what all things stand on, where it is known.
+        surface: what all objects stand on, if it is known.
         solids: what else is known to stand there, by name, frame of the views [m].
-        failures: of before. A thing is not looked at again after `tries` of them. No grasp is given that is like one.
-        tries: of a thing at most.
-        seconds: after which no further thing is begun.
-        on_thing: called with each thing that was looked at.
-        plan: of `plan_grasps`; its `seed` is advanced with every failure of a thing.
+        failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
+        tries: the most tries for an object.
+        seconds: after which no further object is begun.
+        on_thing: called with each object that was looked at.
+        plan: of `plan_grasps`. Its `seed` is advanced with every failure of an object.
 
     Raises:
         CloudError: empty, all NaN, or too few points.
@@ -130,7 +130,6 @@ def plan_any_thing(
 def _in_order(
     things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
-    """Things with what failed on them: fewest failures first, then the highest."""
     rows = [
         (points, [f for f in failures if np.linalg.norm(points.mean(0) - f.place) < _SAME_PLACE]) for points in things
     ]
@@ -144,7 +143,7 @@ def _scene_among(
     surface: Plane | None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None,
 ) -> Scene | str:
-    """Return the scene of the thing that some points show, or why there is none."""
+    """Return the scene of the object that some points show, or the error."""
     # A point of the thing itself: the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
@@ -170,14 +169,11 @@ def _thing_plan(
     result = plan_grasps(scene, hand, **plan)
     left = [grasp for grasp in unlike(result.grasps, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
-        return ThingPlan(points, scene, result, None, _why_none(result))
+        reason = result.message or next((g.reason for g in result.grasps if g.reason), "") or result.outcome.value
+        return ThingPlan(points, scene, result, None, reason)
     best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
     reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp is sure enough"
     return ThingPlan(points, scene, result, best, reason)
-
-
-def _why_none(result: GraspResult) -> str:
-    return result.message or next((g.reason for g in result.grasps if g.reason), "") or result.outcome.value
 
 
 def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:

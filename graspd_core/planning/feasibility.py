@@ -1,9 +1,9 @@
-"""Why an object cannot be held, in words that a user can act on: before any search, and after trials that failed.
+"""Why an object cannot be held, in words that a user can act on: before any search, and after failed trials.
 
 A necessary condition of every grasp, from statics alone: contact forces that cancel cannot all point into one open
-half-space. All contacts of a hand lie within its span of each other; where the surface normals of every such patch of
-the object stay so close together that no force in their friction cones opposes the others, nothing can be held. Rims,
-handles, walls and thin plates have opposing normals next to each other and pass.
+half-space. All contacts of a hand lie within its span of each other. Nothing can be held if in every such patch of the
+object no force of the friction cones opposes the others. Rims, handles, walls and thin plates have opposing normals
+next to each other and pass.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from graspd_core.mesh.topology import packed_rows, scaled_normals
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Verdict
 
-# The roughest surface that a trial believes in; see `verify.world.at_friction`.
+# The roughest surface that a trial believes in. See `verify.world.at_friction`.
 _MOST_FRICTION = 0.6
-# Points of the surface; beside them go the middles of all faces, so that no small handle is missed.
+# Points of the surface. Beside them go the middles of all faces, so that no small handle is missed.
 _SAMPLES = 4000
 # Directions that the object's width is looked at along.
 _DIRECTIONS = 400
@@ -41,7 +41,7 @@ _FROM_ABOVE, _LOW = 0.5, 0.03
 
 
 def out_of_reach(scene: Scene, hand: HandModel) -> str:
-    """Why the hand can hold the object nowhere, as a sentence; empty where it may."""
+    """Return why the hand can hold the object nowhere, as a sentence, empty if it may."""
     span, opening = reach_of(hand)
     vertices = scene.object.mesh.vertices
     # What fits along an axis, as most things do, needs no closer look.
@@ -62,7 +62,7 @@ def out_of_reach(scene: Scene, hand: HandModel) -> str:
 
 
 def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
-    """What became of the grasps whose trials failed, most frequent first, and what may help; empty without any."""
+    """Return the reasons of failed trials, most frequent first, and a remedy, empty without failures."""
     failed = [grasp for grasp in grasps if grasp.verdict is Verdict.FAILED and grasp.reason]
     if not failed:
         return ""
@@ -82,7 +82,7 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
 
 
 def kind_of(reason: str) -> str:
-    """A reason without its figures and directions, so that like ones can be counted."""
+    """Return a reason without its figures and directions, so that like ones can be counted."""
     for figures in (r"\([^()]*\d[^()]*\)", r"(by )?[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?", r"along [-+][xyz]"):
         reason = re.sub(figures, " ", reason)
     return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
@@ -91,7 +91,7 @@ def kind_of(reason: str) -> str:
 # Kept for the last few hands, which are hashed by identity.
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
-    """Of the open hand: the greatest distance of two points of it, and the widest gap between two fingertips [m]."""
+    """Return the greatest distance of two points of the open hand, and the widest gap between two fingertips [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
@@ -102,7 +102,7 @@ def reach_of(hand: HandModel) -> tuple[float, float]:
 
 
 def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Points of the object's surface and their outward unit normals."""
+    """Return points of the object's surface and their outward unit normals."""
     mesh = scene.object.mesh
     points, normals = surface_samples(mesh, _SAMPLES, seed=0)
     across = scaled_normals(mesh.vertices, mesh.faces)
@@ -116,19 +116,16 @@ def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
 def _one_sided(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, least: float
 ) -> bool:
-    """Whether in every patch of `radius` [m] of the surface one direction separates all forces from their opposites.
-
-    The first patch in which none does ends the search.
-    """
+    """Tell whether in every patch of `radius` [m] one direction separates all forces from their opposites."""
     tree = KDTree(points)
     _, first = np.unique(packed_rows(np.round(points / (radius / 4)).astype(np.int64)), return_index=True)
     return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)
 
 
 def _separated(normals: Float[np.ndarray, "n 3"], least: float) -> bool:
-    """Whether one direction a has n·a > `least`, the sine of the friction angle, for all normals n.
+    """Tell whether one direction a has n·a > `least`, the sine of the friction angle, for all normals n.
 
-    The best one is along the point of their convex hull that is nearest to the origin; Gilbert's steps go there (SIAM
+    The best one is along the point of their convex hull that is nearest to the origin. Gilbert's steps go there (SIAM
     J. Control 1966), and end where its distance is too small for any direction.
     """
     nearest = normals.mean(0)

@@ -48,12 +48,10 @@ _WEIGHED = 8
 
 
 def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
-    """The scene as it is planned on (`near_scene`), and where its origin lies in the scene given [m].
+    """Return the scene as it is planned on (`near_scene`), and its origin in the given scene [m].
 
-    A distance grid of another resolution, or of a far object, whose nodes float32 rounded, is built anew.
-
-    Raises:
-        ConfigError: no such resolution.
+    A distance grid of another resolution, or of a far object, whose nodes float32 rounded, is built anew. Raises
+    ConfigError: no such resolution.
     """
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
@@ -90,22 +88,22 @@ def plan_grasps(
     stop: StopHook | None = None,
     watch: WatchHook | None = None,
 ) -> GraspResult:
-    """Plan grasps and try them in rank order until `count` pass all trials of the scene; those that fail come last.
+    """Plan grasps and try them in rank order until `count` pass all trials of the scene. Failed ones come last.
 
     Args:
-        scene: from `load_scene` or `scene_from_views`; where the preset asks for another grid, that is built.
-        hand: from `load_hand`; it gets as many contact candidates as the preset asks for.
+        scene: from `load_scene` or `scene_from_views`. Another grid is built if the preset asks for it.
+        hand: from `load_hand`. It gets as many contact candidates as the preset asks for.
         count: verified grasps wanted.
         seed: same seed, same machine, same grasps.
         preset: a preset's name, a preset file, or the settings themselves.
         verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         deadline: seconds from now after which the run ends with what it has.
         device: of the optimiser's tensors.
-        restrictions: what grasps must be like beside that they hold; what they refuse is counted in `refused`.
-        measure: whether grasps get their metrics, those that failed a trial excepted; it takes longer than a trial.
+        restrictions: further conditions on grasps. Refused candidates are counted in `refused`.
+        measure: whether grasps get their metrics, except failed ones. Measuring takes longer than a trial.
         progress: called from this thread with `Progress` values.
         watch: called from this thread with the hands that the run works on.
-        stop: polled; true ends the run within one optimiser step or a tenth of a simulated second.
+        stop: polled, true ends the run within one optimiser step or a tenth of a simulated second.
 
     Raises:
         ConfigError: count, seed, verify, deadline, device, preset or a restriction is not valid.
@@ -139,9 +137,7 @@ def plan_grasps(
 def _prepared(
     run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str, bound: BoundRestrictions
 ) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
-    """Scene and hand as they are planned on, why nothing can be held there, and the rounds to run.
-    A run that is over before it began begins nothing.
-    """
+    """Return scene and hand as planned on, why nothing can be held, and the rounds, none for a run that is over."""
     if run.over():
         return scene, hand, "", []
     scene, run.origin = planning_scene(scene, config.resolution)
@@ -157,7 +153,7 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
 
 
 def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """The grasps with contacts on the object's mesh: where they lie, and its normals there. A search has its grid's."""
+    """Return the grasps with contacts and normals on the object's mesh. A search has those of its grid."""
     contacts = [contact for grasp in grasps for contact in grasp.contacts]
     if not contacts:
         return tuple(grasps)
@@ -188,7 +184,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
-    """A result without a grasp that is sure enough: with the view that would show most of what is hidden."""
+    """Return a result without a sure grasp, with the next best view of the hidden side."""
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.grasps)
     if scene.evidence is None or not held:
         return result
@@ -206,7 +202,7 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
-    """Seconds of each stage; those of loading were spent before the run began."""
+    """Return the seconds of each stage. Loading took place before the run began."""
     elapsed, (load, sdf) = time.perf_counter() - run.began, scene.timing
     optimise = found.began - run.began + found.optimise_time
     return Timing(
@@ -220,7 +216,7 @@ def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
-    """Refuse what `plan_grasps` would refuse, without a scene. Raises ConfigError: what is valid."""
+    """Refuse what `plan_grasps` would refuse, without a scene. Raises ConfigError: names the valid values."""
     if not 1 <= count <= 1024:
         raise ConfigError(f"count: {count} grasps; valid: 1 to 1024")
     if not 0 <= seed < 2**63:
@@ -238,8 +234,8 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     """Do the first-use work of all libraries on a small sphere, so that the first request is as fast as others.
 
-    For a process that serves: from then on what goes through `run_isolated`, and cutting objects into convex parts, is
-    done in a child process, since threads beside would stand still meanwhile.
+    For a process that serves. It starts the child process for `run_isolated` and for cutting objects into convex parts,
+    so that other threads go on.
     """
     from graspd_core.perception.scene_from_views import scene_from_views
 

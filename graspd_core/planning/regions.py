@@ -1,9 +1,4 @@
-"""Parts of space: boxes, balls and what lies near to given points; and whether a link enters a box.
-
-The latter is exact for solids that are the hull of balls, which all but finely cut hulls are. Frank and Wolfe's steps
-(Naval Research Logistics 1956) lead to the point of a solid's core that is nearest to the box.
-On their way they give a lower bound of the distance. A pair that they leave undecided counts as entered.
-"""
+"""Regions of space: boxes, balls and neighbourhoods of points. Also checks whether a link enters a box."""
 
 from __future__ import annotations
 
@@ -31,7 +26,7 @@ Numbers = Sequence[float | int] | np.ndarray
 
 
 def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
-    """So many finite numbers. Raises ConfigError: they are not, by the name of what was given."""
+    """Return `count` finite numbers. Raises ConfigError otherwise, with the name of what was given."""
     try:
         values = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
@@ -48,7 +43,7 @@ class Box:
     Attributes:
         center: its middle, object frame [m].
         size: its edges' lengths [m].
-        quaternion_wxyz: how its edges are turned, of any length; not at all by default.
+        quaternion_wxyz: rotation of its edges, of any length, by default none.
 
     Raises:
         ConfigError: a number is not finite, an edge not longer than 0, the quaternion 0.
@@ -72,11 +67,11 @@ class Box:
         return rotation_from_quaternion(torch.tensor(tuple(self.quaternion_wxyz), dtype=torch.float64)).numpy()
 
     def local(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Points of the object frame in the box's own [m]."""
+        """Return points of the object frame in the box's own [m]."""
         return (points - np.asarray(self.center)) @ self.rotation
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Signed distance of points [m], negative inside."""
+        """Return the signed distance of points [m], negative inside."""
         beyond = np.abs(self.local(points)) - np.asarray(self.size) / 2
         return np.linalg.norm(beyond.clip(0.0), axis=-1) + beyond.max(-1).clip(max=0.0)
 
@@ -102,13 +97,13 @@ class Sphere:
             raise ConfigError(f"sphere radius: {self.radius} m; valid: above 0")
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Signed distance of points [m], negative inside."""
+        """Return the signed distance of points [m], negative inside."""
         return np.linalg.norm(points - np.asarray(self.center), axis=-1) - self.radius
 
 
 @dataclass(frozen=True, eq=False)
 class NearPoints:
-    """What lies near to points, as those that a mask of an image shows.
+    """The neighbourhood of points, as those of a mask of an image.
 
     Attributes:
         points: object frame [m].
@@ -132,7 +127,7 @@ class NearPoints:
         object.__setattr__(self, "_tree", KDTree(points))
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """How far points are from the nearest point, less the radius [m]; negative inside."""
+        """Return the distance of points from the nearest point, less the radius [m], negative inside."""
         return self._tree.query(points)[0] - self.radius
 
 
@@ -148,7 +143,7 @@ _PAD = 0.004
 
 
 def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) -> Bool[np.ndarray, "postures"]:
-    """In which postures a link reaches into one of the boxes; positions in the boxes' frame."""
+    """Return in which postures a link reaches into one of the boxes. Positions are in the boxes' frame."""
     if not boxes or not postures:
         return np.zeros(len(postures), dtype=bool)
     points, radii = _placed_solids(hand, postures)
@@ -159,7 +154,7 @@ def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) 
 def _placed_solids(
     hand: HandModel, postures: Sequence[Posture]
 ) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
-    """Extreme points of each solid [m], the first again where it has fewer than others; and the radius about them."""
+    """Return the extreme points of each solid [m], padded with the first, and the radius about them."""
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])
@@ -177,7 +172,7 @@ def _enter(
     radii: Float[np.ndarray, "solids"],
     half: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, "postures"]:
-    """Which hands have a solid less than its radius from the box |x| ≤ `half`."""
+    """Return which hands have a solid less than its radius from the box |x| ≤ `half`."""
     flat = points.reshape(-1, *points.shape[2:])
     radius = np.tile(radii, len(points))
     # What lies beyond one of the box's faces is clear of it.
@@ -204,7 +199,7 @@ def _enter(
 
 
 def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple[Obstacle, ...]:
-    """What the hand could meet of each box on its way to the object, as an obstacle of the search."""
+    """Return what the hand could meet of each box on its way to the object, as an obstacle of the search."""
     reach = scene.object.radius + hand_reach(hand) + RETREAT
     found = []
     for box in boxes:

@@ -1,6 +1,6 @@
-"""Rounds of optimiser and trials: how much effort each takes, and what they find.
+"""Rounds of optimiser and trials: their effort and their results.
 
-Too little memory is a named failure, whichever library meets it.
+Too little memory is a named failure in all libraries.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from graspd_core.verify.verification import (
     surest_first,
 )
 
-# What torch says where it finds no memory, on the processor and on CUDA; it raises a RuntimeError for both.
+# What torch says where it finds no memory, on the processor and on CUDA. It raises a RuntimeError for both.
 _TORCH_SAYS = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 @contextmanager
 def enough_memory(asked: str) -> Iterator[None]:
-    """Raise ResourceError for `asked` where the work inside runs out of memory."""
+    """Raise ResourceError for `asked` if the work inside runs out of memory."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -52,10 +52,10 @@ def enough_memory(asked: str) -> Iterator[None]:
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
-    """Settings of every round, each with more effort than the last.
+    """Return the settings of every round, each with more effort than the last.
 
-    A cheap first round pays where its failures are found out at little cost: by a hold trial, on an object whose shape
-    is known and that has nothing about it.
+    A cheap first round pays if failures are found at little cost: by a hold trial, on an object of known shape that
+    stands alone.
     """
     rounds = config.rounds
     cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None
@@ -79,16 +79,16 @@ _WEIGHED, _LIFTED, _HALF = 60, 0.8, 0.5
 
 @dataclass(frozen=True)
 class RoundsResult:
-    """What the rounds of a run found.
+    """The results of the rounds of a run.
 
     Attributes:
         began: when the first round began, a `time.perf_counter()` value.
         grasps: verified (or untried) ones first, then those that failed.
-        context: what grasps are tried with; None where none was tried.
+        context: what grasps are tried with, None if none was tried.
         optimise_time: spent in the method [s].
         first: when the first grasp was verified, a `time.perf_counter()` value.
         refused: candidates that restrictions did not admit to any trial, by reason.
-        mass: that of the trials [kg], where it is less than the one assumed.
+        mass: that of the trials [kg], if it is less than the one assumed.
     """
 
     began: float
@@ -101,17 +101,16 @@ class RoundsResult:
 
     @property
     def good(self) -> int:
-        """How many grasps are as sure as was asked for: verified, or found where no trial was asked for."""
+        """Number of grasps as sure as was asked for: verified, or found if no trial was asked for."""
         return sum(grasp.usable for grasp in self.grasps)
 
 
 def poses_seen(poses: Poses) -> Snapshot:
-    """The hands of an optimiser."""
+    """Return the hands of an optimiser."""
     return Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values()))
 
 
 def _hooks(run: Run, good: int) -> Hooks:
-    """What follows and ends one optimiser while `good` grasps are known."""
     return Hooks(
         report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
         # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.
@@ -135,9 +134,9 @@ def run_rounds(
 ) -> RoundsResult:
     """Find candidates and try them, round by round, until `count` of them are good.
 
-    Most objects need one round, which begins with a small batch for a first answer. Where too few grasps held, what is
-    missing is sought again from other initial poses. Candidates that a restriction refuses are not tried; without
-    `ahead`, what trials need, none is.
+    The first round begins with a small batch for a first answer. If too few grasps held, the next round starts from
+    other initial poses. Candidates that a restriction refuses are not tried. Without `ahead`, the worlds of the trials,
+    none is.
     """
     state = RoundsResult(time.perf_counter())
     rounds = rounds[:1] if scene.evidence is not None and scene.evidence.doubts else rounds
@@ -189,7 +188,7 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 def _tried_lighter(
     run: Run, scene: Scene, ahead: TrialsAhead, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
-    """Try the best grasps again at a mass that the hand can lift, where the one that was assumed is too heavy."""
+    """Try the best grasps again at a mass that the hand can lift, if the assumed one is too heavy."""
     if state.context is None:
         return state
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]

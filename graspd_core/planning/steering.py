@@ -1,9 +1,9 @@
-"""Steering: where a hand comes from, how it is rolled, what it touches and what it keeps away from.
+"""Steering: the hand's approach direction, its roll, its contacts and what it avoids.
 
-The part of an object outside a wanted region is an obstacle of the search. So the search itself puts all contacts into
-the region, with the loss and the gradient that it has for obstacles. The distance is the greater of two, that to the
-object and that to the outside of the region: exact where one of them is the nearer one's, else too small, and its
-gradient jumps where they are equal.
+The part of an object outside a wanted region is an obstacle of the search. The search then puts all contacts into the
+region by its loss for obstacles. The obstacle's distance is the greater of the distances to the object and to the
+outside of the region. It is exact if one of them is the nearer one's, else too small. Its gradient jumps where the two
+are equal.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _BEGINS, _SKIN = 0.003, 0.004
 
 
 def untouched_part(scene: Scene, region: Region) -> Obstacle:
-    """The object outside `region`, on the nodes of the object's own grid."""
+    """Return the object outside `region`, on the nodes of the object's own grid."""
     sdf = scene.sdf
     field, spacing = sdf.field.double().cpu().numpy(), float(sdf.spacing)
     axes = [float(x) + spacing * np.arange(n) for x, n in zip(sdf.origin, field.shape[1:], strict=True)]
@@ -58,7 +58,7 @@ def untouched_part(scene: Scene, region: Region) -> Obstacle:
     )
 
 
-# A contact may lie so far outside the region [m]; rounding of angles [rad].
+# A contact may lie so far outside the region [m]. Angles are rounded by this [rad].
 CONTACT_TOLERANCE = 0.005
 _ROUNDING = 1e-6
 # Points of the surface that tell what part of the object lies in a region, and how many of those are aimed at.
@@ -75,22 +75,22 @@ _PROBES, _TOO_DEEP = 8, 0.06
 
 @dataclass(frozen=True)
 class Steering:
-    """What is asked of a grasp's place and direction. Everything is in the object frame; what is None is not asked for.
+    """What is asked of a grasp's place and direction, in the object frame. None: not asked for.
 
-    The direction of approach of a hand is the one in which it moves from the retreat over the pregrasp to the grasp:
-    `HandModel.approach`, which a hand's description says and which is the palm's normal where it does not.
+    A hand's approach is the direction in which it moves from the retreat over the pregrasp to the grasp:
+    `HandModel.approach`, by default the palm's normal.
 
-    Its side, from which the roll is measured, is the direction from the palm to the fingertips, square to the approach;
-    for a hand whose open fingers point along the approach, as a gripper's, the one in which they close.
+    The roll is measured at the hand's side: the direction from the palm to the fingertips, made normal to the approach.
+    For a hand whose open fingers point along the approach, as a gripper's, it is the direction in which they close.
 
     Attributes:
-        approach_direction: direction of approach that is wanted, of any length but 0; (0, 0, -1) is from above.
+        approach_direction: wanted direction of approach, of any length but 0. (0, 0, -1) is from above.
         approach_angle: greatest angle between it and a grasp's approach, above 0, at most π [rad].
-        region: a `Box`, a `Sphere` or points (`NearPoints`); every contact lies in it, or at most 5 mm outside.
+        region: a `Box`, a `Sphere` or points (`NearPoints`). Every contact lies in it, or at most 5 mm outside.
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
-        roll: turn of the hand's side about the approach, right-handed [rad]; at 0 it points along z, or along x
-            where the wanted approach is within 18° of vertical. It needs an approach direction, and an angle below π/2.
-        roll_zero: where the hand's side points at a roll of 0, once made square to the approach; None: as `roll` says.
+        roll: turn of the hand's side about the approach, right-handed [rad]. At 0 it points along z, or along x if the
+            wanted approach is within 18° of vertical. It needs an approach direction, and an angle below π/2.
+        roll_zero: direction of the hand's side at a roll of 0, made normal to the approach. None: as `roll` says.
         roll_tolerance: greatest difference from `roll` either way, above 0, at most π [rad].
 
     Raises:
@@ -129,7 +129,7 @@ class Steering:
                 raise ConfigError(f"roll_zero: {shown(zero)}; valid: a direction that is not along approach_direction")
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundSteering:
-        """Steering of this hand in this scene.
+        """Bind the steering to this hand in this scene.
 
         Raises:
             ConfigError: no part of the object lies in the region, or that part lies in an avoided box.
@@ -149,7 +149,7 @@ class Steering:
 
 @dataclass(frozen=True, eq=False)
 class BoundSteering(BoundRestriction):
-    """`Steering` of one hand in one scene; `wanted` is where starts are drawn."""
+    """`Steering` of one hand in one scene. `wanted` is where starts are drawn."""
 
     steering: Steering
     scene: Scene
@@ -158,27 +158,27 @@ class BoundSteering(BoundRestriction):
 
     @property
     def asked(self) -> str:
-        """The wishes that there are, by name."""
+        """The names of the given conditions."""
         given = {name: getattr(self.steering, name) is not None for name in ("approach_direction", "region", "roll")}
         given["avoid"] = len(self.steering.avoid) > 0
         return ", ".join(name for name, there in given.items() if there)
 
     @property
     def aim(self) -> Aim | None:
-        """Where starts are drawn, if a place, a direction or a roll is asked for."""
+        """The aim of starts, if a place, a direction or a roll is asked for."""
         asked = self.wanted.direction is not None or self.wanted.places is not None
         return self.wanted if asked else None
 
     @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """The avoided boxes, where the hand could meet them, and what of the object is not to be touched."""
+        """The avoided boxes, where the hand could meet them, and the part of the object that must not be touched."""
         region = self.steering.region
         rest = () if region is None else (untouched_part(self.scene, region),)
         return (*boxes_in_reach(self.scene, self.hand, self.steering.avoid), *rest)
 
     @property
     def impossible(self) -> str:
-        """Why the hand cannot come from the wanted direction: it would have to come out of the support."""
+        """Why the hand cannot come from the wanted direction: it would come out of the support."""
         if self.scene.support is None or self.wanted.direction is None:
             return ""
         depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))
@@ -190,7 +190,7 @@ class BoundSteering(BoundRestriction):
         )
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Hands whose palm lies in no avoided box, there and at the retreat; their aim sees to all else."""
+        """Return which hands have their palm in no avoided box, there and at the retreat."""
         if not self.steering.avoid:
             return np.ones(len(positions), dtype=bool)
         turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
@@ -198,7 +198,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """The candidates that are as asked for; the first wish that one misses is why it is refused."""
+        """Return the candidates that meet all conditions. A refusal names the first condition that is missed."""
         if not grasps:
             return grasps
         asked, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
@@ -222,20 +222,20 @@ class BoundSteering(BoundRestriction):
 
 
 def angle_of_approach(hand: HandModel, grasp: Grasp, direction: Float[np.ndarray, "3"]) -> float:
-    """Angle between a grasp's approach and a unit direction [rad]."""
+    """Return the angle between a grasp's approach and a unit direction [rad]."""
     turned = rotation_from_quaternion(torch.as_tensor(grasp.grasp.quaternion_wxyz)).double().numpy()
     approach = turned @ hand.approach
     return float(np.arctan2(np.linalg.norm(np.cross(approach, direction)), approach @ direction))
 
 
 def outside_region(region: Region, grasp: Grasp) -> float:
-    """How far the farthest contact of a grasp lies outside a region [m]; infinite without a contact."""
+    """Return how far the farthest contact of a grasp lies outside a region [m], infinite without a contact."""
     points = np.array([contact.position for contact in grasp.contacts], dtype=float)
     return float(region.distance(points).max()) if len(points) else np.inf
 
 
 def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
-    """Unit direction that rolls are measured by, square to the approach, base frame; see `Steering`."""
+    """Return the unit direction by which rolls are measured, normal to the approach, base frame (see `Steering`)."""
     links = hand.candidate_link
     points = in_base(link_poses(hand, hand.open_posture), hand.candidate_points, links)
     tips = [points[hand.link_group[links] == group].mean(0) for group in hand.fingertip_groups]
@@ -250,17 +250,16 @@ def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Where a hand's side points at a roll of 0 where nobody says: unit, square to the wanted unit approach."""
+    """Return the default direction of a hand's side at a roll of 0: unit, normal to the wanted unit approach."""
     up = np.eye(3)[0 if abs(direction[2]) > _VERTICAL else 2]
     square = up - (up @ direction) * direction
     return square / np.linalg.norm(square)
 
 
 def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float[np.ndarray, "places 3"]:
-    """Points of the object's surface in a region [m].
+    """Return points of the object's surface in a region [m].
 
-    Raises:
-        ConfigError: there is none, or all of them lie in an avoided box.
+    Raises ConfigError: there is none, or all of them lie in an avoided box.
     """
     mesh = scene.object.mesh
     points = np.vstack([surface_samples(mesh, _SURFACE, seed=0)[0], mesh.vertices])

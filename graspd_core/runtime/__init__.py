@@ -1,1 +1,1 @@
-"""What the process keeps: arrays on disk, a worker process, the heap."""
+"""The process: arrays kept on disk, a worker process, the heap."""

@@ -1,9 +1,8 @@
 """Arrays remembered by key: in this process always, and on disk between processes.
 
-Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`); `GRASPD_CACHE=off` keeps everything in memory. A file
-that cannot be read back whole is built again, and a disk that cannot be written is done without. Clouds are never the
-same twice, so that a node that sees them would fill the disk: the files not used for longest give way.
-Every file appears whole or not at all.
+Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`). `GRASPD_CACHE=off` keeps everything in memory. A file
+that cannot be read back whole is built again. A disk that cannot be written is not used. The files not used for longest
+are removed, because clouds are never the same twice. Every file appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _written = itertools.count(1)
 
 
 def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
-    """The arrays stored under `key`, built and stored if there are none that are `valid`. Read-only by convention."""
+    """Return the arrays stored under `key`, built and stored if none are `valid`. Read-only by convention."""
     with _lock:
         if key in _memory:
             _memory.move_to_end(key)
@@ -55,7 +54,7 @@ def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bo
 
 
 def contents() -> dict[str, Arrays]:
-    """What this process remembers in memory, by key."""
+    """Return what this process remembers in memory, by key."""
     with _lock:
         return dict(_memory)
 
@@ -69,13 +68,13 @@ def supply(arrays: dict[str, Arrays]) -> None:
 
 
 def forget() -> None:
-    """Empty the memory of this process; files stay."""
+    """Empty the memory of this process. Files stay."""
     with _lock:
         _memory.clear()
 
 
 def digest(values: Iterable[Any]) -> str:
-    """SHA-256 of arrays, tuples, dataclasses and what is told by its `repr`, hexadecimal: the part of a key."""
+    """Return the SHA-256 of arrays, tuples, dataclasses and other values by their `repr`, hexadecimal."""
     found = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -95,7 +94,7 @@ def digest(values: Iterable[Any]) -> str:
 
 
 def cache_path(key: str) -> Path | None:
-    """Where the file of `key` lies, None when the disk is not to be used."""
+    """Return the path of the file of `key`, None if the disk is not to be used."""
     if os.environ.get("GRASPD_CACHE", "").lower() in ("off", "0", "no"):
         return None
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
@@ -104,7 +103,7 @@ def cache_path(key: str) -> Path | None:
 
 def _read(path: Path) -> Arrays | None:
     try:
-        # Opening by hand closes the file whatever happens; npz members carry a CRC, so a damaged one is noticed.
+        # Opening by hand closes the file whatever happens. Members of npz carry a CRC, so a damaged one is noticed.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         os.utime(path)
@@ -141,7 +140,7 @@ def _prune(directory: Path) -> None:
 
 
 def save_bytes(path: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all; makes missing directories."""
+    """Write a file that appears whole or not at all. Makes missing directories."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
     try:

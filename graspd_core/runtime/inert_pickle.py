@@ -1,11 +1,9 @@
 """A pickle reader that runs nothing that a file asks for.
 
-A pickle is a program: it names classes and functions, and calls them. Here every name that a format uses stands for an
-inert stand-in of this module, from which the numbers are read afterwards (`array_of`); neither numpy nor any other
-library is called by the file, and every other name is refused. What bounds time and memory: the size of the file, a
-memo that is a dictionary (the C reader allocates as many slots as a file says), no opcode that reserves memory
-beforehand, few arguments to a call, and keys that are text or small numbers: to hash a tuple of tuples takes time
-without bound, or more stack than there is.
+A pickle is a program: it names classes and functions, and calls them. Here every name that a format uses gives an inert
+object of this module, from which the numbers are read afterwards (`array_of`). The file calls no library, and every
+other name is refused. Time and memory are bounded: the file's size, the arguments of a call, and keys, which are text
+or small numbers. The memo is a dictionary. No opcode may reserve memory beforehand.
 
 Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
 """
@@ -40,7 +38,7 @@ class Inert:
     Attributes:
         kind: what it stands for.
         arguments: what it was made with.
-        state: what it was told to become, None where nothing.
+        state: what it was told to become, None for nothing.
     """
 
     kind: str
@@ -53,7 +51,7 @@ class Inert:
 
 @dataclass(frozen=True)
 class Maker:
-    """What stands for a class or function that a file names: it makes an `Inert`, and can do nothing else."""
+    """A stand-in for a class or function that a file names. It makes an `Inert`, and can do nothing else."""
 
     kind: str
 
@@ -70,7 +68,7 @@ class Maker:
 
 
 def makers(*rows: tuple[str, tuple[str, ...], tuple[str, ...]]) -> dict[tuple[str, str], Maker]:
-    """What a file may name, by module and name: of rows of a kind, its modules and its names."""
+    """Return what a file may name, by module and name, from rows of a kind, its modules and its names."""
     return {(module, name): Maker(kind) for kind, modules, names in rows for module in modules for name in names}
 
 
@@ -90,7 +88,7 @@ def _is_plain(key: object) -> bool:
 
 
 def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
-    """The base class's act, after a look at the keys, which lie in its stack at `keys`."""
+    """Return the base class's act behind a check of the keys, which lie in its stack at `keys`."""
 
     def act(reader: Any) -> None:
         if not all(map(_is_plain, reader.stack[keys])):
@@ -101,7 +99,7 @@ def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
 
 
 class _Reader(pickle._Unpickler):
-    """The stand-ins for what a file names; a name that is not admitted is refused."""
+    """A reader that gives an inert object for an admitted name and refuses every other one."""
 
     # What the base class has, though its stubs do not say so.
     stack: list[Any]
@@ -141,7 +139,7 @@ class _Reader(pickle._Unpickler):
         self._admitted = admitted
 
     def find_class(self, module: str, name: str) -> Any:
-        """The stand-in for a name."""
+        """Return the maker for a name."""
         try:
             return self._admitted[module, name]
         except KeyError:
@@ -150,11 +148,11 @@ class _Reader(pickle._Unpickler):
 
 
 class _RefusedError(Exception):
-    """A name that is not admitted."""
+    """The refusal of a name that is not admitted."""
 
 
 def read_bounded(path: Path, what: str) -> bytes:
-    """The content of a file. Raises ValueError: it cannot be read, or is larger than any `what`, "MANO file" say."""
+    """Read a file. Raises ValueError: it cannot be read, or is larger than any `what`, "MANO file" say."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
@@ -166,17 +164,16 @@ def read_bounded(path: Path, what: str) -> bytes:
 
 
 def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
-    """What a pickle holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+    """Return what a pickle holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises:
-        ValueError: not a pickle, or one that names anything but `admitted`; says why, and names the culprit.
+    Raises ValueError: not a pickle, or it names anything but `admitted`. Says why, and names the culprit.
     """
     try:
         return _Reader(content, admitted).load()
     except _RefusedError as refused:
         told = f"asks for {refused}, which a {what} does not need: refused, and nothing of it was run"
         raise ValueError(told) from None
-    # A file that is no pickle fails in whatever way its bytes happen to; the file is the culprit.
+    # A file that is no pickle fails in whatever way its bytes happen to. The file is the culprit.
     except Exception as error:
         told = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ValueError(f"not the pickle of a {what}: {told[:200]}") from error
@@ -189,7 +186,7 @@ _MOST_AXES = 8
 
 
 def array_of(value: Inert) -> np.ndarray:
-    """The array of numbers that an inert one stands for, native byte order. Raises ValueError: it stands for none."""
+    """Return the array of numbers of an inert object, native byte order. Raises ValueError: it holds none."""
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5:
         raise ValueError("holds an array without content")
@@ -222,7 +219,7 @@ def _shown(value: object) -> str:
 
 
 def is_shape(value: object) -> bool:
-    """Whether it is a shape that an array can have."""
+    """Tell whether a value is a shape that an array can have."""
     return (
         isinstance(value, tuple) and len(value) <= _MOST_AXES and all(type(n) is int and 0 <= n < 2**40 for n in value)
     )

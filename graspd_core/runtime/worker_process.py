@@ -1,10 +1,9 @@
 """Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
 
-A process that serves calls `start_worker_process` once; then what goes through `run_isolated` is done in a child.
-All others, the command line among them, do it themselves. The child is a bare interpreter, not one of
-multiprocessing's, which would import the user's main module again: a script without a guard, or none, as in a notebook.
-This module is cheap to import, so that the child can be started before all else. For processes that serve for days, it
-also gives freed memory back to the system.
+A process that serves calls `start_worker_process` once. `run_isolated` then works in a child, in all other processes it
+works in place. The child is a bare interpreter, not one of multiprocessing's, which would import the user's main module
+again. This module is cheap to import, so that the child can be started before all else. For processes that serve for
+days, it also gives freed memory back to the system.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _M_ARENA_MAX, _ARENAS = -8, 2
 
 
 def trim_heap() -> None:
-    """Let the C library return what was freed (glibc keeps it, scattered, for later); others do so by themselves."""
+    """Return freed memory to the system. Only glibc keeps it and needs this."""
     try:
         trim = ctypes.CDLL(None).malloc_trim
     except (OSError, AttributeError, TypeError):  # no glibc
@@ -40,11 +39,7 @@ def trim_heap() -> None:
 
 
 def limit_malloc_arenas() -> None:
-    """Let all threads allocate from two arenas, from now on; glibc only.
-
-    Else every thread that ever allocated holds freed memory of its own that no other thread can use, and a process with
-    many threads grows for as long as they come upon their largest work by turns.
-    """
+    """Let all threads allocate from two arenas (glibc only), since each of its own would keep freed memory."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):
@@ -64,11 +59,11 @@ _PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
-    """Calls functions in a child process, which starts at once and ends with this one, however that ends.
+    """A child process that calls functions. It starts at once and ends with this process, however that ends.
 
-    Calls come one at a time; before the first the child imports `modules`. A child that has died is replaced. Functions
-    must be importable by their names; arguments, results and errors are pickled. With `killed_with_thread` the child
-    is killed as soon as the thread that started it ends, even in the middle of a call (Linux); else behind its call.
+    Calls come one at a time. Before the first the child imports `modules`. A child that has died is replaced. Functions
+    must be importable by their names. Arguments, results and errors are pickled. With `killed_with_thread` the child
+    ends with the thread that started it, even in the middle of a call (Linux), otherwise after its call.
     """
 
     def __init__(self, *modules: str, killed_with_thread: bool = False) -> None:
@@ -78,7 +73,7 @@ class WorkerProcess:
         self._start()
 
     def __call__(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
-        """What the work gives or raises; MemoryError where two children died over it, as when memory is short."""
+        """Return or raise what the work does. Raises MemoryError: two children died over it."""
         # pickle's own way with tensors, by value: that of multiprocessing shares memory that outlives nobody's death.
         call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
         with self._lock:
@@ -105,11 +100,11 @@ class WorkerProcess:
         return answer
 
     def bounded(self, seconds: float, most_mb: float, work: Callable[..., T], *arguments: Any) -> T:
-        """As a call, but done at most once, and ended with the child where it takes too long or too much memory.
+        """Call once, and end the call with its child if it takes too long or too much memory.
 
         Raises:
-            TimeoutError: no end after so many seconds.
-            MemoryError: the child's resident memory passed so many MB (looked at where there is a /proc).
+            TimeoutError: no end after `seconds`.
+            MemoryError: the child's resident memory passed `most_mb` (checked on systems with /proc).
             ChildProcessError: the child died.
         """
         call = pickle.dumps((work, arguments, {}), pickle.HIGHEST_PROTOCOL)
@@ -148,7 +143,7 @@ class WorkerProcess:
         path = [entry for entry in sys.path if isinstance(entry, str)]
         names = {"module": __name__, "modules": self._modules, "parent": self._parent}
         program = _CHILD.format(path=path, pipe=theirs.fileno(), **names)
-        # Ctrl-C reaches every process of the terminal; this one ends when its parent does. It is born with the signal
+        # Ctrl-C reaches every process of the terminal. This one ends when its parent does. It is born with the signal
         # blocked, since it needs a second for its imports before it could ignore it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -164,9 +159,9 @@ _child: WorkerProcess | None = None
 
 
 def start_worker_process(*modules: str) -> None:
-    """From now on do what goes through `run_isolated` in a child process, so that threads beside do not stand still.
+    """Do what goes through `run_isolated` in a child process from now on, so that other threads go on.
 
-    The child begins by importing `modules`; where there is a child, nothing is done.
+    The child begins by importing `modules`. If there is a child already, nothing is done.
     """
     global _child
     if _child is None:
@@ -175,12 +170,12 @@ def start_worker_process(*modules: str) -> None:
 
 
 def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
-    """What the work gives or raises; done in the child where there is one, else here."""
+    """Return or raise what the work does, in the child if there is one, else here."""
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
 def resident_mb(process: int) -> float:
-    """Resident memory of a process [MB]; 0 where it has ended or there is no /proc."""
+    """Return the resident memory of a process [MB], 0 if it has ended or there is no /proc."""
     try:
         pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     except (OSError, IndexError):
@@ -189,9 +184,9 @@ def resident_mb(process: int) -> float:
 
 
 def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
-    """Import modules, then do what comes through the pipe of this file descriptor, until its other end is closed.
+    """Import modules, then answer calls from the pipe of this file descriptor until its other end is closed.
 
-    Where a `parent` is named, its end ends this process at once.
+    The end of a named `parent` ends this process at once.
     """
     if parent:
         _end_with(parent)
@@ -226,7 +221,7 @@ def _end_with(parent: int) -> None:
 
 
 def _answer(call: bytes) -> bytes:
-    """Whether the work failed, and what it gave or raised."""
+    """Return whether the work failed, and its result or error, pickled."""
     try:
         work, arguments, named = pickle.loads(call)
         return pickle.dumps((False, work(*arguments, **named)), pickle.HIGHEST_PROTOCOL)
@@ -246,5 +241,5 @@ _MODULES = ("graspd_core.perception.scene_from_views", "graspd_core.verify.robus
 
 
 def start_planning_worker() -> None:
-    """Start the child process, if there is none yet; it imports what it needs beside what this process does."""
+    """Start the child process, if there is none yet. It imports the libraries of planning meanwhile."""
     start_worker_process(*_MODULES)

@@ -1,11 +1,10 @@
-"""When a hold is over early: the object's drift cannot carry it to a limit in the time that is left.
+"""The end of a hold whose answer is known: the object's drift cannot carry it to a limit in the time that is left.
 
-A trial that stops early goes through the same states as one of full length, so it can verify what that would not,
-never the reverse. What slides slowly may come to an edge and snap away: hence the safety. Jitter on the contacts
-hides how far an object drifts within a few steps; over more of them it cancels, so that the drift is taken over
-several spans and any of them may give the answer. Where friction is low or fingers are few, the object has to be at
-rest as well. Numbers are from trajectories of pulls of four hands on eleven shapes and ten scans; `graspd bench
-early` measures what they come to.
+A trial that stops early goes through the same states as one of full length. It can verify what a full one would not,
+never the reverse. A slowly sliding object may come to an edge and snap away, hence the safety factor. Jitter on the
+contacts hides the drift within a few steps, so the drift is taken over several spans, and one of them suffices. At low
+friction or with few fingers, the object has to be at rest as well. The numbers come from trajectories of pulls of four
+hands on eleven shapes and ten scans. `graspd bench early` measures their effect.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 
 from graspd_core.verify.world import Protocol
 
-# Steps from one look at a hold to the next; divides `CHECK_EVERY` and every number of steps in a rule.
+# Steps from one look at a hold to the next. This divides `CHECK_EVERY` and every number of steps in a rule.
 LOOK_EVERY = 5
 # Steps from one check of the limits to the next.
 CHECK_EVERY = 25
@@ -24,14 +23,14 @@ CHECK_EVERY = 25
 
 @dataclass(frozen=True)
 class StopRule:
-    """How a hold is looked at.
+    """How a hold is checked.
 
     Attributes:
         first: steps before the first look.
-        windows: steps that the drift is taken over; one of them is enough.
+        windows: steps that the drift is taken over. One of them is enough.
         safety: how many times that drift the object is supposed to keep until the end.
-        speed: what is slower is at rest [m/s]; infinite where rest is not asked for.
-        spin: what turns slower is at rest [rad/s], likewise.
+        speed: a slower object is at rest [m/s], infinite if rest is not asked for.
+        spin: an object that turns slower is at rest [rad/s], likewise.
     """
 
     first: int
@@ -43,17 +42,17 @@ class StopRule:
 
 FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
 SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
-# Objects begin to slip as late as 1.9 s; what moves at 1 mm/s until then may let go at once.
+# Objects begin to slip as late as 1.9 s. What moves at 1 mm/s until then may let go at once.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
 # Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
 _FEWEST_FINGERS = 3
-# The least impedance ratio and sliding friction of each, CREEPING below them all; measured at 0.6 and 0.3.
+# The least impedance ratio and sliding friction of each, CREEPING below them all. Measured at 0.6 and 0.3.
 _RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
 
 @dataclass(frozen=True)
 class ObjectState:
-    """Where the object is in the world of a trial, and how fast.
+    """Pose and speed of the object in the world of a trial.
 
     Attributes:
         center: of mass [m].
@@ -69,7 +68,7 @@ class ObjectState:
 
 
 def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
-    """The rule of a protocol, by its friction, and of a hand; None where trials run to their end."""
+    """Return the rule of a protocol, by its friction, and of a hand, None if trials run to their end."""
     if protocol.full_length:
         return None
     if fingers < _FEWEST_FINGERS:
@@ -81,12 +80,12 @@ def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
 def answer_known(
     rule: StopRule, protocol: Protocol, states: Sequence[ObjectState], moved: tuple[float, float], left: int
 ) -> bool:
-    """Whether a hold need not go on; False where anything is not finite.
+    """Tell whether a hold need not go on. False if anything is not finite.
 
     Args:
         rule: of the hold.
         protocol: has the limits.
-        states: of the last looks, oldest first; windows that reach back further are left out.
+        states: of the last checks, oldest first. Windows that reach back further are left out.
         moved: travel [m] and turn [rad] so far.
         left: steps that are left.
     """
@@ -105,6 +104,6 @@ def _stays(protocol: Protocol, moved: tuple[float, float], drift: tuple[float, f
 
 
 def drifted(before: ObjectState, now: ObjectState) -> tuple[float, float]:
-    """Travel [m] and turn [rad] from one state to another."""
+    """Return travel [m] and turn [rad] from one state to another."""
     cosine = abs(sum(a * b for a, b in zip(before.quaternion_wxyz, now.quaternion_wxyz, strict=True)))
     return math.dist(before.center, now.center), 2 * math.acos(min(1.0, cosine))

@@ -1,8 +1,8 @@
-"""The hold trial: close on a free object, pull it along ±x, ±y, ±z in turn, and see whether it stays.
+"""The hold trial: close on a free object, pull it along ±x, ±y, ±z in turn, and check that it stays.
 
 After DexGraspBench's floating protocol, re-implemented from its parameters. Travel and turn of the object are measured
-from its pose at the start of the trial, so that what the closing fingers do to it counts too. A pull ends when its
-answer is known (`early_stop`), unless the protocol asks for the full length.
+from its pose at the start of the trial, so that the closing counts too. A pull ends when its answer is known
+(`early_stop`), unless the protocol asks for the full length.
 
 The noisy hold trial repeats the hold trial with the hand out of place, as by a wrong estimate of the object's pose.
 """
@@ -36,12 +36,12 @@ STOPPED = "stopped before the trial ended"
 def hold_trial(
     world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
 ) -> TrialResult:
-    """Run one hold trial of `protocol`; ends at the first breach.
+    """Run one hold trial of `protocol`, which ends at the first breach.
 
     Returns:
-        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the pulls, until
-        the pulls ended: an object that still creeps when a pull's answer is known would go farther by its full length.
-        A simulation that diverges, or has more contacts than memory, is a failure with that reason.
+        Worst displacement [m] of the object's centre of mass and worst rotation [rad] until the pulls ended. A slowly
+        moving object would go farther in a pull of full length. A simulation that diverges, or has more contacts than
+        memory, is a failure with that reason.
     """
     import mujoco
 
@@ -54,12 +54,12 @@ def hold_trial(
 
 
 def gave_up(error: Exception) -> str:
-    """Why a trial is over that MuJoCo has broken off."""
+    """Return the reason of a trial that MuJoCo has broken off."""
     return f"the simulation gave up: {str(error).splitlines()[0]}"
 
 
 def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, stop: Callable[[], bool]) -> str:
-    """Why the grasp does not hold, empty if it does; `worst` travel [m] and turn [rad] are brought up to date."""
+    """Return why the grasp does not hold, empty if it does. `worst` travel [m] and turn [rad] are updated."""
     import mujoco
 
     with trial_data(world) as data:
@@ -82,9 +82,9 @@ def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, sto
 def step_until_known(
     world: World, data: Any, protocol: Protocol, worst: np.ndarray, steps: int, *, stop: Callable[[], bool]
 ) -> str:
-    """Simulate what acts now for `steps` steps, or until it is known that the object stays within the limits.
+    """Simulate `steps` steps, or until it is known that the object stays within the limits.
 
-    `worst` travel [m] and turn [rad] are brought up to date. Returns why the trial is over, empty if it is not.
+    Returns why the trial is over, empty if it is not. `worst` travel [m] and turn [rad] are updated.
     """
 
     rule, done = stop_rule(protocol, world.fingers), 0
@@ -108,7 +108,7 @@ def step_until_known(
 
 
 def object_state(world: World, data: Any) -> ObjectState:
-    """Where the object is, and how fast."""
+    """Return the pose and speed of the object."""
     turn = world.object_address + 3
     x, y, z, *spin = data.qvel[world.object_velocity : world.object_velocity + 6].tolist()
     return ObjectState(
@@ -120,7 +120,7 @@ def object_state(world: World, data: Any) -> ObjectState:
 
 
 def moved(world: World, state: ObjectState) -> tuple[float, float]:
-    """Travel [m] of the object's centre of mass, and the object's turn [rad], from the start of the trial."""
+    """Return travel [m] of the object's centre of mass, and the object's turn [rad], from the start of the trial."""
     w, x, y, z = state.quaternion_wxyz
     return math.dist(state.center, world.center_of_mass), 2 * math.atan2(math.hypot(x, y, z), abs(w))
 
@@ -134,9 +134,9 @@ def close_hand(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> str:
-    """From the pregrasp over the grasp to the squeeze; returns why the trial is over, empty if it is not.
+    """Move the hand from pregrasp to squeeze.
 
-    `worst` travel [m] and turn [rad] of the object are brought up to date.
+    Return why the trial is over, if it is. Updates travel and turn `worst`.
     """
     import mujoco
 
@@ -158,10 +158,7 @@ def close_hand(
 
 
 def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
-    """Why a grasp is refused before the hand moves, empty if it is not: deep in the object, or links in each other.
-
-    That is geometry: the hand is put there, and MuJoCo's collision detection tells the depths.
-    """
+    """Return why a grasp is refused before the hand moves: deep in the object, or in itself. Empty if it is not."""
     deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
     for name, limit in deepest.items():
         place_hand(world, data, getattr(grasp, name))
@@ -173,7 +170,7 @@ def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> 
 
 
 def start_penetration(world: World, data: Any) -> float:
-    """Deepest overlap of hand and object in the current state [m]."""
+    """Return the deepest overlap of hand and object in the current state [m]."""
     bodies = world.model.geom_bodyid
     contact = data.contact
     on_object = (bodies[contact.geom1] == world.object_body) != (bodies[contact.geom2] == world.object_body)
@@ -181,7 +178,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Which links are too deep in each other in the current state, empty if none. Adjacent ones never collide."""
+    """Return which non-adjacent links are too deep in each other in the current state, empty for none."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]
@@ -198,7 +195,7 @@ def axis_name(direction: np.ndarray) -> str:
 
 
 def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
-    """Put base, joints and targets where a posture says; `mj_forward` is the caller's."""
+    """Put base, joints and targets where a posture says. The caller runs `mj_forward`."""
     set_joints(world, data, posture.joint_positions)
     data.mocap_pos[0] = posture.position
     data.mocap_quat[0] = posture.quaternion_wxyz
@@ -222,7 +219,7 @@ def set_joints(world: World, data: Any, values: np.ndarray) -> None:
 
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
-    """Targets move linearly from start to end; returns why the trial is over, empty if it is not."""
+    """Move the targets linearly from start to end. Return why the trial is over, empty if it is not."""
 
     steps = round(protocol.stage_time / protocol.timestep)
     way = straight_way(start, end, np.arange(1, steps + 1) / steps)
@@ -238,7 +235,7 @@ def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Proto
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Base poses (wxyz, [m]) and joint targets [rad] or [m] on the way from one posture to another."""
+    """Base poses (wxyz, [m]) and joint targets [rad] or [m] on the path from one posture to another."""
 
     positions: Float[np.ndarray, "n 3"]
     quaternions: Float[np.ndarray, "n 4"]
@@ -246,7 +243,7 @@ class Way:
 
 
 def straight_way(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> Way:
-    """The postures at some shares of the straight way from start to end, all at once: a trial takes hundreds."""
+    """Return the postures at shares of the straight path from start to end, all at once."""
     a = shares[:, None]
     # The shorter way round for the base: wxyz and its negative are the same rotation.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
@@ -259,14 +256,14 @@ def straight_way(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -
 
 
 def set_targets(data: Any, way: Way, index: int) -> None:
-    """Base pose and joint targets at a point of the way."""
+    """Set base pose and joint targets to a point of the path."""
     data.mocap_pos[0] = way.positions[index]
     data.mocap_quat[0] = way.quaternions[index]
     data.ctrl[:] = way.joints[index]
 
 
 def diverged(data: Any) -> bool:
-    """Whether MuJoCo met a bad state. Its other warnings, such as a full contact buffer, leave the state sound."""
+    """Tell whether MuJoCo met a bad state. Its other warnings, such as a full contact buffer, leave the state sound."""
     import mujoco
 
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -274,7 +271,7 @@ def diverged(data: Any) -> bool:
 
 
 def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
-    """Update the worst travel and turn; name the limit that is broken, if any."""
+    """Update the worst travel and turn. Return the broken limit, if any."""
     travel, turn = moved(world, object_state(world, data))
     if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
         worst[:] = np.inf
@@ -284,7 +281,7 @@ def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> st
 
 
 def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
-    """Which limit a travel [m] and a turn [rad] break, as a sentence; empty for none."""
+    """Return which limit a travel [m] and a turn [rad] break, as a sentence, empty for none."""
     if travel > protocol.max_displacement:
         return f"the object moved {travel * 100:.1f} cm"
     if turn > protocol.max_rotation:
@@ -293,7 +290,7 @@ def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
 
 
 def out_of_place(protocol: Protocol) -> Protocol:
-    """The trial of a grasp whose object is not what or where it was planned for: how deep it would be is no fault."""
+    """Return the trial for an object that is not as planned: the depth of the grasp posture is no fault there."""
     return replace(protocol, max_grasp_penetration=math.inf)
 
 
@@ -327,13 +324,13 @@ def noisy_share(
 
 
 def pose_errors(seed: int | Sequence[int], count: int) -> list[PoseError]:
-    """Seeded errors, one for each trial."""
+    """Draw seeded errors, one for each trial."""
     rng = np.random.default_rng(seed)
     return [pose_error(rng) for _ in range(count)]
 
 
 def pose_error(rng: np.random.Generator) -> PoseError:
-    """A random turn and a random offset [m]."""
+    """Draw a random turn and a random offset [m]."""
     axis = rng.normal(size=3)
     angle = torch.tensor(rng.uniform(-TURN, TURN), dtype=torch.float64)
     rotation = rotation_from_axis_angle(torch.as_tensor(axis / np.linalg.norm(axis)), angle).numpy()
@@ -346,7 +343,7 @@ def displaced(
     offset: Float[np.ndarray, "3"],
     center: Float[np.ndarray, "3"],
 ) -> Grasp:
-    """The grasp with all its hand postures turned about `center` and shifted by `offset` [m], object frame."""
+    """Return the grasp with all its hand postures turned about `center` and shifted by `offset` [m], object frame."""
 
     def move(posture: Posture) -> Posture:
         base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()

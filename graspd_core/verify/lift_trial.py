@@ -1,11 +1,11 @@
 """The lift trial: come from a retreat, close on an object that stands on its support, lift it, and hold it.
 
 Two questions, in this order. Do the commanded postures, from the retreat over the pregrasp to the grasp, reach into the
-support or a neighbour? That is geometry, asked of MuJoCo's distances, because a base that follows its commands passes
-through fixed things. Then, in the simulation under gravity: does the object rise with the hand and stay with it?
+support or a neighbour? MuJoCo's distances answer this, because a base that follows its commands passes through fixed
+bodies. Then, in the simulation under gravity: does the object rise with the hand and stay with it?
 
-The lift is seen from the hand: the base stands still, everything else sinks, and the object feels the acceleration as
-weight. MuJoCo gives bodies that follow commands no velocity, so a base that really rose would not carry by friction.
+The lift is seen from the hand: the base stands still, all others sink, and the object feels the acceleration as weight.
+MuJoCo gives bodies that follow commands no velocity, so a rising base would not carry by friction.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SHARES = (0.0, 0.25, 0.5, 0.75)
 
 @dataclass(frozen=True)
 class LiftSettings:
-    """What happens in a lift trial, beside the physics and limits of `world.Protocol`.
+    """The course of a lift trial, beside the physics and limits of `world.Protocol`.
 
     Attributes:
         retreat: how far back along the hand's approach the trial begins [m].
@@ -75,13 +75,13 @@ def lift_trial(
     settings: LiftSettings = LiftSettings(),
     stop: Callable[[], bool] = lambda: False,
 ) -> TrialResult:
-    """Run one lift trial in a world built with a support or neighbours; ends at the first breach.
+    """Run one lift trial in a world built with a support or neighbours.
 
-    While the hand comes and closes, and until it first touches the object, that rests as it was seen, because a
+    It ends at the first breach. Until the hand first touches the object, the object rests as it was seen, because a
     reconstructed bottom may not stand. From then on it is free.
 
-    The object has to stay within the protocol's limits (5 cm, 15°) of where it stood, as carried along by the lift, at
-    all times. Without a support there is no gravity, and the hand takes the object back the way it came.
+    The object has to stay within the protocol's limits (5 cm, 15°) of its start, as carried along by the lift, at all
+    times. Without a support there is no gravity, and the hand takes the object back the way it came.
     """
     import mujoco
 
@@ -120,7 +120,7 @@ def _raise(
     worst: np.ndarray,
     stop: Callable[[], bool],
 ) -> str:
-    """Come, close, squeeze and lift; returns why the trial is over, empty if it is not. Brings `worst` up to date."""
+    """Come, close, squeeze and raise the hand. Return why the trial is over, empty if it is not. Updates `worst`."""
 
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
@@ -150,7 +150,7 @@ def _said(reason: str, stage: str) -> str:
 def _stages(
     begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
 ) -> tuple[tuple[str, Posture, Posture, float], ...]:
-    """Name, first and last posture and duration [s] of every stage but the last, the hold, in order."""
+    """Return name, ends and duration [s] of every stage but the last, the hold, in order."""
     return (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
         (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
@@ -179,7 +179,7 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
-    """Where the hand is deepest in an obstacle on the straight ways between postures; empty up to `limit` [m]."""
+    """Return where the hand is deepest in an obstacle on the straight paths between postures, empty to `limit` [m]."""
     import mujoco
 
     worst, reason = 0.0, ""

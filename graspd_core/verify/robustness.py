@@ -1,9 +1,9 @@
-"""What else may be true of an object that cameras saw: another place, less friction, other shapes of its hidden side.
+"""Robustness checks of an object that cameras saw: another place, less friction, other shapes of its hidden side.
 
 A grasp that holds on the likeliest scene is tried on these too, until it is as sure as asked for or cannot be. Two of
-the other shapes must hold it: whole things whose hidden side was guessed wrong are told by that from those that every
-rule sees alike. How often such grasps hold on the true object was measured (docs/clouds.md). Trials run on several
-threads, and `results_in_order` gives their results in order, the same for any number of threads.
+the other shapes must hold it, which finds objects whose hidden side was guessed wrong. How often such grasps hold on
+the true object was measured (docs/clouds.md). Trials run on several threads. `results_in_order` gives their results in
+order, the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _POLL_RESULTS = 0.02
 
 
 def begin_in_thread(name: str, work: Callable[[], Result]) -> Future[Result]:
-    """Begin work in a thread that only who asks for its result, and the process's end, waits for."""
+    """Begin work in a thread of its own. Only a request for its result, and the process's end, wait for it."""
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
     begun = pool.submit(work)
     pool.shutdown(wait=False)
@@ -55,17 +55,17 @@ def results_in_order(
     *,
     known_over: StopHook = lambda: False,
 ) -> Generator[Result]:
-    """The result of each item, in their order, until it is over.
+    """Yield the result of each item, in their order, until it is over.
 
-    Work that is begun ahead and not asked for any more ends by its stop hook when the iterator is closed.
+    Work that was begun ahead ends by its stop hook when the iterator is closed.
 
     Args:
-        over: ends it all; asked by the calling thread alone.
-        work: done by the calling thread where there is one thread, else by so many others.
+        over: ends it all. Only the calling thread asks it.
+        work: done by the calling thread if there is one thread, else by `threads` others.
         items: what is worked on.
         threads: at least 1.
         needed: how many more results will be asked for at least, so that none of these is begun too early.
-        known_over: ends work too; asked by all threads, also while nobody asks for a result.
+        known_over: ends work too. All threads ask it, also while nobody asks for a result.
     """
     if min(threads, len(items)) <= 1:
         for item in items:
@@ -94,7 +94,7 @@ def results_in_order(
 
 # Of the friction that the scene says.
 _LESS_FRICTION = 2 / 3
-# Places that the object may be at instead, the same for all grasps; never those that a benchmark tries.
+# Places that the object may be at instead, the same for all grasps. No benchmark tries them.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
 # How many places must hold a grasp whose trials ask for more than most things weigh, and how many other shapes.
 _LEAST_PLACES, LEAST_SHAPES = 2, 2
@@ -105,18 +105,18 @@ _POLL = 0.02
 # Name of the threads that make other shapes.
 _SHAPES = "graspd-shapes"
 
-# Of trials under some hypotheses, in their order; None where there was none. And how a grasp goes through them.
+# Results of some checks in order, None for an impossible one. And a function that tries a grasp under a stage.
 Results = Generator[TrialResult | None]
 HoldUnder = Callable[["HypothesisStage", Grasp, StopHook], Results]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One other thing that may be true.
+    """One robustness check: another possible state of the scene.
 
     Attributes:
         name: what it is, for people.
-        hold: the hold trial of a grasp if it is; None where it cannot be, or the hook says to stop.
+        hold: the hold trial of a grasp in that state, None if it is impossible or the hook says to stop.
     """
 
     name: str
@@ -125,12 +125,12 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class HypothesisStage:
-    """Things of a kind that may be true.
+    """Robustness checks of one kind.
 
     Attributes:
         items: in the order in which they are tried.
         least: how many of them must hold a grasp, all of them if there are fewer.
-        though_failed: how likely a grasp holds on the true object that fails here.
+        though_failed: probability that a grasp which fails here holds on the true object.
     """
 
     items: tuple[Hypothesis, ...]
@@ -139,13 +139,13 @@ class HypothesisStage:
 
 
 class LaterWorld:
-    """A world that is made in a thread once somebody asks for it, and then kept. It is None where there is none."""
+    """A world that a thread makes on the first request and that is then kept. None if there is no such world."""
 
     def __init__(self, make: Callable[[], World | None]):
         self._make, self._begun, self._asked = make, None, threading.Lock()
 
     def begin(self) -> Future[World | None]:
-        """Begin to make it, if nobody has."""
+        """Begin to make it, if that is not begun."""
         with self._asked:
             self._begun = self._begun or begin_in_thread(_SHAPES, self._make)
             return self._begun
@@ -157,7 +157,7 @@ class LaterWorld:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """What else a grasp must hold under.
+    """The robustness checks that a grasp must pass.
 
     Attributes:
         stages: places, which are cheap to try, then other shapes.
@@ -175,9 +175,9 @@ class Hypotheses:
 def begin_other_worlds(
     run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float
 ) -> tuple[LaterWorld, ...]:
-    """The worlds of other shapes of the object, none where grasps need not be tried in one.
+    """Return the worlds of other shapes of the object, none if grasps need not be tried in one.
 
-    Those that every grasp is tried in are begun, one at a time. A world is None where there is no such shape, or the
+    Those that every grasp is tried in are begun, one at a time. A world is None if there is no such shape, or if the
     run was over before.
     """
     making = threading.Lock()
@@ -196,9 +196,10 @@ def begin_other_worlds(
 def hypotheses_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> Hypotheses | None:
-    """All that a grasp must hold under to be as sure as asked for, `others` from `begin_other_worlds`. None: nothing.
+    """Return the checks that a grasp must pass to be as sure as asked for, None for none.
 
-    Where the mass is known, it must hold in all places, and with less friction.
+    `others` comes from `begin_other_worlds`. With a known mass, a grasp must hold in all places, and with less
+    friction.
     """
     shares = held_shares(scene.object)
     if scene.evidence is not None and scene.evidence.doubts:
@@ -230,7 +231,7 @@ def hypotheses_of(
 
 
 def one_by_one(stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
-    """The trials of a grasp under each, none begun before its result is asked for."""
+    """Yield the trials of a grasp under each check, none begun before its result is asked for."""
     for item in stage.items:
         yield item.hold(grasp, stop)
 
@@ -241,10 +242,10 @@ def try_hypotheses(
     stop: StopHook,
     hold_under: HoldUnder = one_by_one,
 ) -> tuple[TrialResult, float]:
-    """Hold trials of a grasp under each in turn, until enough hold or too many fail, and how likely it is to hold.
+    """Try a grasp under each check in turn, until enough hold or too many fail.
 
-    The result tells the greatest travel and turn of the trials that were passed. `hold_under` is given a stage at a
-    time.
+    Returns result and probability. The result holds the greatest travel and turn of the passed trials. `hold_under` is
+    given a stage at a time.
     """
     travel = turn = 0.0
     if hypotheses.doubts:
@@ -270,7 +271,7 @@ def try_hypotheses(
 
 
 def held_shares(target: ObjectModel) -> HeldShares:
-    """How sure grasps of an object are that hold under hypotheses."""
+    """Return the probabilities of grasps of an object that hold under robustness checks."""
     return MASS_ASSUMED if target.mass_assumed else MASS_KNOWN
 
 
@@ -306,9 +307,9 @@ def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
 
 
 def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
-    """Begin the other shapes that all grasps of a scene to come will be tried on, if any, in threads beside.
+    """Begin the other shapes that all grasps of a scene to come will be tried on, if any, in other threads.
 
-    For `scene_from_views`: they are made while the distance grid of the likeliest shape is built.
+    `scene_from_views` calls this, so that they are made while the distance grid of the likeliest shape is built.
     """
     for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:LEAST_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)
@@ -317,7 +318,7 @@ def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evi
 
 @lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
-    """The world of another shape of the object's own mass and friction; None where there is no such shape."""
+    """Return the world of another shape of the object's own mass and friction, None if there is no such shape."""
     assert scene.evidence is not None
     # Taken out: if making it failed, as where memory was short, it is made again the next time.
     begun = _begun(scene.evidence).pop(rule, None)
@@ -330,7 +331,7 @@ def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -
 
 
 def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
-    """An object of the same mass and friction whose hidden side is guessed by a rule; None where there is none."""
+    """Return an object of the same mass and friction whose hidden side is guessed by a rule, None for no guess."""
     from graspd_core.perception.reconstruct.hidden_side import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)

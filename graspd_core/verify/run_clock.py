@@ -24,12 +24,12 @@ from graspd_core.types import (
 
 
 class Run:
-    """When a run began and must end, whom it tells, and whether it was cancelled.
+    """The clock of a run, its hooks, and whether it was cancelled.
 
     Attributes:
         began: `time.perf_counter()` value.
-        cancelled: whether the stop hook has said so.
-        watch: sees the hands that the run works on, where somebody watches.
+        cancelled: whether the stop hook has returned true.
+        watch: called with the hands that the run works on, if given.
         origin: of what the run works on, in the frame of the scene that it was given [m].
     """
 
@@ -49,32 +49,32 @@ class Run:
         self._progress, self._stop = progress, stop
 
     def over(self) -> bool:
-        """Whether to end; asks the stop hook, so only for the run's own thread."""
+        """Tell whether to end. Only the run's own thread may ask, because this calls the stop hook."""
         self.cancelled = self.cancelled or (self._stop is not None and self._stop())
         return self.known_over()
 
     def known_over(self) -> bool:
-        """As `over`, for other threads: the stop hook is asked by the run's own thread alone."""
+        """Tell whether to end, without a call of the stop hook, for other threads."""
         return self.cancelled or self.late()
 
     def late(self) -> bool:
-        """Whether the deadline has passed."""
+        """Tell whether the deadline has passed."""
         return time.perf_counter() >= self._end
 
     def report(self, stage: Stage, step: int, of: int, best: float, verified: int, found: Grasp | None = None) -> None:
-        """Tell the caller."""
+        """Call the progress hook."""
         if self._progress is not None:
             found = None if found is None else moved_grasp(found, self.origin)
             self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))
 
     def show(self, seen: Snapshot) -> None:
-        """Let who watches see it."""
+        """Call the watch hook."""
         if self.watch is not None:
             self.watch(replace(seen, positions=seen.positions + self.origin))
 
     @property
     def ended_early(self) -> Outcome | None:
-        """Why the run ended before its work was done; None where it did not."""
+        """Why the run ended before its work was done, None if it did not."""
         return Outcome.CANCELLED if self.cancelled else Outcome.DEADLINE if self.late() else None
 
 

@@ -15,13 +15,13 @@ from graspd_core.verify.world import Protocol, World, build_world
 
 @dataclass(frozen=True)
 class TrialContext:
-    """What the grasps of one scene are tried with.
+    """The worlds and the physics of the trials of one scene.
 
     Attributes:
         hand: the hand that grasps.
         protocol: physics of the trials.
         alone: world of the object and the hand.
-        around: world with support and obstacles too; None where there are none.
+        around: world with support and obstacles too, None without them.
     """
 
     hand: HandModel
@@ -37,7 +37,7 @@ class Trial:
     Attributes:
         name: of its results.
         applies: whether the trial runs in a context.
-        run: tries one grasp; polls the hook, and fails where it ends the trial.
+        run: tries one grasp. It polls the hook, and fails if that ends the trial.
     """
 
     name: str
@@ -60,7 +60,7 @@ TRIALS: dict[str, Trial] = {row.name: row for row in _ROWS}
 
 
 def build_worlds(scene: Scene, hand: HandModel, parts: Sequence[TriangleMesh], protocol: Protocol) -> TrialContext:
-    """Build the worlds; `parts` are the object's convex parts, object frame [m]."""
+    """Build the worlds. `parts` are the object's convex parts, object frame [m]."""
     around = None
     if scene.support is not None or scene.obstacles:
         around = build_world(hand, scene.object, parts, protocol, scene.support, scene.obstacles)

@@ -1,4 +1,4 @@
-"""The trials of a run: worlds built once, candidates tried in rank order, and those that held put in order.
+"""The trials of a run: worlds built once, candidates tried in rank order, held grasps put in order.
 
 `verify_grasps` tries and measures grasps of another planner or of a file in the same worlds.
 """
@@ -60,7 +60,7 @@ _NOISE = 0x6E6F697365
 
 @dataclass(frozen=True)
 class VerificationContext:
-    """What the grasps of a run are tried with, and measured with, made when first asked for; None: they are not."""
+    """The worlds, metrics and robustness checks of a run. Metrics are made on the first request, None: not measured."""
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
@@ -69,17 +69,17 @@ class VerificationContext:
 
     @property
     def mass(self) -> float:
-        """What the object weighs in the trials [kg]."""
+        """Mass of the object in the trials [kg]."""
         return float(self.trials.alone.model.body_mass[self.trials.alone.object_body])
 
 
 @dataclass(frozen=True)
 class TrialsAhead:
-    """What the trials of a run need and takes long, made by threads beside the search.
+    """The slow parts of a run's trials, made by threads beside the search.
 
     Attributes:
-        worlds: of the likeliest scene; None where the run was over before.
-        others: the worlds of other shapes of the object; none where no grasp is tried in one.
+        worlds: of the likeliest scene, None if the run was over before.
+        others: the worlds of other shapes of the object, if grasps are tried in them.
     """
 
     worlds: Future[TrialContext | None]
@@ -87,10 +87,10 @@ class TrialsAhead:
 
 
 def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
-    """Begin what the trials need, in threads beside (`begin_in_thread`).
+    """Begin the worlds of the trials in other threads (`begin_in_thread`), which takes about as long as the optimiser.
 
-    It takes about as long as the optimiser does. One object is cut at a time, and none whose run is over before its
-    turn came: runs that are cancelled faster than objects are cut would pile up work that keeps later ones waiting.
+    One object is cut at a time, and none whose run is over before its turn. Runs that are cancelled faster than objects
+    are cut would otherwise pile up work.
     """
 
     def build() -> TrialContext | None:
@@ -112,7 +112,7 @@ def make_trial_context(
     measure: bool,
     friction: bool = False,
 ) -> VerificationContext | None:
-    """The contexts, as soon as the worlds are there; None where the run ended first."""
+    """Return the context, as soon as the worlds are there, None if the run ended first."""
     while not run.over() and not wait([ahead.worlds], timeout=_POLL).done:
         pass
     if run.over() or (worlds := ahead.worlds.result()) is None:
@@ -125,7 +125,7 @@ def make_trial_context(
 def lighter(
     scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float
 ) -> VerificationContext:
-    """Return the context with an object of less mass [kg] than was assumed, whose grasps are less sure."""
+    """Return the context with an object of less mass [kg] than was assumed. Its grasps are less sure."""
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
@@ -137,7 +137,7 @@ def lighter(
 
 
 def greatest_payload(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> float:
-    """Return the most that one of the grasps holds [kg]."""
+    """Return the greatest payload of the grasps [kg]."""
     trials, most = context.trials, LEAST_PAYLOAD
     for grasp in grasps:
         most = max(most, payload(trials.alone, grasp, trials.protocol, least=FINENESS * most, stop=stop))
@@ -158,7 +158,7 @@ def _metrics_context(scene: Scene, hand: HandModel) -> MetricsContext:
 
 
 def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
-    """Candidates with their metrics, none of them tried."""
+    """Return candidates with their metrics, none of them tried."""
     postures = [grasp.grasp for grasp in candidates]
     with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="graspd-metrics") as pool:
         metrics = list(pool.map(partial(measure, _metrics_context(scene, hand)), postures))
@@ -178,7 +178,7 @@ def _measured(trials: TrialContext, context: MetricsContext, friction: bool, gra
 
 @dataclass(frozen=True)
 class TriedGrasps:
-    """What the trials of some candidates came to.
+    """The results of the trials of some candidates.
 
     Attributes:
         grasps: those that were tried, verified ones first.
@@ -190,7 +190,7 @@ class TriedGrasps:
 
 
 def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
-    """The hands of candidates, none of them tried."""
+    """Return the hands of candidates, none of them tried."""
     hands = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in candidates]
     return Snapshot(*map(np.stack, zip(*hands, strict=True)), verdicts=(Verdict.UNVERIFIED,) * len(candidates))
 
@@ -198,10 +198,10 @@ def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
 def run_trials(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> TriedGrasps:
-    """Try candidates in rank order until `count` are verified; `before` are already.
+    """Try candidates in rank order until `count` are verified.
 
-    On as many threads as torch may use in the calling one; verdicts and order do not depend on their number. What is
-    verified is measured beside the trials of the next.
+    `before` are already. It uses as many threads as torch may use in the calling one. Verdicts and order do not depend
+    on their number. Verified grasps are measured beside the trials of the next.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []
@@ -248,9 +248,10 @@ def run_trials(
 def _tried(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], alone: bool, needed: Callable[[], int]
 ) -> Generator[Grasp]:
-    """Candidates with their trials, in their order.
+    """Yield candidates with their trials, in their order.
 
-    The first `alone`: under several hypotheses at a time, the others once it waits for the world of one, or has ended.
+    `alone`: the first is tried under several checks at a time. The others wait until it waits for a world, or has
+    ended.
     """
     threads, hypotheses = torch.get_num_threads(), context.hypotheses
     work = partial(_all_trials, context, one_by_one)
@@ -262,7 +263,7 @@ def _tried(
 def _best_first(
     context: VerificationContext, hypotheses: Hypotheses, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
 ) -> Grasp:
-    """A candidate with its trials; those that are not the best wait until there is time for them."""
+    """Try a candidate. All but the best wait until there is time for them."""
     if grasp is not best:
         while not hypotheses.waited_for.wait(_POLL) and not stop():
             pass
@@ -274,7 +275,7 @@ def _best_first(
 
 
 def _at_once(threads: int, stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
-    """As many at a time as must hold in any case, the others one by one."""
+    """Try as many checks at a time as must hold in any case, the others one by one."""
     first, others = stage.items[: stage.least], stage.items[stage.least :]
     yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
     yield from one_by_one(replace(stage, items=others), grasp, stop)
@@ -289,7 +290,7 @@ def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Gras
 
 
 def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Verified grasps, then those less sure, then those that failed; among them by probability, then by score."""
+    """Return verified grasps, then unverified, then failed ones, each by probability, then by score."""
     place = {Verdict.VERIFIED: 0, Verdict.UNVERIFIED: 1, Verdict.FAILED: 2}
     return tuple(sorted(grasps, key=lambda g: (place[g.verdict], -(g.probability or 0.0), -g.score)))
 
@@ -297,14 +298,14 @@ def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def rank_by_robustness(
     run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
-    """The grasps with those first that still hold when the object is not quite where it was thought to be.
+    """Return the grasps, first those that still hold with the object slightly out of place.
 
-    The share of noisy trials that a verified grasp held is written into its metrics. Where the run ends before all were
-    tried, those that were not stand between the good and the bad.
+    The share of noisy trials that a verified grasp held is written into its metrics. If the run ends before all were
+    tried, untried ones stand between the good and the bad.
     """
     verified = [grasp for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
     measured: list[Grasp] = []
-    # The same errors for all, so that none is ranked by its luck; never those that a benchmark judges by.
+    # The same errors for all, so that none is ranked by its luck. No benchmark uses them.
     errors = pose_errors((_NOISE, seed), config.trials)
     protocol = replace(context.trials.protocol, hold_time=config.hold_time)
 
@@ -323,7 +324,7 @@ def rank_by_robustness(
 
 
 def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
-    """Grasps by the share that they held out of place; where it is the same, or nobody measured it, in their order."""
+    """Return grasps by the share of noisy trials that they held. Equal and unmeasured ones keep their order."""
 
     def share(grasp: Grasp) -> float:
         known = grasp.metrics.get("robustness") if grasp.metrics else None
@@ -339,12 +340,12 @@ _UNIT_TOLERANCE = 0.01
 def verify_grasps(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], *, verify: str = "standard", measure: bool = True
 ) -> tuple[Grasp, ...]:
-    """Run the trials and measure the metrics of grasps that are given, in their order; none is dropped.
+    """Try and measure given grasps, in their order. None is dropped.
 
     Args:
-        scene: what is grasped; with a support or obstacles the lift trial runs too.
+        scene: what is grasped. With a support or obstacles the lift trial runs too.
         hand: whose joints the postures name, in the order of `hand.joint_names`.
-        grasps: `pregrasp`, `grasp` and `squeeze` count; earlier metrics and trials are replaced.
+        grasps: `pregrasp`, `grasp` and `squeeze` count. Earlier metrics and trials are replaced.
         verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
         measure: whether metrics are measured, of failed grasps too.
 

@@ -1,7 +1,7 @@
 """The world of a trial in MuJoCo: a hand of primitives on a position-controlled base, a free object of convex parts.
 
-With a support there are gravity and a table, with neighbours there are these; without, neither costs anything. They are
-mocap bodies after the hand's own, so that a trial can lower them all away from the hand.
+A support adds gravity and a table, neighbours add obstacles. They are mocap bodies after the hand's own, so that a
+trial can lower them all away from the hand.
 
 Contact and solver settings follow the floating protocol of DexGraspBench (Chen et al., BODex, ICRA 2025), from its
 published parameters. Nothing here is differentiable and nothing is shared with the optimiser.
@@ -42,10 +42,10 @@ Friction = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class FreeBody:
-    """A thing that lies somewhere, free to move.
+    """A body of the scene that is free to move.
 
     Attributes:
-        model: the thing, in its own frame.
+        model: the object, in its own frame.
         parts: its convex parts, likewise [m].
         pose: of its frame in the world [m].
     """
@@ -56,7 +56,7 @@ class FreeBody:
 
 
 def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, friction: Friction) -> None:
-    """A collision solid of the hand; `name` is its mesh's, where it needs one."""
+    """Add a collision solid of the hand. `name` is that of its mesh, if it needs one."""
     import mujoco
 
     geom = body.add_geom(
@@ -112,7 +112,7 @@ def add_object(
 
 
 def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tuple[str, ...]:
-    """Things that lie about, each free; returns the names of their bodies."""
+    """Add free bodies about the object. Return the names of their bodies."""
     names = tuple(f"other {index + 1}" for index in range(len(others)))
     for name, other in zip(names, others, strict=True):
         add_object(spec, other.model, other.parts, friction, name=name, pose=other.pose)
@@ -120,7 +120,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """What the hand meets, and below `parts` what they rest on; without parts, all meets the one plane."""
+    """Add the plane that the hand meets, and one below `parts` on which they rest. Without parts there is one plane."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, support, friction)
     for link in hand.link_names:
@@ -173,7 +173,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """MuJoCo's order xx yy zz xy xz yz, with principal moments raised to `floor` and the triangle inequality kept."""
+    """Return xx yy zz xy xz yz, with principal moments raised to `floor` and the triangle inequality kept."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -242,7 +242,7 @@ PROTOCOLS: dict[str, Protocol] = {
 
 
 def at_friction(protocol: Protocol, friction: float) -> Protocol:
-    """The trial of an object more slippery than the 0.6 that protocols suppose: their coefficients in proportion.
+    """Return the trial of an object more slippery than the 0.6 of the protocols, with coefficients in proportion.
 
     A rougher object is tried as the protocol says, so that no grasp passes by friction that nobody measured.
     """
@@ -264,13 +264,13 @@ class World:
         center_of_mass: of the object [m].
         hand_geoms: ids of the hand's geoms.
         obstacles: id and name of the geom of every obstacle to the hand.
-        up: unit direction against gravity; None where there is none.
+        up: unit direction against gravity, None without gravity.
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
-        fingers: how many ends of fingers the hand has.
+        fingers: number of the hand's fingertips.
         others: body ids of the free things about the object.
         spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
-        watch: called with the `mujoco.MjData` after every step of a trial; None, as in planning, costs nothing.
+        watch: called with the `mujoco.MjData` after every step of a trial. None, as in planning, costs nothing.
     """
 
     model: Any
@@ -307,10 +307,10 @@ def altered(world: World, *, mass: float | None = None, friction: Friction | Non
 
 @contextmanager
 def trial_data(world: World) -> Iterator[Any]:
-    """The `mujoco.MjData` of one trial, at the model's initial state. Safe from any thread: each trial has its own.
+    """Give the `mujoco.MjData` of one trial, at the model's initial state.
 
-    That of a trial that ended is used again, since it takes about a millisecond to make. One that MuJoCo broke off in
-    is not: its memory may be half in use.
+    Safe from any thread: each trial has its own. Data of an ended trial is used again, since it takes about a
+    millisecond to make. Data that MuJoCo broke off in is not: its memory may be half in use.
     """
     import mujoco
 
@@ -324,7 +324,7 @@ def trial_data(world: World) -> Iterator[Any]:
 
 
 def advance(world: World, data: Any, steps: int = 1) -> None:
-    """Simulate so many steps, under the eyes of who watches."""
+    """Simulate `steps` steps, and call the watch hook after each."""
     import mujoco
 
     if world.watch is None:
@@ -352,14 +352,14 @@ def build_world(
         target: gives mass, centre of mass and inertia. It lies near the origin (`near_scene`).
         parts: convex collision parts of the object, object frame [m].
         protocol: physics settings.
-        support: a table, with gravity onto it. The hand meets it where it is; the object rests on a plane of its own
+        support: a table, with gravity onto it. The hand meets it where it is. The object rests on a plane of its own
             through its lowest point, because a reconstructed bottom hovers or sinks by millimetres.
         obstacles: fixed, as their convex hulls. Those that the object touches already let it pass.
-        others: free things; given, even none, all is as it truly lies and the object rests on the support itself.
+        others: free bodies. If given, even none, the object rests on the support itself.
     """
     import mujoco
 
-    # Or MuJoCo writes a log file into the working directory; the trial reads the counts of warnings itself.
+    # Otherwise MuJoCo writes a log file into the working directory. The trial reads the counts of warnings itself.
     mujoco.set_mju_user_warning(lambda message: None)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -386,7 +386,7 @@ def _world_of(
     fixed: Sequence[str],
     up: Float[np.ndarray, "3"] | None,
 ) -> World:
-    """A compiled model with the addresses that trials need; `fixed` names the geoms of the obstacles."""
+    """Return a compiled model with the addresses that trials need. `fixed` names the geoms of the obstacles."""
     return World(
         model=model,
         joint_addresses=_joint_addresses(model, hand.joint_names),
@@ -468,7 +468,7 @@ def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Proto
 
 
 def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, protocol: Protocol) -> None:
-    """A joint without motor or stops of its own, that an equality holds to its leader: loads on it reach the motor."""
+    """Add a joint without motor or stops, held to its leader by an equality: loads on it reach the motor."""
     import mujoco
 
     name = f"joint:{mimic.name}"
@@ -486,7 +486,7 @@ def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, prot
 
 
 def _joint_physics(hand: HandModel, link: int, protocol: Protocol) -> dict[str, Any]:
-    """What joints with and without a motor share."""
+    """Return what joints with and without a motor share."""
     import mujoco
 
     slides = hand.joint_kind[link] == "prismatic"

@@ -1,1 +1,1 @@
-"""Messages to requests."""
+"""Conversion of messages to requests."""

@@ -1,8 +1,8 @@
-"""What cameras showed the node: clouds and depth images, the views kept of one scene, and where the cameras stood.
+"""Clouds and depth images that came from cameras, the views kept of one scene, and where the cameras stood.
 
-A cloud message does not tell where its camera stood: the request or the parameters do, else it stood at the origin of
-the cloud's frame. What nobody said is checked against the cloud itself: taken from a wrong place, its table is lost and
-its object has the wrong shape, and grasps are verified on what is not there.
+A cloud message does not say where its camera stood. The request or the parameters say it. If neither does, the origin
+of the cloud's frame is assumed and checked against the cloud. With a wrong place the table is not found, the object
+gets a wrong shape, and grasps are verified on a shape that is not there.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from graspd_ros.parameters import WORKSPACE, Settings
 
 CLOUD = "cloud"  # the kind of frame whose camera the message does not name
 Pixels = Float[np.ndarray, "height width 3"]
-# `T_target_source` of two frames at a time; may raise a TransformError.
+# `T_target_source` of two frames at a time. May raise a TransformError.
 Lookup = Callable[[str, str, Time], Matrix]
 
 DepthMessage = Image | CompressedImage
 _Kind = tuple[str, int, int]  # frame, width and height of an image, packed or not, or of what a CameraInfo is of
 
-MOST_CALIBRATIONS = 8  # kept of one topic; cameras that share it have one each
+MOST_CALIBRATIONS = 8  # kept of one topic. Cameras that share it have one each
 AHEAD = 0.5  # seconds in the future that a stamp is taken without a word
 UNPAIRED = 2.0  # seconds that images may come without a calibration before that is told
 MOST_CLOUD_BYTES = 2**27  # 128 MiB: 4 million points of 32 bytes
@@ -62,11 +62,12 @@ class SensorFrame:
     Attributes:
         kind: cloud or depth.
         frame: the frame it was seen in.
-        stamp: when it was seen, by the sensor's word; zero where it has none.
+        stamp: when it was seen, by the sensor's clock. Zero where it has none.
         arrived: when it came, by the node's clock [ns].
-        read: its points, in its frame, and where its camera stood, given the place that is said of a cloud's, and how
-            to look frames up. It takes some milliseconds and may raise a CloudError or TransformError.
-        pixels: all of its points in their pixels, NaN where nothing was seen; may raise a CloudError.
+        read: reads its points, in its frame, and where its camera stood. It is given the camera's place, where one is
+            known for a cloud, and a function that looks frames up. It takes some milliseconds and may raise a
+            CloudError or TransformError.
+        pixels: returns all of its points by pixel, NaN where nothing was seen. May raise a CloudError.
     """
 
     kind: str
@@ -77,10 +78,9 @@ class SensorFrame:
     pixels: Callable[[], Pixels] | None = None
 
     def check(self, now: int, limit: float) -> None:
-        """Refuse what names no frame, and stamps that are `limit` seconds from `now` [ns], 0 is no limit.
+        """Refuse a message without a frame, or with a stamp more than `limit` seconds (0: no limit) from `now` [ns].
 
-        Raises:
-            RequestError: which of these it is.
+        Raises RequestError, which says what is wrong.
         """
         if not self.frame.strip("/"):
             told = f"the {self.kind} names no frame: its header.frame_id is empty, so that its grasps could be anywhere"
@@ -105,7 +105,7 @@ class SensorFrame:
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """Return a cloud message as a frame; it is read only when it is used. Raises RequestError: too large to keep."""
+    """Return a cloud message as a frame, which is read only when it is used. Raises RequestError if it is too large."""
     if len(message.data) > MOST_CLOUD_BYTES:
         told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
         raise RequestError(ErrorCode.BAD_CLOUD, told)
@@ -115,7 +115,7 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
-    """Return a depth image with its calibration as a frame; it is read only when it is used."""
+    """Return a depth image with its calibration as a frame, which is read only when it is used."""
 
     def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
         # A depth image knows by itself.
@@ -129,10 +129,10 @@ def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> S
 
 
 class ImagePairs:
-    """Give each depth image the last calibration of its frame and size. Not for several threads.
+    """Pairs of each depth image and the last calibration of its frame and size. Not for several threads.
 
-    An image that comes before any such calibration waits for it, the newest one only. A CameraInfo without a frame is
-    of any. `clock` tells seconds that only rise.
+    The newest image that comes before any such calibration waits for it. A CameraInfo without a frame fits every frame.
+    `clock` returns seconds that only rise.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -143,7 +143,7 @@ class ImagePairs:
         self._alone_since = 0.0
 
     def add(self, message: DepthMessage | CameraInfo) -> tuple[DepthMessage, CameraInfo] | None:
-        """Take an image or a calibration; return the pair that it completes, if any. Raises CloudError: no image."""
+        """Take an image or a calibration and return the pair it completes, if any. Raises CloudError: no image."""
         if isinstance(message, CameraInfo):
             self._calibrations += 1
             kind = _kind(message)
@@ -169,7 +169,7 @@ class ImagePairs:
         return image, info
 
     def doubt(self) -> str:
-        """Return why images find no calibration, in one line; empty if they do, or have for less than `UNPAIRED`."""
+        """Return why images find no calibration, in one line, empty if they do or have waited less than `UNPAIRED`."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
             return ""
         last = next(reversed(self._infos.values()), None)
@@ -190,7 +190,7 @@ def _shown_kind(message: Any) -> str:
 
 
 def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraPlace:
-    """What the request says, or else the parameters."""
+    """Return the camera's place of the request or, where it has none, of the parameters."""
     if message is not None and message.use_view_point:
         x, y, z = array_of(message.view_point).tolist()
         return CameraPlace((x, y, z))
@@ -201,7 +201,7 @@ def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraP
 
 
 def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> PointCloud:
-    """Return what a frame shows, from where its camera stood.
+    """Return the cloud of a frame, with where its camera stood.
 
     Raises:
         CloudError: the cloud cannot be read, or its pixels show that its camera stood elsewhere.
@@ -213,9 +213,11 @@ def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> Po
 def masked_points(
     frame: SensorFrame, mask: Image, name: str = "target_mask"
 ) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
-    """Return a point a pixel, NaN where none was seen, and which of them the mask of this name shows.
+    """Return one point for each pixel, NaN where nothing was seen, and which of them the mask named `name` shows.
 
-    Raises RequestError: the mask is no mono8 image of the cloud's size; CloudError: the cloud cannot be read.
+    Raises:
+        RequestError: the mask is no mono8 image of the cloud's size.
+        CloudError: the cloud cannot be read.
     """
     pixels = np.empty((0, 0, 3)) if frame.pixels is None else frame.pixels()
     height, width = pixels.shape[:2]
@@ -233,16 +235,16 @@ def masked_points(
 
 @dataclass(frozen=True)
 class Views:
-    """Clouds of one scene, all in one frame. Immutable: `add` returns new ones."""
+    """Clouds of one scene, all in one frame. Immutable, so `add` returns new ones."""
 
     frame: str = ""
     stamp: Time = field(default_factory=Time)
     clouds: tuple[PointCloud, ...] = ()
 
     def add(self, sensor_frame: SensorFrame, cloud: PointCloud, settings: Settings, lookup: Lookup) -> Views:
-        """Add what a camera saw, moved to the frame of the other views (the settings' fixed_frame, or the first's).
+        """Add a cloud, moved to the frame of the other views (the settings' fixed_frame, or the first's).
 
-        Raises GraspdError: there are as many views as there may be, or this one cannot be trimmed or moved.
+        Raises GraspdError if there are as many views as are allowed, or this one cannot be trimmed or moved.
         """
         if len(self.clouds) >= MOST_VIEWS:
             raise bad_request(f"{MOST_VIEWS} views are kept already; call ~/reset_views first")
@@ -259,11 +261,10 @@ class Views:
 def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Target | None, doubts: tuple[str, ...] = ()
 ) -> Scene:
-    """Return the scene that clouds in one frame show; `target` says which object is meant, in that frame.
+    """Return the scene of clouds that are in one frame. `target` says which object is meant, in that frame.
 
-    `doubts` become warnings of its object.
-
-    Raises GraspdError: the clouds show no usable object, or the file of the settings has changed and cannot be used.
+    `doubts` become warnings of its object. Raises GraspdError if the clouds show no usable object, or the file of the
+    settings has changed and cannot be used.
     """
     # Beside its distance grid, if grasps will have to hold on it.
     certainty = load_preset(settings.preset).certainty
@@ -281,13 +282,13 @@ def scene_of_views(
 
 
 def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
-    """Return the points inside the workspace, one a voxel where the settings give a voxel its size."""
+    """Return the points inside the workspace, one for each voxel where the settings give a voxel size."""
     inside = replace(cloud, points=cloud.points[within(cloud, settings)])
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 
 def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
-    """Return which points lie in the workspace; NaN does not. Raises RequestError: none does, and where they lie."""
+    """Return which points lie in the workspace (NaN does not). Raises RequestError with their place if none does."""
     points, low, high = cloud.points, np.array(settings.roi_min), np.array(settings.roi_max)
     inside = np.asarray(((points >= low) & (points <= high)).all(1))
     if inside.any():

@@ -1,7 +1,7 @@
-"""Topics of sensors: heard with the quality of service that their publishers offer, and watched for what is lost.
+"""Subscriptions to topics of sensors, with the quality of service that their publishers offer, and a watch for losses.
 
-rmw's own BEST_AVAILABLE decides once, when the subscription is made. A camera that starts later would be asked for what
-it does not offer, and nothing would come. Here the choice is made again as publishers come and go.
+rmw's own BEST_AVAILABLE chooses once, when the subscription is made. It would ask a camera that starts later for what
+that camera does not offer, and nothing would come. Here the choice is made again as publishers come and go.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class SensorTopic:
     """One topic of a sensor. Used by the executor's thread only.
 
     Args:
-        node: hears the topic, and logs what is lost.
+        node: subscribes to the topic, and logs lost messages.
         kind: type of its messages.
         name: of the topic, before remapping.
         callback: takes each message.
-        instead_of: a topic that is heard rather than this one where anybody publishes it. Where this one's name is not
-            remapped, it has the other's with `ending` behind it.
+        instead_of: a topic that is used rather than this one while it has publishers. Where this topic's name is not
+            remapped, its name is that of the other and `ending`.
         ending: see above.
     """
 
@@ -61,18 +61,18 @@ class SensorTopic:
         self._before: Subscription | None = None
         self._twice: set[int] = set()  # stamps of what the one before heard when there were two
         self._qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        # What somebody asks for is left as it is; rclpy keeps it in no public place.
+        # What somebody asks for is left as it is, which rclpy keeps in no public place.
         self._fixed = f"qos_overrides.{self.name}.subscription.reliability" in getattr(node, "_parameter_overrides", {})
         if instead_of is None:
             self._listen(QoSOverridingOptions.with_default_policies())
 
     def publishers(self) -> list[Any]:
-        """Return what is known of those who publish messages of its type."""
+        """Return information about the publishers of messages of its type."""
         kind = f"{self._kind.__module__.partition('.')[0]}/msg/{self._kind.__name__}"
         return [info for info in self._node.get_publishers_info_by_topic(self.name) if info.topic_type == kind]
 
     def check(self) -> str:
-        """Ask for what is offered now; return what does not arrive, empty if all does. To be called once a second."""
+        """Adapt to what is offered now and return what does not arrive, empty if all does. Call it once a second."""
         publishers = self.publishers()
         if self._instead_of is not None and (not publishers or self._instead_of.publishers()):
             self._stop()

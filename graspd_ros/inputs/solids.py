@@ -1,6 +1,6 @@
-"""Shapes of messages: solids and meshes, the plane that an object stands on, and things of a planning scene.
+"""Shapes in messages: solids, meshes, the plane that an object stands on, and things of a planning scene.
 
-The things are obstacles of every later request, as `moveit_msgs/CollisionObject` tells of them.
+The things come as `moveit_msgs/CollisionObject` and are obstacles of every later request.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLIND
 
 
 def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Meshes where their poses put them; without poses, where they are. Raises RequestError, which names `owner`."""
+    """Return meshes at their poses, if there are any. Raises RequestError, which names `owner`."""
     return _placed("mesh", _mesh, shapes, poses, owner)
 
 
 def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Boxes, spheres, cylinders and cones likewise."""
+    """Return boxes, spheres, cylinders and cones at their poses. Raises RequestError, which names `owner`."""
     return _placed("primitive", _primitive, shapes, poses, owner)
 
 
@@ -88,12 +88,12 @@ def _solid(kind: int, sizes: np.ndarray) -> Any:
 
 
 def bad_message(owner: str, message: str) -> RequestError:
-    """The error about something of a message."""
+    """Return the error about a part of a message."""
     return bad_request(f"{owner}: {message}")
 
 
 def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
-    """Return the support surface in the object's frame; None where its numbers are 0. Raises RequestError: no plane."""
+    """Return the support surface in the object's frame, None if its numbers are 0. Raises RequestError: no plane."""
     a, b, c, d = map(float, surface.coef)
     if not any((a, b, c, d)):
         return None
@@ -105,7 +105,7 @@ def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Pla
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader of the scene with what the object stands on; its free side is where the object is."""
+    """Return a loader of the scene with the plane the object stands on. Its free side is the object's."""
     if plane is None:
         return load
 
@@ -133,9 +133,9 @@ class Thing:
 
 
 def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Thing]:
-    """Return the things by id, as a `moveit_msgs/CollisionObject` leaves them; those given stay as they are.
+    """Return the things by id after a `moveit_msgs/CollisionObject`. Those given are not changed.
 
-    Raises RequestError: the message names no thing that is there, or no shape or pose that can be used.
+    Raises RequestError if the message names no known thing, or has no usable shape or pose.
     """
     name, owner, operation = message.id, f"collision object {message.id[:128]!r}", message.operation
     operations = {message.ADD: "ADD", message.REMOVE: "REMOVE", message.APPEND: "APPEND", message.MOVE: "MOVE"}
@@ -176,9 +176,10 @@ def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
 
 
 def among_things(request: Request, lookup: FrameLookup) -> Request:
-    """Return the request whose scene has its `things` about its object; none of its other fields changes.
+    """Return the request with its `things` added to its scene. None of its other fields changes.
 
-    `lookup` is of two frames when the object was seen. Raises TransformError: it does not know a thing's frame.
+    `lookup` transforms between two frames at the time the object was seen. Raises TransformError if it does not know a
+    thing's frame.
     """
     settings, load = request.settings, request.load
     placed = {name: _thing_shapes(name, thing, request, lookup) for name, thing in request.things.items()}

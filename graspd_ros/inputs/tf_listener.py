@@ -1,6 +1,6 @@
-"""Transforms of /tf and /tf_static, waiting for those that come late, and where the arm stands that carries the hand.
+"""Transforms of /tf and /tf_static, with a wait for late ones, and the place of the arm that carries the hand.
 
-tf2_msgs comes with ROS, or from `make setup`: without it the node works, and knows no transforms.
+tf2_msgs comes with ROS, or from `make setup`. Without it the node works, but knows no transforms.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _COMPLAIN_AGAIN = 10.0  # seconds between two log lines about transforms that ma
 
 
 class TransformListener:
-    """Fills a buffer from /tf and /tf_static for as long as the node lives. `available`: whether it can.
+    """A buffer filled from /tf and /tf_static while the node lives. `available` is whether it can be.
 
-    Where time jumps back, as when a bag starts anew under sim time, everything is forgotten.
+    When time jumps back, as when a bag starts again under sim time, everything is forgotten.
     """
 
     def __init__(self, node: Node, buffer: TransformBuffer) -> None:
@@ -56,14 +56,14 @@ class TransformListener:
         self._jumps = node.get_clock().create_jump_callback(back, post_callback=self._on_jump)
 
     def lookup(self, target: str, source: str, stamp: Time) -> Matrix:
-        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError: it is not known."""
+        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError if it is not known."""
         return self._buffer.lookup(target, source, nanoseconds(stamp) or None)
 
     def lookup_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> Matrix:
-        """Return the same, waited for: transforms come later than clouds.
+        """Return the same, and wait for it, because transforms come later than clouds.
 
-        For a thread other than the executor's, which has to receive them meanwhile. Raises TransformError, what the
-        buffer said last, after `TRANSFORM_PATIENCE` or when `stop` says so.
+        It must not be called in the executor's thread, which has to receive them meanwhile. Raises the buffer's last
+        TransformError after `TRANSFORM_PATIENCE` or when `stop` is true.
         """
         end = time.monotonic() + TRANSFORM_PATIENCE
         while True:
@@ -89,9 +89,10 @@ class TransformListener:
 
 
 def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "") -> Reach:
-    """Return the restriction, in the frame of the request's object, whose settings name the arm and its base's frame.
+    """Return the restriction to what the arm of the request's settings can reach, in the frame of the object.
 
-    `lookup` is of two frames when the object was seen, `robot_description` the URDF of a robot that has the arm.
+    `lookup` transforms between two frames at the time the object was seen. `robot_description` is the URDF of a robot
+    that has the arm.
     """
     from graspd_core import Reach
 
@@ -112,9 +113,9 @@ def _arm(name: str, robot_description: str) -> Arm:
 
 
 def heard_robot(node: Node, arm: str) -> str:
-    """Return the URDF on the topic robot_description if an arm is part of that robot; else nothing is waited for.
+    """Return the URDF on the topic robot_description, or at once an empty one if the arm is no part of a robot.
 
-    To be called at the start, before the node is spun. Raises GraspdError: nothing came in time, or not with the arm.
+    To be called before the node is spun. Raises GraspdError if no URDF came in time, or one without the arm.
     """
     if not arm:
         return ""

@@ -1,8 +1,8 @@
-"""Starts the node with the shipped parameters.
+"""Launch file of the node with the shipped parameters.
 
 `ros2 launch graspd_ros graspd.launch.py points:=/camera/depth/color/points hand:=allegro_right output_frame:=base_link`
 
-An argument that is a parameter of the node goes before the parameter file only where it is given.
+An argument that is a parameter of the node overrides the parameter file only where it is given.
 """
 
 from launch import LaunchDescription
@@ -33,7 +33,7 @@ PARAMETERS = ("hand", "hand_prefix", "output_frame", "sensor_frame", "use_sim_ti
 
 
 def given(values: dict[str, str]) -> dict[str, str | bool]:
-    """Those that were given, of the type that the node declares; the others are left to the parameter file."""
+    """Return the values that were given, of the types the node declares. The parameter file decides the others."""
     typed: dict[str, str | bool] = {name: value for name, value in values.items() if value}
     if "use_sim_time" in typed:
         typed["use_sim_time"] = values["use_sim_time"].lower() in ("true", "1")
@@ -68,7 +68,7 @@ def _node(context) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """One node, with arguments on the command line."""
+    """Return the description of the node, with arguments on the command line."""
     large_clouds = SetEnvironmentVariable(
         "FASTRTPS_DEFAULT_PROFILES_FILE",
         str(config_dir() / "fastdds.xml"),

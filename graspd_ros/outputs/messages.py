@@ -1,15 +1,15 @@
 """Progress, answers, trajectories and markers as messages. No message carries a NaN.
 
-Metrics that were not measured are left out; other figures that are not finite are -1.
+Metrics that were not measured are left out. Other figures that are not finite are -1.
 
 A trajectory has three points in time for the fingers, and the base's pose at each of them. Velocities are zero at every
-point. A controller that interpolates by cubics (ros2_control's, where positions and velocities are given) then moves
-all joints along straight lines in step with each other, which is the way that the trial tried, and its greatest speed
-is 1.5 times the mean one of each stage; the times here account for that.
+point. A controller that interpolates by cubics (as ros2_control's do, given positions and velocities) then moves all
+joints along straight lines in step with each other, as the trial did. Its greatest speed is 1.5 times the mean speed of
+each stage, and the times here allow for that.
 
-Markers show in RViz the hand at its grasp, where it touches, the axes of its base link, and what it is worth. Their
-namespaces are the names of `PARTS`, so that each can be switched off; ids start at `IDS_OF_A_GRASP` times the rank.
-They stay until the next result deletes them.
+Markers show in RViz the hand at its grasp, its contacts, the axes of its base link, and its quality. Their namespaces
+are the names of `PARTS`, so that each can be switched off. Their ids start at `IDS_OF_A_GRASP` times the rank. They
+stay until the next result deletes them.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ _TEXT_ABOVE = 0.12
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a real hand may be moved; a joint's own limit holds too."""
+    """How fast a real hand may be moved. A joint's own limit holds too."""
 
     joint_speed: float = 1.0  # greatest of a turning joint [rad/s]
     base_speed: float = 0.05  # greatest of the hand's base, and of sliding joints [m/s]
@@ -110,9 +110,9 @@ class Pace:
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """How a request ended, in the words of a GraspArray; the grasps of `result` are in the answer's frame.
+    """The end of a request, as a GraspArray states it. The grasps of `result` are in the answer's frame.
 
-    `mass` [kg] is what their object weighed in the trials, 0 without any. `mass_assumed`: nobody said it.
+    `mass` [kg] is that of the object in the trials, 0 without any. `mass_assumed` is whether the request gave none.
     """
 
     status: int
@@ -124,7 +124,7 @@ class AnswerEnding:
 
 
 def ending_of(result: GraspResult) -> AnswerEnding:
-    """The ending of a run that nobody stopped."""
+    """Return the ending of a run that nobody stopped."""
     message = result.message or result.outcome.value
     if result.outcome is Outcome.SUCCEEDED:
         return AnswerEnding(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
@@ -137,7 +137,7 @@ def ending_of(result: GraspResult) -> AnswerEnding:
 def array_message(
     ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
-    """The one answer to a request; `elapsed` seconds after it came. Raises FloatingPointError: a grasp holds a NaN."""
+    """Return the answer to a request `elapsed` seconds after it. Raises FloatingPointError if a grasp holds a NaN."""
     message = GraspArray(
         header=header,
         request_id=request_id,
@@ -171,9 +171,9 @@ def grasp_message(
     *,
     mass: float | None = None,
 ) -> GraspMessage:
-    """One grasp, in the frame that the header names. Raises FloatingPointError: it holds a NaN.
+    """Return one grasp, in the frame that the header names. Raises FloatingPointError if it holds a NaN.
 
-    `mass` is that of the object [kg], which decides how fast it is lifted. None: nobody knows.
+    `mass` is that of the object [kg], None if unknown. It decides how fast the object is lifted.
     """
     _check_finite(grasp, rank)
     pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))
@@ -220,7 +220,7 @@ def grasp_message(
 
 
 def progress_message(progress: Progress, request_id: str, frame: str, stamp: Time, elapsed: float) -> GraspProgress:
-    """How far a request is, `elapsed` seconds after it came."""
+    """Return the progress of a request, `elapsed` seconds after it came."""
     return GraspProgress(
         header=Header(frame_id=frame, stamp=stamp),
         request_id=request_id,
@@ -236,7 +236,7 @@ def progress_message(progress: Progress, request_id: str, frame: str, stamp: Tim
 
 
 def sentence(progress: Progress) -> str:
-    """A progress report for people."""
+    """Return a progress report for people."""
     steps = f"{progress.step} of {progress.of}"
     said = {
         Stage.LOAD: "reading the object",
@@ -247,12 +247,12 @@ def sentence(progress: Progress) -> str:
 
 
 def fraction_of(progress: Progress) -> float:
-    """How much of its stage is done, 0 to 1; 0 where nobody knows."""
+    """Return how much of its stage is done, 0 to 1, and 0 where it is unknown."""
     return min(progress.step / progress.of, 1.0) if progress.of > 0 else 0.0
 
 
 def joint_message(posture: Posture, hand: HandModel, stamp: Time) -> JointState:
-    """Values of all movable joints, coupled ones too [rad] or [m]; no velocities and no efforts."""
+    """Return the values of all movable joints, coupled ones too [rad] or [m], without velocities and efforts."""
     return JointState(
         header=Header(frame_id=hand.base_link, stamp=stamp),
         name=list(all_joint_names(hand)),
@@ -292,11 +292,11 @@ def _number(value: float, otherwise: float = UNMEASURED) -> float:
 
 
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
-    """Pregrasp, grasp and squeeze, for a controller that starts on receipt (the stamp is zero) from any posture.
+    """Return pregrasp, grasp and squeeze, for a controller that starts on receipt (the stamp is zero) from any posture.
 
-    It names the joints that a controller drives: one that follows another has no command of its own, and controllers
-    refuse joints that they do not know. Positions are within the joint limits. The last point is a target that presses:
-    joints stop short of it.
+    It names the joints that a controller drives. A joint that follows another has no command of its own, and
+    controllers refuse joints that they do not know. Positions are within the joint limits. The last point is a target
+    that presses, so joints stop short of it.
     """
     times = stage_times(grasp, hand, pace)
     return JointTrajectory(
@@ -307,15 +307,15 @@ def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
 
 
 def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
-    """Where the hand's base link is at each point of the trajectory; straight and evenly turning in between."""
+    """Return the base link's pose at each point of the trajectory. It moves straight and turns evenly in between."""
     return [PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(p)) for p in _postures(grasp)]
 
 
 def stage_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
-    """Seconds from the start until pregrasp, grasp and squeeze.
+    """Return the seconds from the start until pregrasp, grasp and squeeze.
 
-    The first is enough for any joint to come from anywhere within its limits; the base is taken to stand at the
-    pregrasp by then.
+    The first is enough for any joint to come from anywhere within its limits. The base is assumed to be at the pregrasp
+    by then.
     """
     speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
@@ -333,7 +333,7 @@ def _stage_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> 
 
 
 def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Of the actuated joints [rad/s] or [m/s]; a joint that follows one may not be faster than its own kind either."""
+    """Return those of the actuated joints [rad/s] or [m/s]. Joints that follow one are within their limits, too."""
     speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
     for mimic in hand.mimics:
         own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
@@ -353,11 +353,10 @@ def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint
 
 
 def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
-    """All waypoints of an arm; no velocities, so that controllers go through them without a stop.
+    """Return all waypoints of an arm, without velocities, so that controllers go through them without a stop.
 
-    The arm is taken to stand at the retreat when it begins: the first point comes after `pace.shortest`.
-    Between two stages time is shared out evenly, enough for joints below `pace.joint_speed` and the hand below
-    `pace.base_speed`.
+    The arm is assumed to be at the retreat when it begins, so the first point comes after `pace.shortest`. Between two
+    stages time is divided evenly, enough for joints below `pace.joint_speed` and the hand below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
@@ -377,7 +376,7 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
 def execution_message(
     grasp: Grasp, path: ArmPath, hand: HandModel, pace: Pace, mass: float | None = None
 ) -> GraspExecution:
-    """Arm and hand in time, from the retreat to the end of the lift, with the points of the gates."""
+    """Return the motion of arm and hand from the retreat to the end of the lift, with the points of the gates."""
     from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
 
     own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
@@ -409,9 +408,10 @@ def result_markers(
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Parts of the best `shown` grasps; the first marker deletes what was shown before: none leave an empty scene.
+    """Return parts of the best `shown` grasps.
 
-    `solids` are what the hand is drawn with; None: its collision solids.
+    The first marker deletes earlier ones, so no grasps leave an empty scene. `solids` are drawn as the hand (None: its
+    collision solids).
     """
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
@@ -458,7 +458,7 @@ def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
 def _hand(
     hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
 ) -> Iterator[Marker]:
-    """The solids; a capsule is a cylinder and two balls."""
+    """Yield the solids of the hand. A capsule is drawn as a cylinder and two balls."""
     T_frame_base = matrix_of_posture(posture)
     rotations, translations = link_poses(hand, posture.joint_positions)
     for solid in solids:
@@ -481,14 +481,14 @@ def _hand(
                     yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
 
 
-# Thousands of points take tens of milliseconds to make; nobody changes them.
+# Thousands of points take tens of milliseconds to make. Nobody changes them.
 @lru_cache(maxsize=256)
 def _corners(mesh: Primitive) -> list[Point]:
     return [point_of(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
 
 
 def _contact(contact: Contact) -> Marker:
-    """An arrow that ends where the link touches and goes the way it presses: against the object's normal."""
+    """Return an arrow that ends at the contact and points as the link presses, against the object's normal."""
     tip = np.array(contact.position)
     tail = tip + _ARROW_LENGTH * np.array(contact.normal)
     return _arrow(tail, tip, (0.1, 0.3, 0.9))
@@ -522,7 +522,7 @@ def _solid(kind: int, pose: Pose, size: np.ndarray, colour: tuple[float, float, 
 
 
 def _arrow(tail: np.ndarray, tip: np.ndarray, colour: tuple[float, float, float]) -> Marker:
-    # Points are in the header's frame; RViz wants the pose beside them to be a rotation all the same.
+    # Points are in the header's frame. RViz wants the pose beside them to be a rotation all the same.
     marker = Marker(type=Marker.ARROW, scale=vector_of((0.004, 0.008, 0.01)), color=_colour(colour, 1.0))
     marker.pose.orientation.w = 1.0
     marker.points = [point_of(tail), point_of(tip)]

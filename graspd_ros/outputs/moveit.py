@@ -1,7 +1,7 @@
-"""A grasp as a moveit_msgs/Grasp, for MoveIt's pick pipelines. A ROS installation or `make setup` brings moveit_msgs.
+"""Grasps as moveit_msgs/Grasp, for MoveIt's pick pipelines. A ROS installation or `make setup` brings moveit_msgs.
 
-MoveIt's `grasp_pose` is that of the end effector's parent link, the last link of the arm, not of a link of the hand:
-`T_parent_base` says where the hand's base link is in it.
+MoveIt's `grasp_pose` is that of the end effector's parent link, which is the last link of the arm and no link of the
+hand. `T_parent_base` is the pose of the hand's base link in it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LEAST_APPROACH = 0.5
 
 
 class MoveItMissing(GraspdError):
-    """moveit_msgs cannot be imported."""
+    """The error that moveit_msgs cannot be imported."""
 
 
 def moveit_grasp(
@@ -40,18 +40,18 @@ def moveit_grasp(
     touch: Sequence[str] = (),
     messages: ModuleType | None = None,
 ) -> Any:
-    """The moveit_msgs/Grasp of a graspd_msgs/Grasp.
+    """Return the moveit_msgs/Grasp of a graspd_msgs/Grasp.
 
     Args:
         grasp: as on ~/grasps.
-        retreat: direction to lift in, of any length, in `retreat_frame`: usually up.
+        retreat: direction to lift in, of any length, in `retreat_frame`. It is usually up.
         retreat_frame: frame of `retreat`.
         retreat_distance: how far to lift [m].
-        T_parent_base: pose of the hand's base link in the end effector's parent link; None: as the hand is mounted by
-            its description, and where that has no mount, they are one.
-        touch: names of what the hand may touch on its way and afterwards: the object.
-        effort: most that each joint of the trajectory may press with, in its order [N·m] or [N]; empty: not told.
-        messages: module with the message classes; None: moveit_msgs.msg.
+        T_parent_base: pose of the hand's base link in the end effector's parent link. None: the mount in the hand's
+            description, or identity if it has no mount.
+        touch: names of what the hand may touch on its way and afterwards, which is the object.
+        effort: most that each joint of the trajectory may press with, in its order [N·m] or [N]. Empty: not stated.
+        messages: module with the message classes (None: moveit_msgs.msg).
 
     Raises:
         MoveItMissing: moveit_msgs is not installed.

@@ -1,7 +1,7 @@
-"""What becomes of a request, in messages: exactly one GraspArray for each, and events for those without graspd_msgs.
+"""Outcomes of requests as messages: exactly one GraspArray for each, and events for clients without graspd_msgs.
 
-Clouds that come unasked are the exception: those that gave way to a newer one before their turn are only counted.
-The node's health goes out on /diagnostics: what it counts since its start.
+Clouds that come without a request are the exception. Those that are replaced by a newer one before their turn are only
+counted. The node publishes its health and its counts since the start on /diagnostics.
 """
 
 from __future__ import annotations
@@ -82,12 +82,12 @@ LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 @dataclass(frozen=True)
 class Health:
-    """What the node knows about itself.
+    """The state of the node.
 
     Attributes:
         running: id of the request that is worked on, empty when idle.
         waiting: requests that wait, of at most `queue_size`.
-        counts: since the start, by the key that tells them.
+        counts: since the start, by their keys in the message.
         last_latency: seconds from the last answered request to its answer, None before the first.
         last_first_verified: seconds from that request to its first verified grasp, None where there was none.
     """
@@ -147,7 +147,7 @@ class Counters:
 
 
 def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
-    """Return one status; its level is for alarms, its message for people, its values for graphs.
+    """Return one status, with a level for alarms, a message for people, and values for graphs.
 
     `memory` is the resident memory of the process and its children [bytes].
     """
@@ -163,9 +163,9 @@ def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
 
 
 def resident_memory(pid: int | None = None) -> int:
-    """Return what of a process (this one) and its children is in RAM [bytes]; 0 where the system does not tell.
+    """Return the memory of a process (None: this one) and its children in RAM [bytes], 0 where it is unknown.
 
-    What they share counts for each.
+    Memory that they share counts for each.
     """
     process = Path("/proc", str(pid or os.getpid()))
     try:
@@ -185,7 +185,7 @@ def _words(file: Path) -> list[str]:
 
 
 def _verdict(health: Health) -> tuple[bytes, str]:
-    """The worst that holds."""
+    """Return the level and message of the worst problem."""
     if not health.worker_alive:
         return DiagnosticStatus.ERROR, "the worker has ended: restart the node"
     if not health.ready:
@@ -247,21 +247,21 @@ class Publishers:
         )
 
     def publish(self, message: Any) -> None:
-        """Publish on the topic of the message's type; nothing after `close`."""
+        """Publish on the topic of the message's type. Do nothing after `close`."""
         with self._lock:
             if not self._closed:
                 self._publishers[type(message)].publish(message)
 
     def tell(self, event: str, request_id: str, source: str, **details: Any) -> None:
-        """One event on ~/status."""
+        """Publish one event on ~/status."""
         stamp = self._node.get_clock().now().nanoseconds * 1e-9
         line = {"event": event, "request": request_id, "source": source, "stamp": stamp, **details}
         self.publish(String(data=status_line(line)))
 
     def forget(self) -> None:
-        """Late joiners get none of the poses, joint values and markers from before now.
+        """Withhold earlier poses, joint values and markers from late joiners.
 
-        Answers stay: a new publisher has to be found by its readers first, and those that follow at once were lost.
+        Answers stay, because readers find a new publisher only after a moment and would miss those published at once.
         """
         with self._lock:
             for kind in SHOWN:
@@ -286,7 +286,7 @@ class Responses:
         self._superseded_told = self._complained = -float("inf")
 
     def forget(self) -> None:
-        """As after a start: no counts, and late joiners get nothing from before now but the last answer."""
+        """Reset the counts, and withhold everything but the last answer from late joiners."""
         self.publishers.publish(result_markers((), self._hand, "", self._now()))
         self.publishers.forget()
         self.counters.clear()
@@ -301,7 +301,7 @@ class Responses:
             self._accepted(request, admission.ahead)
 
     def not_made(self, request_id: str, source: str, error: Exception, listener: Listener | None = None) -> None:
-        """A message that is no valid request."""
+        """Answer a message that is no valid request."""
         code, message = code_of(error), sentence_of(error)
         if code is ErrorCode.INTERNAL:
             self.tell_error(request_id[:MOST_ID], source, error)
@@ -312,17 +312,17 @@ class Responses:
         self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
 
     def cloud_not_taken(self, request_id: str, error: Exception) -> None:
-        """A cloud that came unasked and is no use; cameras repeat themselves, complaints do only once a second."""
+        """Report an unusable cloud that came without a request, at most once a second, as cameras repeat themselves."""
         if time.monotonic() - self._complained >= COUNT_PERIOD:
             self._complained = time.monotonic()
             self.not_made(request_id, "cloud", error)
 
     def thing_not_taken(self, error: Exception) -> None:
-        """A message about a thing of the planning scene that is no use; things stay as they were."""
+        """Report an unusable message about a thing of the planning scene, which changes nothing."""
         self._refused("", "collision_objects", code_of(error), sentence_of(error))
 
     def images_not_taken(self, told: str) -> None:
-        """Tell that depth images come, and why none of them is used."""
+        """Report why none of the depth images that come is used."""
         self._refused("", "sensors", ErrorCode.NO_CLOUD, told)
 
     def _refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
@@ -337,13 +337,13 @@ class Responses:
             self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=told))
 
     def started(self, request: Request) -> None:
-        """The worker begins; a cloud that waited for that is told of only now."""
+        """Report that the worker begins a request. A waiting cloud is reported only now."""
         if request.only_newest:
             self._tell_superseded(request.id)
             self._accepted(request, 0)
 
     def progress_hook(self, request: Request) -> ProgressHook:
-        """Tells of the request's progress, not too often."""
+        """Return a hook that publishes the request's progress, not too often."""
         lowest, last, period = math.inf, -math.inf, 1 / request.settings.progress_rate
 
         def tell(progress: Progress) -> None:
@@ -374,7 +374,7 @@ class Responses:
             request.listener.progressed(message)
 
     def finished(self, request: Request, report: Report[Planned]) -> None:
-        """A request that was taken has ended; never raises."""
+        """Answer a request that was taken and has ended. Never raises."""
         try:
             self._finished(request, report)
         except Exception as error:  # whatever is wrong with a result, its client is not left waiting
@@ -427,7 +427,10 @@ class Responses:
         self._publish(answer, request.listener)
 
     def drawn(self, settings: Settings) -> Sequence[Primitive]:
-        """The solids that markers draw the hand with; read on first use, for seconds where its meshes are large."""
+        """Return the solids that markers draw the hand with.
+
+        The first use reads them, for seconds if they are large.
+        """
         if settings.marker_geometry != "visual":
             return self._hand.primitives
         if self._visuals is None:
@@ -454,13 +457,13 @@ class Responses:
                 self._log().error(f"{message.request_id}: {''.join(traceback.format_exception(error))}")
 
     def nothing_to_cancel(self, request_id: str) -> None:
-        """A cancel that came after the end, or for a request that never was: common, and no fault."""
+        """Report a cancel that found no request, which is common and no fault."""
         message = f"cancel: no request {request_id!r} is waiting or running"
         self.publishers.tell("error", request_id, "cancel", kind="NotFound", code=ErrorCode.NOT_FOUND, message=message)
         self._log().debug(message)
 
     def tell_error(self, request_id: str, source: str, error: BaseException) -> None:
-        """An error on ~/status and in the log."""
+        """Report an error on ~/status and in the log."""
         message, kind, code = sentence_of(error), type(error).__name__, code_of(error)
         self.publishers.tell("error", request_id, source, kind=kind, code=code, message=message)
         expected = isinstance(error, GraspdError | OSError)
@@ -468,7 +471,7 @@ class Responses:
         self._log().error(f"{request_id or source}: {message}{detail}")
 
     def _tell_superseded(self, request_id: str) -> None:
-        """How many clouds gave way to newer ones since this was last told; at most one a second and one a request."""
+        """Report how many clouds were replaced by newer ones, at most once a second and once a request."""
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_told = time.monotonic()
@@ -491,19 +494,19 @@ def _pace(request: Request) -> Pace:
 
 
 def presentable(result: GraspResult) -> Grasp | None:
-    """The best grasp, if it is as sure as was asked for: one known to be bad or less sure is never published as one."""
+    """Return the best grasp if it is as certain as was asked for, else None, so that no worse one is published."""
     best = result.grasps[0] if result.grasps else None
     return best if best is not None and best.usable else None
 
 
 def progress_event(progress: Progress) -> dict[str, Any]:
-    """A progress report; `fraction` is that of its stage."""
+    """Return a progress report. `fraction` is that of its stage."""
     told = {name: value for name, value in vars(progress).items() if name != "found"}
     return {**told, "fraction": messages.fraction_of(progress)}
 
 
 def result_event(result: GraspResult) -> dict[str, Any]:
-    """Outcome, counts, timing and the best grasp's figures; `best` is null when no grasp is worth publishing."""
+    """Return outcome, counts, timing and the best grasp's figures. `best` is null when no grasp may be published."""
     best = presentable(result)
     return {
         "outcome": result.outcome.name.lower(),
@@ -531,7 +534,7 @@ def _summary(grasp: Grasp) -> dict[str, Any]:
 
 
 def status_line(event: dict[str, Any]) -> str:
-    """One JSON object on one line; numbers that JSON does not know become null."""
+    """Return one JSON object on one line. Numbers that JSON does not know become null."""
     return json.dumps(_finite(event), allow_nan=False)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from graspd_core.errors import HandError
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, is_shape, load_inert, makers, read_bounded
 
-# A sparse matrix's state holds data, indices, indptr and the shape. A leaf of chumpy's has the value `x`; a selection
+# A sparse matrix's state holds data, indices, indptr and the shape. A leaf of chumpy's has the value `x`. A selection
 # is `a` flattened, taken at `idxs`, in `preferred_shape`. Python 2 and 3, old and new scipy have different names for
 # the same.
 ADMITTED = NUMPY_NAMES | makers(
@@ -28,15 +28,14 @@ ADMITTED = NUMPY_NAMES | makers(
     ("rebuilt", ("copy_reg", "copyreg"), ("_reconstructor",)),
     ("object", ("__builtin__", "builtins"), ("object", "set", "frozenset")),
 )
-# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions; MANO needs 12448 and 2.
+# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions. MANO needs 12448 and 2.
 _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 
 
 def read_pickle(path: Path) -> Any:
-    """What a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+    """Return what a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises:
-        HandError: no such file, too large, not a pickle, or one that names anything but `ADMITTED`; names the culprit.
+    Raises HandError: no such file, too large, not a pickle, or it names anything but `ADMITTED`.
     """
     try:
         return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")
@@ -45,12 +44,9 @@ def read_pickle(path: Path) -> Any:
 
 
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
-    """The dense array of numbers that a value of the file stands for, native byte order.
+    """Return the dense array of numbers that a value of the file stands for.
 
-    `depth` counts the expressions around it.
-
-    Raises:
-        ValueError: it stands for none; says why.
+    `depth` counts the expressions around it. Raises ValueError: the value holds no numbers. Says why.
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
@@ -111,7 +107,7 @@ def _entry(value: Inert, key: str) -> Any:
     return value.state[key]
 
 
-# The sixteen bodies, each named after the bone that it moves; 1 is the knuckle, 3 the last joint. Not the order of a
+# The sixteen bodies, each named after the bone that it moves. 1 is the knuckle, 3 the last joint. Not the order of a
 # hand: the little finger comes before the ring finger.
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 BODIES = ("wrist", *(f"{finger}{number}" for finger in FINGERS for number in (1, 2, 3)))
@@ -150,8 +146,7 @@ class ManoData:
 def read_mano(path: Path) -> ManoData:
     """Read and check a MANO file (.pkl), as downloaded.
 
-    Raises:
-        HandError: it cannot be read, asks for code to be run, or an entry is missing or wrong; names file and entry.
+    Raises HandError: it cannot be read, asks for code to be run, or has a missing or wrong entry. Names file and entry.
     """
     content = read_pickle(path)
     if not isinstance(content, Mapping):
@@ -185,7 +180,7 @@ def read_mano(path: Path) -> ManoData:
 
 
 def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An entry as float64 of a shape in which None is any positive number."""
+    """Return an entry as float64. A None in `shape` stands for any positive number."""
     if key not in content:
         known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
         raise HandError(f"{path}: {key} is missing; the file has {known}")

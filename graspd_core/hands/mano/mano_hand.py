@@ -1,21 +1,18 @@
 """A MANO model as a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
 
-The methods, the metrics and the trials see a hand like any other; figures of the skinned surface come from
-`ManoHand.skinned_mesh`, the mesh that MANO itself makes of the same joint values. The hulls stand for the skin at
-rest: they do not follow the blend shapes of the pose, and at a strongly bent joint the skin bulges by a few
-millimetres against them. Contact candidates lie on the skin at rest, since hulls are fuller where it is hollow.
+Methods, metrics and trials see an ordinary hand. `ManoHand.skinned_mesh` gives MANO's own surface at the same joint
+values. The hulls stand for the skin at rest and ignore the blend shapes of the pose. At a strongly bent joint the skin
+bulges by a few millimetres against them. Contact candidates lie on the skin at rest.
 
 Base frame: the model's axes, origin in the wrist joint. The wrist body carries the palm.
 
 MANO's fifteen ball joints become hinges. A body turns against its parent by `R = B Rx(flexion) Ry(abduction) Rz(twist)
-Bᵀ`, B being its anatomical frame at rest: z along the bone, x the axis about which it flexes, y = z × x. The order is
-that of the ISB's recommendation for finger joints (Wu et al. 2005, after Grood and Suntay 1983): flexion about the
-parent's axis, then abduction, then twist about the bone itself. It is exact both ways as long as abduction stays under
-90°, which every limit here does.
+Bᵀ`. B is its anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The order follows the ISB's
+recommendation (Wu et al. 2005, after Grood and Suntay 1983). It is exact both ways while abduction stays under 90°.
 
-MANO has no such frames; they are made from the joints of the shape at hand. A finger flexes towards the palm's normal,
-which is that of the plane through wrist, index and little knuckle; the thumb flexes towards a point in front of the
-palm. Which side of that plane the palm is on shows in the mean pose, whose fingers are bent.
+The anatomical frames come from the joints of the shape. A finger flexes towards the palm's normal, that of the plane
+through wrist, index and little knuckle. The thumb flexes towards a point in front of the palm. The mean pose, whose
+fingers are bent, shows on which side of the plane the palm is.
 """
 
 from __future__ import annotations
@@ -53,8 +50,8 @@ HINGES = ("flexion", "abduction", "twist")
 # How far in front of the palm the thumb's tip goes when the thumb is bent [m].
 _OPPOSITION = 0.05
 # Limits of flexion, abduction and twist [deg], from the flat hand. Fingers: Lin, Wu and Huang 2000 (flexion 0 to 90 at
-# the knuckle, 0 to 110, 0 to 90; abduction ±15), knuckles also 20 backwards (Norkin and White: 45 passively). Thumb:
-# flexion of knuckle and tip 50 and 80 (American Academy of Orthopaedic Surgeons 1965); saddle joint 53 of flexion, 42
+# the knuckle, 0 to 110, 0 to 90, abduction ±15), knuckles also 20 backwards (Norkin and White: 45 passively). Thumb:
+# flexion of knuckle and tip 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Saddle joint 53 of flexion, 42
 # of abduction and 17 of twist in all (Cooney et al. 1981), about MANO's rest, which is in their middle. What is no
 # degree of freedom in the literature keeps a little play, as living joints do.
 _LIMITS_DEG = {
@@ -75,19 +72,19 @@ _TWIST_LEVER, _LEAST_LEVER = 0.01, 0.02
 
 
 def kind_of(body: int) -> str:
-    """Row of `_LIMITS_DEG` of a body other than the wrist."""
+    """Return the row of `_LIMITS_DEG` of a body other than the wrist."""
     name = BODIES[body]
     return name if name.startswith("thumb") else f"finger{name[-1]}"
 
 
 def limits() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
-    """Lower and upper limits of the hinges, body by body [rad]."""
+    """Return the lower and upper limits of the hinges, body by body [rad]."""
     table = np.deg2rad([_LIMITS_DEG[kind_of(body)] for body in range(1, len(BODIES))])
     return table[..., 0].ravel(), table[..., 1].ravel()
 
 
 def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
-    """Open and closed joint values [rad]."""
+    """Return open and closed joint values [rad]."""
     made = []
     for table in (_OPEN_DEG, _CLOSED_DEG):
         flexion = [table["thumb" if kind_of(b).startswith("thumb") else "finger"][(b - 1) % 3] for b in range(1, 16)]
@@ -96,17 +93,14 @@ def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
-    """Greatest torques [N·m]: those by which a stretched finger presses with `_TIP_FORCE` at its tip.
-
-    The levers are those of this shape: a small hand is weaker.
-    """
+    """Return the greatest torques [N·m], with which a stretched finger of this shape presses `_TIP_FORCE`."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
     lever = np.maximum(np.column_stack([reach, reach, np.full(15, _TWIST_LEVER)]), _LEAST_LEVER)
     return (_TIP_FORCE * lever).ravel()
 
 
 def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.ndarray, "3"]:
-    """Unit direction out of the palm at rest, model frame: a right hand's or a left hand's, by the mean pose."""
+    """Return the unit direction out of the palm at rest, model frame. The mean pose shows the palm's side."""
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)
@@ -124,7 +118,7 @@ def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.n
 def anatomical_frames(
     joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"], normal: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "16 3 3"]:
-    """The frames B: flexion, abduction and twist axes of every body at rest as columns; the wrist's is the model's."""
+    """Return the frames B of every body at rest, axes as columns. The wrist's is the model's."""
     target = joints[[0, 1, 4, 7, 10]].mean(0) + _OPPOSITION * normal
     frames = np.tile(np.eye(3), (len(BODIES), 1, 1))
     for body in range(1, len(BODIES)):
@@ -139,7 +133,7 @@ def anatomical_frames(
 def rotations_from_joints(
     frames: Float[Tensor, "16 3 3"], values: Float[Tensor, "batch 45"]
 ) -> Float[Tensor, "batch 16 3 3"]:
-    """Rotation of every body against its parent in the model's axes; the wrist's is the identity."""
+    """Return the rotation of every body against its parent in the model's axes. The wrist's is the identity."""
     sine, cosine = values.sin().unflatten(-1, (15, 3)), values.cos().unflatten(-1, (15, 3))
     (sx, sy, sz), (cx, cy, cz) = sine.unbind(-1), cosine.unbind(-1)
     # Rx Ry Rz, written out.
@@ -166,10 +160,7 @@ _DENSITY = 1100.0
 
 @dataclass(frozen=True, eq=False)
 class _Rest:
-    """A shape at rest: its skin [m], the body that each vertex belongs to, joints, fingertips [m], the palm's normal.
-
-    `frames` are the anatomical ones. All is in the model's axes.
-    """
+    """A shape at rest in the model's axes [m]. `owner` is the body of each vertex, `frames` are the anatomical ones."""
 
     data: ManoData
     vertices: Float[np.ndarray, "vertices 3"]
@@ -180,7 +171,7 @@ class _Rest:
     frames: Float[np.ndarray, "16 3 3"]
 
     def in_body(self, body: int) -> Float[np.ndarray, "vertices 3"]:
-        """Vertices in the frame of a body [m]."""
+        """Return the vertices in the frame of a body [m]."""
         return (self.vertices - self.joints[body]) @ self.frames[body]
 
 
@@ -201,7 +192,7 @@ class ManoHand:
     frames: Float[np.ndarray, "16 3 3"]
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
-        """MANO's own surface at a posture, wrist closed, in the frame that the posture is in [m]."""
+        """Return MANO's own surface at a posture, wrist closed, in the posture's frame [m]."""
         skin, betas = _float64(self.data), torch.as_tensor(self.betas)[None]
         rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
         origin = rest(skin, betas)[1][:, 0]
@@ -212,10 +203,9 @@ class ManoHand:
 
 
 def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int = 600) -> ManoHand:
-    """The hand of a MANO file (.pkl) and a shape; the mean shape without betas.
+    """Load the hand of a MANO file (.pkl) and a shape, the mean shape without betas.
 
-    Raises:
-        HandError: the file cannot be used, or there are more betas than it has shapes.
+    Raises HandError: the file cannot be used, or there are more betas than it has shapes.
     """
     data = read_mano(Path(path))
     shape = np.zeros(data.shape_directions.shape[-1])
@@ -248,10 +238,7 @@ def _fingertips(
 
 
 def _bare_hand(still: _Rest) -> HandModel:
-    """Tree, limits, hulls and masses; no candidates yet.
-
-    A body hangs from its parent by two massless links and its own: flexion, abduction, twist.
-    """
+    """Return the hand without candidates. Each body hangs from its parent by two massless links and its own."""
     data, normal = still.data, still.normal
     tree, link_of = _tree(still.joints, still.frames)
     count = len(tree["link_names"])
@@ -292,7 +279,7 @@ def _bare_hand(still: _Rest) -> HandModel:
 
 
 def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Each body's link, and in its frame the faces of the skin that have a vertex of it."""
+    """Return each body's link, and in its frame the faces of the skin that have a vertex of the body."""
     faces = still.data.faces
     own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
     return tuple(
@@ -303,7 +290,7 @@ def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...
 
 
 def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]) -> tuple[dict[str, Any], list[int]]:
-    """The fields of a hand that say how its links hang from each other, and the number of each body's own link."""
+    """Return the fields of a hand that describe its tree, and the number of each body's own link."""
     names, parents, axes = [BODIES[0]], [-1], [np.zeros(3)]
     offsets = [(np.eye(3), np.zeros(3))]
     link_of = [0]
@@ -344,7 +331,7 @@ def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.
 def _palm_center(
     palm: Primitive, joints: Float[np.ndarray, "16 3"], normal: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Where a line out of the middle of the palm's bones leaves the palm's hull, base frame [m]."""
+    """Return where the normal through the middle of the palm's bones leaves the palm's hull, base frame [m]."""
     middle = joints[[1, 4, 7, 10]].mean(0) * 0.7 + joints[0] * 0.3 - joints[0]
     a, b, c = (palm.vertices[palm.faces[:, i]] for i in range(3))
     outward = np.cross(b - a, c - a)

@@ -20,7 +20,7 @@ from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A MANO model as tensors on one device; fields as in `ManoData`."""
+    """A MANO model as tensors on one device. Fields as in `ManoData`."""
 
     template: Float[Tensor, "vertices 3"]
     shape_directions: Float[Tensor, "vertices 3 shapes"]
@@ -30,7 +30,6 @@ class Skin:
 
 
 def make_skin(data: ManoData, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Skin:
-    """Lay a model out as tensors."""
     fields = (data.template, data.shape_directions, data.pose_directions, data.joint_regressor, data.weights)
     return Skin(*(torch.as_tensor(array, device=device, dtype=dtype) for array in fields))
 
@@ -38,7 +37,7 @@ def make_skin(data: ManoData, device: torch.device | str = "cpu", dtype: torch.d
 def rest(
     skin: Skin, betas: Float[Tensor, "batch shapes"]
 ) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Vertices and joints of a shape at rest [m]; betas beyond those given are zero."""
+    """Return vertices and joints of a shape at rest [m]. Betas beyond those given are zero."""
     shaped = skin.template + torch.einsum("vcs,bs->bvc", skin.shape_directions[..., : betas.shape[-1]], betas)
     return shaped, skin.joint_regressor @ shaped
 
@@ -49,13 +48,12 @@ def skin_vertices(
     rotations: Float[Tensor, "batch 16 3 3"],
     translation: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Posed vertices and joints [m].
+    """Return posed vertices and joints [m].
 
     Args:
         skin: the model.
         betas: shape coefficients.
-        rotations: of every body against its parent, in the model's axes; the first is that of the whole hand, about
-            the wrist joint.
+        rotations: of every body against its parent, in the model's axes. The first turns the hand about the wrist.
         translation: added to everything [m].
     """
     shaped, joints = rest(skin, betas)
@@ -75,7 +73,7 @@ def skin_vertices(
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotations of axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
+    """Return the rotations of axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
     half = 0.5 * safe_norm(vector)[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
 
@@ -83,10 +81,9 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 def pose_from_components(
     data: ManoData, coefficients: Float[Tensor, "batch components"], *, about_mean: bool = True
 ) -> Float[Tensor, "batch 15 3"]:
-    """Axis-angle vectors of bodies 1 to 15 [rad] of the first k principal components, about the mean pose or the flat.
+    """Return the pose of the first k principal components: axis-angle vectors of bodies 1 to 15 [rad].
 
-    Raises:
-        HandError: more coefficients than the model has components.
+    Raises HandError: more coefficients than the model has components.
     """
     count = coefficients.shape[-1]
     if count > len(data.components):
@@ -97,10 +94,9 @@ def pose_from_components(
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
-    """The vertices around the opening at the wrist, in the direction of the faces' edges; empty for a closed mesh.
+    """Return the vertices around the opening at the wrist, in the direction of the edges, none for a closed mesh.
 
-    Raises:
-        HandError: the boundary is not one loop, so that the inside is not defined.
+    Raises HandError: the boundary is not one loop, so that the inside is not defined.
     """
     edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
     present = set(map(tuple, edges.tolist()))
@@ -120,14 +116,14 @@ def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
 
 
 def closed_faces(data: ManoData) -> Int[np.ndarray, "faces 3"]:
-    """The faces with a fan over the wrist about one vertex more: MANO's 1538 become 1554."""
+    """Return the faces with a fan over the wrist about one more vertex: MANO's 1538 become 1554."""
     loop = wrist_loop(data)
     hub = np.full(len(loop), len(data.template))
     return np.concatenate([data.faces, np.column_stack([np.roll(loop, -1), loop, hub])])
 
 
 def close_wrist(data: ManoData, vertices: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch closed 3"]:
-    """The vertices with the fan's hub, the middle of the loop, for `closed_faces`."""
+    """Return the vertices with the fan's hub, the middle of the loop, for `closed_faces`."""
     loop = wrist_loop(data)
     if len(loop) == 0:
         return vertices

@@ -1,8 +1,8 @@
-"""A `HandModel` from links and joints, whichever format they were read from: checks, order, limits, couplings.
+"""A `HandModel` from links and joints of any format: checks, order, limits, couplings.
 
-The order of links and joints is depth-first, children in the order of the file's joints. Joints get limits that mean
-something: those of coupled joints are kept too, none is without end, and none without room. Chains of coupled joints,
-`<mimic joint="..." multiplier="..." offset="..."/>`, are resolved to actuated joints.
+The order of links and joints is depth-first, children in the order of the file. Actuated joints get finite limits that
+keep their followers within their own. Joints without room are welded. Chains of coupled joints (`<mimic joint="..."
+multiplier="..." offset="..."/>`) are resolved to actuated joints.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _LARGEST = 1e6
 _STILL = 1e-6
 # An angle beyond this, up to a whole circle in degrees, may be meant in degrees [rad].
 _FULL_TURN, _CIRCLE = 2 * np.pi + 0.05, 360.5
-# Wider limits than this say nothing [rad]; a slide that is longer is in another unit [m].
+# Wider limits than this say nothing [rad]. A slide that is longer is in another unit [m].
 _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class LinkSpec:
-    """One link as a file gives it: mass [kg], centre [m] and inertia about it [kg·m²] in link axes; solids."""
+    """One link as a file gives it: mass [kg], centre [m] and inertia about it [kg·m²] in link axes, and solids."""
 
     name: str
     mass: float = 0.0
@@ -56,15 +56,15 @@ class Coupling(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointSpec:
-    """One joint as a file gives it: where its child sits in the parent, and how it moves; infinite where unset.
+    """One joint as a file gives it: where its child sits in the parent, and how it moves.
 
     Attributes:
         name: unique among joints.
         parent, child: link names.
         kind: how it moves.
         rotation, translation: `T_parent_child` at joint value zero [m].
-        axis: unit, in the child's frame; zero where fixed.
-        lower, upper: limits [rad] or [m].
+        axis: unit, in the child's frame, zero where fixed.
+        lower, upper: limits [rad] or [m], infinite where unset.
         effort: greatest torque [N·m] or force [N].
         velocity: greatest speed [rad/s] or [m/s].
     """
@@ -101,7 +101,7 @@ def assemble(
     couplings: Mapping[str, Coupling],
     warnings: tuple[str, ...] = (),
 ) -> HandModel:
-    """The hand without candidates: postures mid-range, palm at the base's origin, every pair of links checked.
+    """Return the hand without candidates: postures mid-range, palm at the base's origin, no adjacent links yet.
 
     Args:
         path, name: of the file, for errors, and of the hand.
@@ -110,7 +110,7 @@ def assemble(
         warnings: what reading has found.
 
     Raises:
-        HandError: the links are not one tree, or nothing in it moves; names the file and the culprit.
+        HandError: the links are not one tree, or nothing in it moves. Names the file and the culprit.
     """
     order = _depth_first(path, links, joints)
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
@@ -150,7 +150,7 @@ def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
 
 
 def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
-    """The fields of a hand that say how its links hang from each other; `chain` are the joints of all but the first."""
+    """Return the fields of a hand that describe its tree. `chain` holds the joints of all links but the first."""
     index = {link: i for i, link in enumerate(order)}
     actuated = [joint.name for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     number = {joint: i for i, joint in enumerate(actuated)}
@@ -178,7 +178,7 @@ def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping
 
 
 def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSpec]) -> list[str]:
-    """Link names, a link before its children, once links and joints are known to make one tree."""
+    """Return the link names depth-first. Raises HandError if links and joints do not make one tree."""
     names = [link.name for link in links]
     _refuse_repeated(path, "link", names)
     _refuse_repeated(path, "joint", [joint.name for joint in joints])
@@ -228,13 +228,10 @@ def _reaches(root: str, link: str, above: Mapping[str, str]) -> bool:
 def _settled(
     path: Path, joints: Sequence[JointSpec], couplings: Mapping[str, Coupling]
 ) -> tuple[list[JointSpec], dict[str, Coupling], tuple[str, ...]]:
-    """The joints with limits that can be moved within, the couplings that are left, and a warning for what was done.
+    """Return the joints with usable limits, the remaining couplings, and a warning for each change.
 
-    Actuated joints are kept within what their followers allow, those that turn without end within one turn; what
-    cannot move is welded where it is, with its followers.
-
-    Raises:
-        HandError: a joint slides farther than anything in a hand does.
+    Actuated joints are kept within what their followers allow, endless ones within one turn. A joint that cannot move
+    is welded with its followers. Raises HandError: a joint slides farther than a hand's joint can.
     """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     followers = [joint for joint in moving if joint.name in couplings]
@@ -281,7 +278,7 @@ def _settled(
 
 
 def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> JointSpec:
-    """The leader within limits and speed that keep its follower within its own too."""
+    """Return the leader with limits and speed that keep its follower within its own limits too."""
     _, multiplier, offset = coupling
     if multiplier == 0:
         return leader
@@ -291,7 +288,7 @@ def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> Joi
 
 
 def _finite(path: Path, joint: JointSpec) -> JointSpec:
-    """The joint, or one that turns without end kept to one turn."""
+    """Return the joint, kept to one turn if it turns without end."""
     reach = joint.upper - joint.lower
     if joint.kind == "prismatic" and not reach <= _LONGEST_SLIDE:
         raise _too_long(path, joint.name, reach)
@@ -316,12 +313,10 @@ def _too_long(path: Path, joint: str, slide: float) -> HandError:
 
 
 def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupling]:
-    """The couplings of all joints with a `<mimic>`, by name; each leader is an actuated joint.
+    """Read the couplings of all joints with a `<mimic>`, by name.
 
-    A fixed joint has no value to give, so its own `<mimic>` is not looked at.
-
-    Raises:
-        HandError: a joint follows itself, one that is not there or one that is fixed, or has a bad number.
+    Each leader is an actuated joint. The `<mimic>` of a fixed joint is ignored. Raises HandError: a joint follows
+    itself, a missing or a fixed joint, or has a bad number.
     """
     moving = {str(joint.get("name")): joint for joint in joints if joint.get("type") != "fixed"}
     direct: dict[str, Coupling] = {}
@@ -340,16 +335,15 @@ def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupli
 
 
 def resolved_couplings(path: Path, direct: Mapping[str, Coupling]) -> dict[str, Coupling]:
-    """Couplings as written, each led back to the actuated joint at the end of its chain.
+    """Return the couplings, each led back to the actuated joint at the end of its chain.
 
-    Raises:
-        HandError: joints follow each other in a circle, or by a number that is no hand's.
+    Raises HandError: joints follow each other in a circle, or with a factor that no hand has.
     """
     return {name: _resolved(path, name, direct) for name in direct}
 
 
 def _resolved(path: Path, name: str, direct: Mapping[str, Coupling]) -> Coupling:
-    """The coupling to the actuated joint at the end of the chain: m₁(m₂ q + o₂) + o₁ = m₁m₂ q + m₁o₂ + o₁."""
+    """Return the coupling to the actuated joint at the end of the chain: m₁(m₂ q + o₂) + o₁ = m₁m₂ q + m₁o₂ + o₁."""
     coupling, seen = direct[name], [name]
     while coupling.leader in direct:
         if coupling.leader in seen:

@@ -1,4 +1,4 @@
-"""A hand description: the YAML file beside a URDF that says where the palm is and how the hand opens and closes."""
+"""A hand description: the YAML file beside a URDF that names the palm and how the hand opens and closes."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ _LARGEST = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A file, and in which line of it each key is, `palm.center` for a nested one; the values of keys, checked."""
+    """A file and the line of each of its keys, `palm.center` for a nested one. Its methods check values."""
 
     path: Path
     lines: Mapping[str, int]
 
     def error(self, key: str, message: str) -> HandError:
-        """The error to raise about a key: names file, line and key."""
+        """Return the error to raise about a key: names file, line and key."""
         line = self.lines.get(key, self.lines.get(key.partition(".")[0], 1))
         return HandError(f"{self.path}:{line}: {key}: {message}")
 
     def mapping(self, key: str, value: Any) -> dict[str, Any]:
-        """A mapping; some hands' joints have bare numbers for names."""
+        """Check a mapping. Keys become text, since some joints have bare numbers for names."""
         if not isinstance(value, dict):
             raise self.error(key, f"expected a mapping of keys to values, got {shown(value)}")
         return {name if isinstance(name, str) else shown(name): entry for name, entry in value.items()}
 
     def section(self, key: str, value: Any, known: tuple[str, ...], required: tuple[str, ...]) -> dict[str, Any]:
-        """A mapping of some of the known keys to values; the whole file has no key."""
+        """Check a mapping for unknown and missing keys. An empty `key` stands for the whole file."""
         data, prefix = self.mapping(key or "the file", value), f"{key}." if key else ""
         for name in data:
             if name not in known:
@@ -54,19 +54,19 @@ class Source:
         return data
 
     def text(self, key: str, value: Any) -> str:
-        """Some text."""
+        """Check that a value is text."""
         if not isinstance(value, str):
             raise self.error(key, f"expected text, got {shown(value)}")
         return value
 
     def numbers(self, key: str, value: Any, count: int) -> Float[np.ndarray, "count"]:
-        """A list of so many numbers."""
+        """Check a list of `count` numbers."""
         if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
             raise self.error(key, f"expected {count} numbers, got {shown(value)}")
         return np.array(value, dtype=np.float64)
 
     def direction(self, key: str, value: Any) -> Float[np.ndarray, "3"]:
-        """Three numbers as a unit vector."""
+        """Return three numbers as a unit vector."""
         vector = self.numbers(key, value, 3)
         length = float(np.linalg.norm(vector))
         if length < 1e-9:
@@ -74,7 +74,7 @@ class Source:
         return vector / length
 
     def by_joint(self, key: str, value: Any) -> dict[str, float]:
-        """Numbers by joint name."""
+        """Check a mapping of joint names to numbers."""
         values = self.mapping(key, value)
         for joint, number in values.items():
             if not _is_number(number):
@@ -82,7 +82,7 @@ class Source:
         return {joint: float(number) for joint, number in values.items()}
 
     def effort(self, value: Any) -> float | dict[str, float]:
-        """One greatest torque for all joints, or some by name."""
+        """Check one positive torque for all joints, or some by name."""
         efforts = self.by_joint("effort", value) if isinstance(value, dict) else value
         values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
         if not all(_is_number(number) and number > 0 for number in values):
@@ -90,7 +90,7 @@ class Source:
         return efforts if isinstance(efforts, dict) else float(efforts)
 
     def mount(self, value: Any) -> Mount:
-        """The `mount` entry: the arm's link, and the pose of the base link in it, zero unless given."""
+        """Read the `mount` entry: the arm's link, and the pose of the base link in it, the identity unless given."""
         given = self.section("mount", value, _MOUNT_KEYS, ("parent",))
         parent = self.text("mount.parent", given["parent"])
         x, y, z = self.numbers("mount.position", given.get("position", [0, 0, 0]), 3).tolist()
@@ -110,14 +110,14 @@ class HandDescription:
         source: the file, and in which line of it each key is.
         name: the hand's name, the file's stem unless given.
         urdf: path of the URDF or MJCF file.
-        palm_link: the link that palm_center and palm_normal are given in; None for the base link.
-        palm_center: the point of the palm that grasps centre on [m]; None where the palm is to be guessed.
-        palm_normal: direction out of the palm, unit; None likewise.
-        approach: direction of approach in the base frame, unit; None for the palm's normal.
+        palm_link: the link that palm_center and palm_normal are given in, None for the base link.
+        palm_center: the point of the palm that grasps centre on [m], None if the palm is to be guessed.
+        palm_normal: direction out of the palm, unit, None likewise.
+        approach: direction of approach in the base frame, unit, None for the palm's normal.
         effort: one greatest torque for all joints, or some by name, or None for the URDF's [N·m].
-        open, closed: joint values by joint name [rad] or [m]; None where they are to be guessed.
-        mount: where the base link sits on an arm; None where the file does not say.
-        root: the link that the hand begins at, where the URDF holds a whole robot; None: all of it is the hand.
+        open, closed: joint values by joint name [rad] or [m], None if they are to be guessed.
+        mount: where the base link sits on an arm, None if the file does not say.
+        root: the link that the hand begins at, in a URDF of a whole robot. None: all of it is the hand.
     """
 
     source: Source
@@ -141,8 +141,7 @@ def _is_number(value: object) -> bool:
 def read_description(path: Path) -> HandDescription:
     """Read and check a hand description.
 
-    Raises:
-        HandError: not YAML, an unknown or missing key, or a value of the wrong type; names file, line and key.
+    Raises HandError: not YAML, an unknown or missing key, or a wrong value. Names file, line and key.
     """
     try:
         node, data = parse_yaml(path.read_text(encoding="utf-8"))
@@ -177,10 +176,10 @@ def read_description(path: Path) -> HandDescription:
 
 
 def apply_description(hand: HandModel, description: HandDescription) -> HandModel:
-    """The hand with the description's palm, postures and efforts; what it leaves out is guessed, with a warning.
+    """Return the hand with the description's palm, postures and efforts.
 
-    Raises:
-        HandError: an unknown joint or link, a joint without a value, or a value outside the joint's limits.
+    The rest is guessed, with a warning. Raises HandError: an unknown joint or link, a joint without a value, or a value
+    outside the joint's limits.
     """
     known_at_once = {"name": description.name, "effort": _efforts(hand, description), "mount": description.mount}
     hand = _with_palm(replace(hand, **known_at_once), description)
@@ -245,7 +244,7 @@ def _check_joints(hand: HandModel, description: HandDescription, key: str, value
 
 
 def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
-    """Line number of every key of the file and of the mappings in it, the two joined by a dot."""
+    """Return the line of every key of the file and of the mappings in it. Nested keys are joined by a dot."""
     lines: dict[str, int] = {}
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:

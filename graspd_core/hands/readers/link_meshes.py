@@ -28,14 +28,11 @@ LARGEST_SIZE = 2.0
 
 
 def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
-    """Where a mesh lies that a URDF names by a `package://`, `model://` or `file://` address or by a path.
+    """Find the file of a mesh that a URDF names by a `package://`, `model://` or `file://` address or by a path.
 
-    A package is looked for in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then in the folders above the URDF and among
-    their neighbours: by folder name or by the name in its package.xml. A relative path is taken from the URDF's folder
-    and from the folders above.
-
-    Raises:
-        HandError: no such file, or one that would have to be fetched.
+    Packages are sought in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then above the URDF and beside its package, by folder
+    name or by the name in package.xml. Relative paths start at the URDF's folder and the folders above. Raises
+    HandError: no such file, or one that would have to be fetched.
     """
     scheme, rest = _address(filename)
     if scheme in ("http", "https", "ftp"):
@@ -54,7 +51,7 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
 
 
 def _address(filename: str) -> tuple[str, str]:
-    """The scheme of a mesh's address, empty for a plain path, and what follows it."""
+    """Return the scheme of a mesh's address, empty for a plain path, and the rest."""
     scheme, separator, rest = filename.replace("\\", "/").partition("://")
     if not separator:
         return "", scheme
@@ -62,7 +59,7 @@ def _address(filename: str) -> tuple[str, str]:
 
 
 def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...]:
-    """Say which packages were not found, whose meshes were taken from beside the URDF or above it."""
+    """Warn of packages that were not found, whose meshes were taken from beside the URDF or above it."""
     addresses = (_address(mesh.get("filename") or "") for mesh in meshes)
     named = {rest.partition("/")[0] for scheme, rest in addresses if scheme in ("package", "model")}
     parents = urdf.resolve().parents
@@ -78,7 +75,7 @@ def _folder_exists(path: Path) -> bool:
 
 
 def inside_exists(path: Path) -> bool:
-    """Whether a file is there; a name that no file can have is not."""
+    """Tell whether a file is there. A name that no file can have is not."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -86,17 +83,16 @@ def inside_exists(path: Path) -> bool:
 
 
 def corners_each(meshes: int) -> int:
-    """The corners that the hull of each of so many meshes of one hand may have."""
+    """Return the greatest number of corners for the hull of each of so many meshes of one hand."""
     return int(np.clip(_ALL_CORNERS // max(meshes, 1), _FEWEST_CORNERS, _CORNERS))
 
 
 def mesh_hull(
     urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"], corners: int = _CORNERS
 ) -> TriangleMesh:
-    """Convex hull of a mesh file, scaled along each axis (a negative factor mirrors), of some `corners` at most [m].
+    """Return the convex hull of a mesh file, scaled along each axis, of at most `corners` corners [m].
 
-    Raises:
-        HandError: the file is not there, not a mesh, or not of a hand's size.
+    A negative factor mirrors. Raises HandError: the file is not there, not a mesh, or not of a hand's size.
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
@@ -112,7 +108,7 @@ def mesh_hull(
 
 
 def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """A mesh file as it is, scaled along each axis [m]. Raises HandError: the file is not there or not a mesh."""
+    """Read a mesh file, scaled along each axis [m]. Raises HandError: the file is not there or not a mesh."""
     try:
         mesh = load_mesh(resolve_mesh(urdf, shape, filename))
     except (MeshError, OSError) as error:
@@ -131,7 +127,7 @@ def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners:
 
 
 def _package_folders(package: str, parents) -> list[Path]:
-    """Where a package may lie, likeliest first."""
+    """Return where a package may lie, likeliest first."""
     named = [Path(entry) for entry in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if entry]
     installed = [Path(entry) / "share" for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if entry]
     found = [folder for folder in named if folder.name == package or _package_name(folder) == package]
@@ -148,7 +144,6 @@ def _package_folders(package: str, parents) -> list[Path]:
 
 
 def _package_name(folder: Path) -> str | None:
-    """The name in a folder's package.xml, None where there is none."""
     try:
         text = (folder / "package.xml").read_text(encoding="utf-8", errors="replace")
     except (OSError, ValueError):

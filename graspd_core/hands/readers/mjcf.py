@@ -1,7 +1,7 @@
-"""MJCF to `HandModel`: MuJoCo reads and compiles the file, and what its model says of a hand is taken over.
+"""MJCF to `HandModel`: MuJoCo reads and compiles the file, and the hand is taken from its model.
 
-MuJoCo is given what `read_xml` took, of the sections that say how a hand moves. It opens no file: meshes are read by
-graspd, in more formats, as convex hulls. What would change how the hand moves and is not read is refused by name.
+MuJoCo gets what `read_xml` took, reduced to the sections that say how a hand moves. It opens no file: graspd reads
+meshes, in more formats, as convex hulls. Elements that change how the hand moves and are not read are refused by name.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class _MeshAsset:
 
     Attributes:
         place: its line and name, for errors.
-        file: relative to the file's folder; empty for a mesh whose vertices are in the file.
+        file: relative to the file's folder, empty for a mesh whose vertices are in the file.
         scale: of its coordinates, along each axis.
         vertices: of a mesh without file [m].
     """
@@ -58,7 +58,7 @@ class _MeshAsset:
 
 
 def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
-    """The meshes of a parsed file by name. Raises HandError: one is moved or turned, or has no size."""
+    """Return the meshes of a parsed file by name. Raises HandError: one is moved, turned or scaled by zero."""
     assets = {}
     for mesh in spec.meshes:
         if np.any(mesh.refpos) or not np.array_equal(mesh.refquat, (1, 0, 0, 0)):
@@ -72,7 +72,7 @@ def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
 
 
 def fault(path: Path, element: Any, message: str) -> HandError:
-    """The error to raise about an element of a `MjSpec`: names the file, the line, and what it belongs to."""
+    """Return the error to raise about an element of a `MjSpec`: names the file, the line and the owner."""
     return wrong(path, _place(element), message)
 
 
@@ -85,12 +85,11 @@ def _place(element: Any) -> Element:
 
 
 def _type_name(element: Any) -> str:
-    """The type of a geom or joint as MJCF writes it."""
     return element.type.name.partition("_")[2].lower()
 
 
 def pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation [m] of one of a model's poses."""
+    """Return rotation and translation [m] of one of a model's poses."""
     return rotation_from_quaternion(torch.as_tensor(np.array(quaternion))).numpy(), np.array(position)
 
 
@@ -104,10 +103,9 @@ def check_type(path: Path, geom: Any, assets: Mapping[str, _MeshAsset]) -> None:
 
 
 def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
-    """One geom as a primitive of link zero: ellipsoids and meshes, of which `hull` is one, as hulls.
+    """Return one geom as a primitive of link zero: meshes (`hull`) and ellipsoids as hulls.
 
-    Raises:
-        HandError: it is larger than anything of a hand.
+    Raises HandError: it is larger than anything of a hand.
     """
     rotation, translation = pose(model.geom_pos[geom.id], model.geom_quat[geom.id])
     if hull is not None:
@@ -125,10 +123,9 @@ def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> 
 
 
 def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
-    """The hull of a mesh, of some `corners` at most [m].
+    """Return the hull of a mesh, of at most `corners` corners [m].
 
-    Raises:
-        HandError: its file is not there or not a mesh, or it is larger than anything of a hand.
+    Raises HandError: its file is not there or not a mesh, or it is larger than anything of a hand.
     """
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
@@ -169,10 +166,10 @@ class _Parts:
 
 
 def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """The hand that an MJCF file describes, as `read_urdf` gives one; the base is the one body of the world.
+    """Read the hand of an MJCF file, in the form of `read_urdf`.
 
-    Raises:
-        HandError: MuJoCo refuses the file, it has several bodies in the world, or uses what is not read.
+    The base is the one body of the world. Raises HandError: MuJoCo refuses the file, it has several bodies in the
+    world, or it uses what is not read.
     """
     root = read_xml(path) if root is None else root
     _include(path, path, root, {path.resolve()})
@@ -206,10 +203,9 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
 
 
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
-    """Put what files hold in the place of each `<include>` below `parent`, as MuJoCo does, which `holder` holds.
+    """Replace each `<include>` below `parent`, which `holder` holds, by the included elements, as MuJoCo does.
 
-    Raises:
-        HandError: a file is not there, is no MJCF, or is included twice.
+    Raises HandError: a file is not there, is no MJCF, or is included twice.
     """
     children: list[ET.Element] = []
     for child in parent:
@@ -226,7 +222,7 @@ def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], dept
 
 
 def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path]) -> tuple[Path, ET.Element]:
-    """The file that an `<include>` names, beside the main file or beside the one that names it, and its root."""
+    """Read the file that an `<include>` names, beside the main file or beside `holder`. Return its path and root."""
     name = place.get("file") or ""
     told = f"<include file={shown(name)}>"
     found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)
@@ -261,7 +257,7 @@ def _refuse(path: Path, root: ET.Element) -> None:
 
 
 def _compiled(path: Path, root: ET.Element) -> _Parts:
-    """The file in MuJoCo's hands, with a small sphere in the place of each mesh, so that no mesh file is opened."""
+    """Compile the file with MuJoCo, with a small sphere in place of each mesh, so that MuJoCo opens no mesh file."""
     mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
     root[:] = [section for section in root if section.tag in _SECTIONS]
     for assets in root.findall("asset"):
@@ -286,7 +282,7 @@ def _compiled(path: Path, root: ET.Element) -> _Parts:
 
 
 def _refusal(path: Path, root: ET.Element, text: str) -> HandError:
-    """MuJoCo's refusal as an error about the element that it names."""
+    """Return MuJoCo's refusal as an error about the element that it names."""
     line, tag = re.search(r",? line (\d+)", text), re.search(r"Element '(\w+)'", text)
     place = Element(tag.group(1) if tag else "mujoco")
     if line:
@@ -324,13 +320,13 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
 
 
 def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
-    """The joint that moves as the file says, of one that stands where it says."""
+    """Return the joint of the file, made from a fixed one that stands in its place."""
     model, number = parts.model, joint.id
     kind = _KINDS.get(_type_name(joint))
     if kind is None:
         raise fault(parts.path, joint, f"is of type {_type_name(joint)!r}; known: {', '.join(_KINDS)}")
     axis, rotation, translation = np.array(model.jnt_axis[number]), placed.rotation, placed.translation
-    # At `ref` the joint is as drawn; a joint value of zero lies that far back.
+    # At `ref` the joint is as drawn. A joint value of zero lies that far back.
     if kind == "revolute":
         rotation = rotation @ axis_rotation(axis, -_reference(parts, number))
     else:
@@ -354,7 +350,7 @@ def _refuse_far(parts: _Parts, element: Any, position: Float[np.ndarray, "3"]) -
 
 
 def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
-    """The colliding geoms of a body, or all where none collides."""
+    """Return the colliding geoms of a body, or all if none collides."""
     colliding = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
     if body.geoms and not colliding:
         parts.shown.append(name)
@@ -368,7 +364,7 @@ def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
 
 
 def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Mass [kg], centre [m] and inertia about it [kg·m²]; zero where the body gives none."""
+    """Return mass [kg], centre [m] and inertia about it [kg·m²], zero if the body gives none."""
     if not body.explicitinertial:
         return 0.0, np.zeros(3), np.zeros((3, 3))
     model, number = parts.model, body.id
@@ -382,7 +378,7 @@ def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], 
 
 
 def _couplings(parts: _Parts) -> dict[str, Coupling]:
-    """Joints that an equality ties to another by a straight line: q₁ − ref₁ = c₀ + c₁ (q₂ − ref₂)."""
+    """Return the joints that an equality ties to another by a straight line: q₁ − ref₁ = c₀ + c₁ (q₂ − ref₂)."""
     direct: dict[str, Coupling] = {}
     for tie in parts.spec.equalities:
         if not tie.active:
@@ -404,7 +400,7 @@ def _couplings(parts: _Parts) -> dict[str, Coupling]:
 
 
 def _efforts(parts: _Parts) -> dict[str, float]:
-    """The greatest torque or force that a joint's actuator gives, where it is limited."""
+    """Return the greatest torque or force of each joint's actuator, if it is limited."""
     mujoco: Any = importlib.import_module("mujoco")
     model, efforts = parts.model, {}
     for i in range(model.nu):

@@ -1,7 +1,7 @@
-"""URDF to `HandModel`: what descriptions in use get wrong is mended with a warning or refused by name.
+"""URDF to `HandModel`: common mistakes of descriptions are mended with a warning or refused by name.
 
-Boxes, spheres, cylinders and capsules stay as they are; meshes become convex hulls. What a hand looks like is read for
-pictures alone.
+Boxes, spheres, cylinders and capsules stay as they are. Meshes become convex hulls. Visual shapes are read for
+pictures.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _STUCK, _SHRUNK = 1.5, 0.95
 
 
 def _colliding(link: ET.Element) -> list[ET.Element]:
-    """The elements of a `<link>` that its solids are read from: where nothing collides, those that it shows."""
+    """Return the `<collision>` elements of a link, its `<visual>` elements if it has none."""
     return link.findall("collision") or link.findall("visual")
 
 
@@ -47,10 +47,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Return the shapes of a link with each cylinder and the two balls at its ends as one capsule, the same solid.
-
-    This is how a URDF writes a capsule, since urdfdom knows none.
-    """
+    """Join each cylinder and two balls at its ends to one capsule, which URDF has no shape for."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
@@ -70,7 +67,7 @@ def _is_ball(shape: Primitive, center: Float[np.ndarray, "3"], radius: float) ->
 
 
 def _read_shape(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:
-    """A `<collision>` or `<visual>` as a primitive of link zero; `read_mesh` gives the mesh of a file [m]."""
+    """Read a `<collision>` or `<visual>` as a primitive of link zero. `read_mesh` gives the mesh of a file [m]."""
     rotation, translation = read_origin(path, element)
     geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
@@ -125,15 +122,15 @@ _HEAVIEST = 1e3
 
 
 def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """The hand that a URDF describes, without candidates; postures mid-range, palm at the base's origin.
+    """Read the hand of a URDF, without candidates.
 
-    `continuous` joints are kept within ±π; an effort or velocity that is absent or zero becomes infinite; a link
-    without collision shapes takes its visual ones; a `world` link or a floating joint above the base is dropped. All
-    but the second leave a warning.
+    Postures are mid-range, the palm is at the base's origin. `continuous` joints are kept within ±π. An absent or zero
+    effort or velocity becomes infinite. A link without collision shapes takes its visual ones. A `world` link or a
+    floating joint above the base is dropped. All changes but the second leave a warning.
 
     Args:
         path: of the file.
-        root: its root element, where it has been read already.
+        root: its root element, if it has been read already.
 
     Raises:
         HandError: the file is missing, malformed, not a tree, has no moving joint, or has one of an unknown type.
@@ -168,10 +165,10 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
 
 
 def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
-    """The shapes that a viewer draws, placed as `hand.primitives` are; a mesh is a `hull` that need not be convex.
+    """Return the shapes that a viewer draws, placed as `hand.primitives` are.
 
-    Meshes of more than 4000 triangles together are simplified to as many, at most half as many again. A link without
-    visuals has its collision solids, and so has a hand that no URDF describes.
+    A `hull` of them need not be convex. Meshes are simplified to about 4000 triangles together, 6000 at most. Links
+    without visuals, and hands without a URDF, get their collision solids.
 
     Args:
         hand: any loaded hand.
@@ -194,7 +191,7 @@ def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
 
 
 def _simpler(shape: Primitive, share: float) -> Primitive:
-    """A mesh with a share of its triangles."""
+    """Return a mesh with a share of its triangles."""
     count = max(int(len(shape.faces) * share), _FEWEST_TRIANGLES)
     if shape.kind != "hull" or len(shape.faces) <= count:
         return shape
@@ -206,7 +203,7 @@ def _simpler(shape: Primitive, share: float) -> Primitive:
 
 
 def below_link(path: Path, root: ET.Element, link: str) -> None:
-    """Drop all links and joints of a robot but those from `link` on. Raises HandError: no such link in a URDF."""
+    """Drop all links and joints of a robot except `link` and those below. Raises HandError: no such link in a URDF."""
     links = {str(element.get("name")): element for element in root.findall("link")}
     if link not in links:
         raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, it is no URDF'}")
@@ -242,7 +239,7 @@ def _refuse_xacro(path: Path, root: ET.Element) -> None:
 def _below_world(
     path: Path, links: list[ET.Element], joints: list[ET.Element]
 ) -> tuple[list[ET.Element], list[ET.Element], list[str]]:
-    """Links and joints below whatever only places the hand in the world, and a warning for what was dropped."""
+    """Return the links and joints below what only places the hand in the world, and a warning for each dropped link."""
     dropped: list[str] = []
     while True:
         children = {_end(joint, "child") for joint in joints}
@@ -294,7 +291,7 @@ def _axis(path: Path, joint: ET.Element) -> Float[np.ndarray, "3"]:
 
 
 def _limits(path: Path, joint: ET.Element) -> tuple[float, float, float, float]:
-    """Lower, upper [rad] or [m], effort [N·m] or [N], velocity; infinite where there is none."""
+    """Return lower, upper [rad] or [m], effort [N·m] or [N] and velocity, infinite if unset."""
     limit = joint.find("limit")
     continuous = joint.get("type") == "continuous"
     if limit is None:
@@ -317,7 +314,7 @@ def _unset_if_zero(path: Path, limit: ET.Element, key: str) -> float:
 
 
 def _inertial(path: Path, link: ET.Element) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Mass [kg], centre of mass [m] and inertia about it [kg·m²] in link axes; zero where the link gives none."""
+    """Return mass [kg], centre of mass [m] and inertia about it [kg·m²] in link axes, zero if the link gives none."""
     inertial = link.find("inertial")
     if inertial is None:
         return 0.0, np.zeros(3), np.zeros((3, 3))

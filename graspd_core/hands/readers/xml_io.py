@@ -1,8 +1,7 @@
-"""XML files of hands: read leniently where descriptions in use are sloppy, strictly where a file could do harm.
+"""XML files of hands: read leniently where descriptions are sloppy, strictly where a file could do harm.
 
-Namespaces are not resolved, so undeclared prefixes do no harm; comments may stand before the header. A document type
-declaration is refused: entities are the one part of XML that can blow up or reach for other files.
-Errors about numbers and origins name the file, the element and the value.
+Namespaces are not resolved, so undeclared prefixes do no harm. Comments may stand before the header. A document type
+declaration is refused, because entities can blow up or reach for other files.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from graspd_core.errors import HandError
 _LONGEST = 1000
 _LARGEST_FILE = 32 * 2**20
 DEEPEST = 150
-# The largest hand known has some 1000 elements; each takes half a kilobyte, however short it is written.
+# The largest hand known has some 1000 elements. Each takes half a kilobyte, however short it is written.
 _MOST_ELEMENTS, _MOST_ATTRIBUTES = 20_000, 200
 # Nothing in a hand is farther than this from the frame that it is given in [m].
 FARTHEST = 10.0
@@ -32,17 +31,16 @@ _OWNERS = ("link", "joint", "body", "geom", "mesh")
 
 
 class Element(ET.Element):
-    """An element that knows where it stands: `line`, and the named element that it belongs to, as text."""
+    """An element with its `line`, and the named element that it belongs to (`owner`), as text."""
 
     line = 0
     owner = ""
 
 
 def read_xml(path: Path) -> Element:
-    """The root element of an XML file.
+    """Read the root element of an XML file.
 
-    Raises:
-        HandError: the file cannot be read, is not well-formed, has a document type declaration, or is far too large.
+    Raises HandError: it cannot be read, is not well-formed, has a document type declaration, or is too large.
     """
     try:
         # By reading, not by the size that the system gives: a device has none, and no end.
@@ -57,7 +55,7 @@ def read_xml(path: Path) -> Element:
 
 
 def parse_xml(path: Path, text: str) -> Element:
-    """The root element of XML that stands for a file. Raises HandError: see `read_xml`."""
+    """Parse the root element from the text of a file. Raises HandError: see `read_xml`."""
     text = _blanked(text, "<!--", "-->")
     for space in " \t\r\n":
         text = _blanked(text, f"<?xml{space}", "?>")
@@ -65,7 +63,7 @@ def parse_xml(path: Path, text: str) -> Element:
 
 
 def as_text(root: ET.Element) -> str:
-    """The elements as XML again, each in the line in which it stood; without texts and comments."""
+    """Return the elements as XML, each in its line, without texts and comments."""
     pieces, line = [], 1
     # An element of which only the end is left to write is None, with its tag.
     ahead: list[tuple[ET.Element | None, str]] = [(root, root.tag)]
@@ -82,7 +80,7 @@ def as_text(root: ET.Element) -> str:
 
 
 def wrong(path: Path, element: ET.Element, message: str) -> HandError:
-    """The error to raise about an element: names the file, the line, and the link or joint that it belongs to."""
+    """Return the error to raise about an element: names the file, the line, and the link or joint of the element."""
     line, owner = getattr(element, "line", 0), getattr(element, "owner", "")
     where = f"{path}:{line}" if line else f"{path}"
     if owner:
@@ -110,10 +108,7 @@ def _decoded(data: bytes) -> str:
 
 
 def _blanked(text: str, start: str, end: str) -> str:
-    """The text with what starts and ends so replaced by as many line ends as it held: line numbers stay right.
-
-    By searching, in linear time: a regular expression would go to the end of the file for every start without an end.
-    """
+    """Replace everything from `start` to `end` by its line ends, in linear time, so that line numbers stay right."""
     pieces, at = [], 0
     while (first := text.find(start, at)) >= 0 and (last := text.find(end, first + len(start))) >= 0:
         pieces += [text[at:first], "\n" * text.count("\n", first, last)]
@@ -165,9 +160,9 @@ def _parsed(path: Path, text: str) -> Element:
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Rotation and translation [m] of an element's `<origin>`; identity where it has none.
+    """Return rotation and translation [m] of an element's `<origin>`, the identity if it has none.
 
-    Raises HandError: it holds no numbers, or is farther away than anything in a hand is.
+    Raises HandError: it holds no numbers, or is farther away than anything in a hand.
     """
     origin = element.find("origin")
     if origin is None:
@@ -180,7 +175,7 @@ def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3
 
 
 def read_numbers(path: Path, element: ET.Element, key: str, count: int, default: str) -> Float[np.ndarray, "n"]:
-    """An attribute of `count` finite numbers. Raises HandError: it holds something else."""
+    """Read an attribute of `count` finite numbers. Raises HandError: it holds something else."""
     text = element.get(key) or default
     try:
         values = np.array([float(word) for word in text.split()])
@@ -192,7 +187,7 @@ def read_numbers(path: Path, element: ET.Element, key: str, count: int, default:
 
 
 def rotation_from_rpy(rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """`Rz(yaw) Ry(pitch) Rx(roll)`: URDF's fixed-axis convention [rad]."""
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`: URDF's fixed-axis convention [rad]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     return np.array(
         [

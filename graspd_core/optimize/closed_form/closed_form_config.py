@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the loss terms; every term is scaled so that one is a sensible weight.
+    """Weights of the loss terms. Every term is scaled so that one is a sensible weight.
 
     Attributes:
         wrench_resistance: resistance against the worst disturbances.
@@ -17,7 +17,7 @@ class LossWeights:
         penetration: depth below the padded surface.
         self_collision: overlap of the hand with itself.
         posture: joints away from the middle of their range.
-        obstacle: depth in the support or in a neighbour; scenes without any have no such term.
+        obstacle: depth in the support or in a neighbour. Scenes without any have no such term.
     """
 
     wrench_resistance: float = 3.0
@@ -33,7 +33,7 @@ class ClosedFormConfig:
     """The closed-form relaxation (docs/method.md).
 
     Attributes:
-        starts_per_grasp: starts tried for each grasp asked for; hopeless ones are dropped on the way.
+        starts_per_grasp: starts tried for each grasp asked for. Hopeless ones are dropped on the way.
         fingertip_starts: share of them that begins with half-closed fingertips at the object, the others with the palm.
         explore_steps: steps with all starts, before the hopeless ones are dropped.
         refine_steps: steps with those that are kept.
@@ -47,7 +47,7 @@ class ClosedFormConfig:
         radius_start: greatest padding of the object at the start [m].
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
-        joint_rate: step size of the joints [rad]; sliding ones take 0.05 m for a radian.
+        joint_rate: step size of the joints [rad]. Sliding ones take 0.05 m for a radian.
         searches: times at most that starts are tried, again only where too few grasps are expected to hold.
         weights: of the loss terms while exploring and refining.
         polish_weights: of the loss terms while polishing.

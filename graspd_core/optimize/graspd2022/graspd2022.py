@@ -104,7 +104,7 @@ def contact_forces(
     push = stiffness * leaky_min(height, leak)
     along = normals @ velocities.T
     slip = ((velocities * velocities).sum(-1) - along * along).clamp_min(_SLIP_FLOOR).sqrt()
-    # A force per tangential speed; v_t = v − (n·v) n is put together below, in one go with the normal force.
+    # A force per tangential speed. v_t = v − (n·v) n is put together below, in one go with the normal force.
     drag = (-friction * push[..., None] / slip).clamp(max=friction_stiffness)
     return (push[..., None] + drag * along)[..., None] * normals[:, :, None] - drag[..., None] * velocities
 
@@ -153,7 +153,7 @@ def net_wrench(
     forces: Float[Tensor, "batch points simulations 3"], arms: Points
 ) -> tuple[Float[Tensor, "batch simulations 3"], Float[Tensor, "batch simulations 3"]]:
     """Return Σ f [N] and Σ r × f [N·m] for every simulation, with `arms` r from the centre of mass [m]."""
-    # Σ rᵢ fⱼ in one matrix product; the torque is what is antisymmetric in it.
+    # Σ rᵢ fⱼ in one matrix product. The torque is what is antisymmetric in it.
     products = (arms.transpose(1, 2) @ forces.flatten(2)).unflatten(2, forces.shape[2:])
     x, y, z = products.unbind(1)
     torque = torch.stack([y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]], -1)
@@ -221,7 +221,7 @@ def into_cone(
     along = -(forces * normals[:, :, None]).sum(-1)
     across = forces + along[..., None] * normals[:, :, None]
     side = across.norm(dim=-1)
-    # Inside the cone nothing moves; else the nearest point of its rim, or its apex.
+    # Inside the cone nothing moves. Outside, the nearest point is on its rim, or its apex.
     rim = ((along + friction * side) / (1 + friction**2)).clamp_min(0.0)
     inside = side <= friction * along
     push = torch.where(inside, along, rim)

@@ -12,7 +12,7 @@ class InitialPosesConfig:
 
     Attributes:
         starts_per_grasp: starts for each grasp asked for.
-        kind: `published`, palm towards a random surface point from `standoff` away; `hull`, those of the other methods.
+        kind: `published`, palm towards a random surface point from `standoff` away, or `hull`, as the other methods.
         standoff: distance of the palm from the surface point [m].
     """
 
@@ -26,10 +26,10 @@ class LevelSetConfig:
     """Coarse to fine: contact with the level set φ = r, r shrinking to zero.
 
     Attributes:
-        schedule: level set at the start: `paper`, `radius_start`; `code`, the start's least distance less `clearance`.
+        schedule: level set at the start: `radius_start` (`paper`), or the least distance less `clearance` (`code`).
         radius_start: of the paper [m].
         clearance: of the hand at the start from the level set of the code [m].
-        coarse_steps: first steps, in which the level set shrinks to the surface; zero leaves coarse to fine out.
+        coarse_steps: first steps, in which the level set shrinks to the surface. Zero leaves coarse to fine out.
     """
 
     schedule: Literal["paper", "code"] = "paper"
@@ -43,7 +43,7 @@ class ContactConfig:
     """The penalty contact.
 
     Attributes:
-        leak: slope of the depth out of contact; zero makes the gradient the plain one.
+        leak: slope of the depth out of contact. Zero makes the gradient the plain one.
         stiffness: normal force of a contact by its depth [N/m].
         friction_stiffness: friction by tangential speed, below Coulomb's bound [N·s/m].
         friction: Coulomb coefficient.
@@ -62,7 +62,7 @@ class SimulationConfig:
     """The one step of the object.
 
     Attributes:
-        scaling: `published`, stiffness and time step as they are, in SI; `object`, the time step is the one in which
+        scaling: `published`, stiffness and time step as they are, in SI, or `object`, the time step in which
             `stopping_force` stops this object.
         stopping_force: of the scaling by object [N].
         time_step: of the published scaling [s].
@@ -80,7 +80,7 @@ class RelaxationConfig:
     """Desired forces as variables (after contact-invariant optimisation).
 
     Attributes:
-        enabled: desired forces as variables; without it the motion after one step is minimised directly.
+        enabled: desired forces as variables. Without it the motion after one step is minimised directly.
         desired: a desired force is a free `force`, a free `wrench` (the code's) or one in the friction `cone`.
         force_rate: step size of the desired forces [N].
     """
@@ -92,14 +92,14 @@ class RelaxationConfig:
 
 @dataclass(frozen=True)
 class PoseStepsConfig:
-    """How the pose is stepped; the defaults are the paper's, other choices those of grasping/src/cio.py.
+    """How the pose is stepped. The defaults are the paper's, other choices those of grasping/src/cio.py.
 
     Attributes:
         optimiser: `adamax`, or the code's `adam`.
         translation_share: step size of the base's position, by `pose_rate`.
         rotation_share: step size of the base's quaternion, by `pose_rate`.
         in_turns: a step moves the position of the base alone, then orientation and joints at what that led to.
-        within_limits: joints are put inside their limits after every move; else limits are a constraint alone.
+        within_limits: joints are put inside their limits after every move, else limits are a constraint alone.
     """
 
     optimiser: Literal["adamax", "adam"] = "adamax"
@@ -143,7 +143,7 @@ class ObjectiveWeights:
 
 @dataclass(frozen=True)
 class Graspd2022Config:
-    """Grasp'D as published (docs/method.md, §1); where paper and released code differ, a switch, the paper's first.
+    """Grasp'D as published (docs/method.md, §1). Where paper and released code differ, a switch, the paper's first.
 
     Attributes:
         initial: where the optimiser starts.
@@ -158,7 +158,7 @@ class Graspd2022Config:
         pose_rate: step size of the pose [m], [half rad] and [rad].
         beta2: decay rate of the gradient's infinity norm (Adamax) or of its squares (Adam).
         warm_up: first steps, in which the step sizes of pose and forces grow linearly from zero.
-        final_rate: share of the step sizes that is left at the end, faded along half a cosine; one keeps them.
+        final_rate: share of the step sizes that is left at the end, faded along half a cosine. One keeps them.
         keep: the `best` iterate on the true surface, or the `last`.
     """
 

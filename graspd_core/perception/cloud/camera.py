@@ -1,10 +1,8 @@
-"""Pinhole cameras, the lens distortion of CameraInfo, and depth images: where pixels look, and where points appear.
+"""Pinhole cameras, the lens distortion of CameraInfo, and depth images.
 
 Camera frames follow the optical convention: z forward, x right, y down. Distortion is that of OpenCV's camera model
 (Brown and Conrady), which ROS calls plumb_bob (k1, k2, p1, p2, k3) and rational_polynomial (k4, k5, k6 after those).
-
-Depth images become points here: their encodings, their bytes as a camera sends them, and the cloud they show. Where a
-camera's picture ends is told too: what reaches there may go on, and nobody saw that it does not.
+Depth images become points here. An object that reaches the border of a picture may go on beyond it.
 """
 
 from __future__ import annotations
@@ -54,7 +52,7 @@ _REMEDIES = {
     "bgr": "it is a colour picture: name the depth image's topic",
 }
 # CompressedImage of `compressedDepth`: the format of its inverse depth as int32, then the two numbers of its
-# quantisation as float32. A PNG begins with 8 bytes that are always the same; its sizes follow at byte 16.
+# quantisation as float32. A PNG begins with 8 bytes that are always the same. Its sizes follow at byte 16.
 _QUANTISED = struct.Struct("<iff")
 _PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
 _MOST_PIXELS = 2**26
@@ -62,13 +60,13 @@ _MOST_PIXELS = 2**26
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A camera; its image is that of an ideal lens unless it has a distortion.
+    """A camera with an ideal lens unless it has a distortion.
 
     Attributes:
         width, height: size of its image [pixels].
         fx, fy: focal lengths [pixels].
         cx, cy: where the optical axis meets the image [pixels].
-        distortion: k1, k2, p1, p2, k3, k4, k5, k6; those left out are zero.
+        distortion: k1, k2, p1, p2, k3, k4, k5, k6, zero if left out.
     """
 
     width: int
@@ -94,10 +92,9 @@ class PinholeCamera:
 def camera_from_calibration(
     width: int, height: int, matrix: _Numbers, distortion: _Numbers = (), model: str = "plumb_bob"
 ) -> PinholeCamera:
-    """The camera of a CameraInfo's `width`, `height`, `k` (row by row), `d` and `distortion_model`.
+    """Return the camera of a CameraInfo's `width`, `height`, `k` (row by row), `d` and `distortion_model`.
 
-    Raises:
-        CloudError: a model that is not known, more coefficients than it has, or no calibration at all.
+    Raises CloudError: an unknown model, more coefficients than it has, or no calibration at all.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -116,10 +113,7 @@ def camera_from_calibration(
 
 @lru_cache(maxsize=8)
 def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
-    """Directions of unit depth through each pixel, camera frame; NaN where no point could be seen through this lens.
-
-    Remembered for each camera, and therefore not writable.
-    """
+    """Return directions of unit depth through each pixel, camera frame, NaN where the lens shows nothing. Read-only."""
     column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     image = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
     rays = np.concatenate([undistort(image, camera.distortion), np.ones((*image.shape[:2], 1))], -1)
@@ -128,23 +122,23 @@ def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
 
 
 def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> _Places:
-    """Pixel coordinates (column, row) at which points in front of the camera appear; camera frame [m]."""
+    """Return the pixel coordinates (column, row) of points in front of the camera, camera frame [m]."""
     seen = distort(points[..., :2] / points[..., 2:], camera.distortion)
     return seen * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def distort(ideal: _Places, coefficients: _Numbers) -> _Places:
-    """Where the lens puts what an ideal one would put at `ideal`; both on the plane of unit depth."""
+    """Return the image of the lens for the image of an ideal one, both on the plane of unit depth."""
     return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
 
 
 def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
-    """The inverse of `distort` on the part of the image where it has one; NaN elsewhere."""
+    """Return the inverse of `distort` where there is one, NaN elsewhere."""
     if not any(coefficients):
         return np.array(seen, dtype=float)
     target = np.asarray(seen, dtype=float)
     ideal = target.copy()
-    # Beyond the lens's range the iteration runs off to infinity; such pixels are sorted out below.
+    # Beyond the lens's range the iteration runs off to infinity. Such pixels are sorted out below.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
             image, slope = _lens(ideal, coefficients)
@@ -163,7 +157,7 @@ def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
 
 
 def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "*batch 3"]]:
-    """Distorted positions, and a, b, d of their derivative, the symmetric matrix [[a, b], [b, d]]."""
+    """Return distorted positions, and a, b, d of their derivative, the symmetric matrix [[a, b], [b, d]]."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     x, y = ideal[..., 0], ideal[..., 1]
     s = x * x + y * y
@@ -183,7 +177,7 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
 def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Whether the points of an object lie on a side of the view's outline on which other points lie too.
+    """Tell whether an object touches a side of the view's outline that other points touch too.
 
     Directions within `width` [rad] of the hull of all directions are on the outline.
     """
@@ -221,7 +215,7 @@ def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], en
 
 
 def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, encoding: str) -> DepthImage:
-    """Depth along the optical axis [m], 0 where the image has none: zero, negative, NaN or infinite.
+    """Return the depth along the optical axis [m], 0 where the image has none: zero, negative, NaN or infinite.
 
     Raises:
         CloudError: an encoding that is no depth, or pixels that are not of its type.
@@ -237,10 +231,9 @@ def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, enco
 def depth_from_bytes(
     data: memoryview, *, width: int, height: int, step: int, encoding: str, is_bigendian: bool = False
 ) -> DepthImage:
-    """Depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
+    """Return depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
 
-    Raises:
-        CloudError: an encoding that is no depth, an empty image, or sizes that contradict each other.
+    Raises CloudError: an encoding that is no depth, an empty image, or sizes that contradict each other.
     """
     if width == 0 or height == 0:
         raise CloudError(f"the depth image is empty: width={width}, height={height}")
@@ -275,7 +268,7 @@ def depth_from_compressed(data: memoryview, told: str) -> DepthImage:
 
     Args:
         data: the message's bytes.
-        told: its `format`, as "16UC1; compressedDepth png".
+        told: its `format`, an encoding and "compressedDepth png".
 
     Raises:
         CloudError: a format that is no depth, or bytes that are not what it says.
@@ -316,10 +309,10 @@ def _png_begins(data: memoryview) -> int:
 def cloud_from_depth(
     depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
-    """What a camera saw, in its own frame or, where its pose is given, in that frame; pixels without depth give none.
+    """Return what a camera saw, in its own frame or, with its pose, in that frame. Pixels without depth give no point.
 
     Args:
-        depth: along the optical axis [m]; 0, NaN and infinite mean none.
+        depth: along the optical axis [m]. 0, NaN and infinite mean none.
         camera: of the same size as the image.
         T_frame_camera: pose of the camera (z forward, x right, y down).
 

@@ -1,8 +1,8 @@
 """Clouds from files: point formats, arrays, and depth images with the camera that took them.
 
-Files of ply and of pcd, text or binary, are not read by Open3D, which makes room for as many points as a header
-promises, and where the file ends before them hands out what happened to lie in that memory. Formats: "The PLY Polygon
-File Format" (Turk, 1994); "The PCD file format", version 0.7 (Point Cloud Library).
+Open3D does not read ply and pcd files here: it makes room for as many points as a header promises, and returns
+uninitialised memory for a file cut short. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file
+format", version 0.7 (Point Cloud Library).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MAX_UNPACKED_BYTES = 2**31
 
 @dataclass
 class _Element:
-    """One element of a ply header: how often it comes, its properties and their types; "" is the type of a list."""
+    """One element of a ply header: its count, its properties and their types, "" for a list."""
 
     name: str
     count: int
@@ -47,10 +47,10 @@ class _Element:
 
 
 def read_ply_points(path: Path) -> Points:
-    """The vertices of a ply file, text or binary in either byte order; NaN is kept.
+    """Read the vertices of a ply file, text or binary in either byte order.
 
-    Raises:
-        ValueError: it is no ply file, lacks x, y or z, is cut short, or has lists before its vertices end.
+    NaN is kept. Raises ValueError: it is no ply file, lacks x, y or z, is cut short, or has lists before its vertices
+    end.
     """
     # At the start of a line: a comment may hold the word.
     head, *more = re.split(rb"[\r\n]end_header", path.read_bytes(), maxsplit=1)
@@ -77,10 +77,10 @@ def read_ply_points(path: Path) -> Points:
 
 
 def read_pcd_points(path: Path) -> Points | None:
-    """The points of a pcd file, text or binary; NaN is kept. None where its data is compressed.
+    """Read the points of a pcd file, text or binary.
 
-    Raises:
-        ValueError: its header lacks what is needed, or it is cut short.
+    NaN is kept. Returns None for compressed data. Raises ValueError: its header lacks what is needed, or it is cut
+    short.
     """
     header: dict[str, list[str]] = {}
     data, at = path.read_bytes(), 0
@@ -129,7 +129,7 @@ def _refuse_false_sizes(packed: bytes, needed: int) -> None:
 
 
 def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
-    """Byte order, empty for text, and the elements in their order."""
+    """Return the byte order, empty for text, and the elements in their order."""
     order, elements = None, []
     for words in (line.split() for line in lines[1:]):
         match words:
@@ -176,7 +176,7 @@ def _numbers_of_text(body: bytes, start: int, rows: int, width: int) -> Float[np
 
 
 def is_cloud_file(path: str | Path) -> bool:
-    """Whether a path names a cloud by its ending; a ply counts when its header declares no faces."""
+    """Tell whether a path names a cloud by its ending. A ply counts when its header declares no faces."""
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
     if ending == "ply":
@@ -187,10 +187,10 @@ def is_cloud_file(path: str | Path) -> bool:
 def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[PointCloud, ...]:
     """Read what one or several cameras saw, in one frame. `viewpoint` says where the camera of points stood.
 
-    * ply, xyz; npy (n×3 or h×w×3): points [m], seen from the origin.
-    * pcd: points [m], seen from where its `VIEWPOINT` stands; which way that looked, the format leaves open.
+    * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
+    * pcd: points [m], seen from its `VIEWPOINT`. The format does not say which way the camera looked.
     * npz with `points`, and where known `viewpoint` [m] and `forward` (the direction of the optical axis).
-    * npz with `depth` (h×w; integers are millimetres, floats metres) and the camera's matrix `K` (3×3), where known
+    * npz with `depth` (h×w, integers in millimetres, floats in metres) and the camera's matrix `K` (3×3), where known
       also `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
     * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), where known `distortion`.
 
@@ -225,7 +225,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
 
 
 def recording_told(path: Path) -> str:
-    """What a recording is, and the command that reads it."""
+    """Return what a recording is, and the command that reads it."""
     if path.suffix.lower() != ".bag":
         return f"is a recording of ROS 2: graspd replay {path.name}"
     return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"
@@ -312,7 +312,7 @@ def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def read_numpy(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz, or that of an npy as `points`."""
+    """Read the arrays of an npz, or that of an npy as `points`."""
     try:
         # numpy leaves a spoilt file open when it is given the path.
         with path.open("rb") as file:
@@ -323,8 +323,8 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
             if unpacked > _MAX_UNPACKED_BYTES:
                 raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are taken")
             return {name: stored[name] for name in stored.files}
-    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals;
-    # one whose header promises more than there is as a lack of memory.
+    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals.
+    # A header that promises more than there is shows as a lack of memory.
     except Exception as error:
         told = _first_line(error)
         if "allow_pickle" in told:
@@ -342,7 +342,7 @@ def _ply_has_faces(path: Path) -> bool:
 
 
 def _pcd_viewpoint(path: Path) -> Vector:
-    """Where the sensor stood, by the header; the origin where it does not say."""
+    """Return the sensor's position by the header, by default the origin."""
     words = _pcd_header(path, b"VIEWPOINT")[:3] or [b"0"] * 3
     try:
         place = np.array([float(word) for word in words])
@@ -389,7 +389,7 @@ def _has_commas(path: Path) -> bool:
 def _read_open3d(path: Path) -> Points:
     import open3d as o3d
 
-    # Open3D prints its complaints and returns nothing; the error below says it once.
+    # Open3D prints its complaints and returns nothing. The error below says it once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
             cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)

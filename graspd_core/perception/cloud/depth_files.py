@@ -1,9 +1,9 @@
-"""A depth image from a file, and the camera that took it from another: what `--camera` takes.
+"""A depth image from a file, and its camera from another, as `--camera` takes it.
 
 The camera's file is JSON: `width`, `height`, and `K` (row by row), Open3D's `intrinsic_matrix` (column by column), or
-`fx fy cx cy`. Where known, `distortion` and `distortion_model` as in CameraInfo, `T_world_camera` (4×4) and
-`depth_unit`: metres per unit of the image, or m, cm, mm or um. A `depth_scale` is refused, since some write metres,
-some millimetres, and some the units of a metre.
+`fx fy cx cy`. Optional are `distortion` and `distortion_model` as in CameraInfo, `T_world_camera` (4×4) and
+`depth_unit`: metres per unit of the image, or m, cm, mm or um. A `depth_scale` is refused, because its unit differs
+from writer to writer.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class DepthCamera:
 
 
 def is_depth_image(path: str | Path) -> bool:
-    """Whether a path names an image by its ending, which needs a camera to become points."""
+    """Tell whether a path names an image by its ending, which needs a camera to become points."""
     return Path(path).suffix.lower().lstrip(".") in IMAGE_ENDINGS
 
 
@@ -114,7 +114,7 @@ def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
 
 
 def _matrix(told: Mapping[str, Any]) -> list[float]:
-    """The nine numbers of K, row by row."""
+    """Return the nine numbers of K, row by row."""
     if "K" in told:
         return _numbers(told["K"], None, "K").reshape(-1).tolist()
     if "intrinsic_matrix" in told:
@@ -127,7 +127,7 @@ def _matrix(told: Mapping[str, Any]) -> list[float]:
 
 
 def _unit(told: Any) -> float:
-    """Metres per unit, of a number or of text that begins with a unit."""
+    """Return metres per unit, from a number or from text that begins with a unit."""
     word = told.replace(",", " ").split()[:1] if isinstance(told, str) else None
     if word and word[0] in _UNITS:
         return _UNITS[word[0]]
@@ -153,7 +153,7 @@ def _keys(told: Mapping[str, Any]) -> str:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    """The pixels of an image as the file has them."""
+    """Read the pixels of an image as the file has them."""
     if not path.is_file():
         raise CloudError(f"{path}: no such depth image")
     if path.suffix.lower().lstrip(".") not in DEPTH_ENDINGS:
@@ -176,7 +176,7 @@ def _pixels(path: Path) -> np.ndarray:
 
 
 def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
-    """Depth [m], 0 where there is none. Raises CloudError: it is a picture, or its unit is hardly the one assumed."""
+    """Return depth [m], 0 for none. Raises CloudError: it is a picture, or its unit is hardly the assumed one."""
     if pixels.ndim != 2 or pixels.dtype.kind not in "iuf" or pixels.dtype.itemsize < 2:
         size = f"{' × '.join(map(str, pixels.shape))} of {pixels.dtype}"
         raise CloudError(f"{name}: holds {size}, a picture; depth has one number of 16 bits or more a pixel")

@@ -1,7 +1,7 @@
-"""What the cameras saw to be empty: the space before a seen surface, and beside the object's outline.
+"""Space that the cameras saw to be empty: before a seen surface, and beside the object's outline.
 
-Each view's own object points give a small depth image of it. A guessed point that falls before that surface, or beside
-the outline, contradicts the camera; one behind it is hidden, and may be.
+Each view's own object points give a small depth image of it. A guessed point before that surface, or beside the
+outline, contradicts the camera. A point behind it is hidden, and may be there.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class ViewDepth:
     Attributes:
         eye: where the camera stood [m].
         frame: columns right, down and forward.
-        low: the first cell's direction; `cell`: the width of one.
-        depth: along forward [m], of the surface or, beside the outline, of the nearest cell of it; infinite where
+        low: the first cell's direction. `cell`: the width of one.
+        depth: along forward [m], of the surface or, beside the outline, of the nearest cell of it, infinite where
             something stands before it.
-        nearest: the same, the smallest over the cell's neighbours; the depth of what stands before it.
+        nearest: the same, the smallest over the cell's neighbours, or the depth of what stands before it.
         beside: cells between this one and the outline, 0 within it and where something hides what is behind.
     """
 
@@ -59,10 +59,10 @@ class ViewDepth:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """All that is known of where the object is not.
+    """The space that the object does not fill.
 
     Attributes:
-        view_depths: one a camera; none where cameras are not known.
+        view_depths: one a camera, none for unknown cameras.
         standing: the object stands on a support that fills z < 0.
         lowest: height of the lowest points seen [m]: segmentation cuts the rest off with the support, so that outlines
             end too high by up to this.
@@ -78,11 +78,11 @@ class FreeSpace:
 
 
 def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = ()) -> tuple[ViewDepth, ...]:
-    """The depth images that views' points of the object make, of those that make any.
+    """Return the depth images of the views' points of the object. Views with too few points make none.
 
     Args:
         views: the object's points alone.
-        whole: all that each camera saw, in the same order; without it, nothing stood between cameras and object.
+        whole: all that each camera saw, in the same order. Without it, nothing stood between cameras and object.
     """
     around = whole or [None] * len(views)
     made = (_make_view_depth(view, all_seen) for view, all_seen in zip(views, around, strict=True))
@@ -90,9 +90,10 @@ def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = 
 
 
 def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | None:
-    """The depth image that a view's points make; holes of a few cells are missing pixels, not the object's.
+    """Return the depth image of a view's points.
 
-    None where they make none: fewer than five before the camera, or all in one line of sight.
+    Holes of a few cells are filled, since they are missing pixels. None for fewer than five points before the camera,
+    or for points all in one line of sight.
     """
     from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
     from scipy.spatial import KDTree
@@ -135,10 +136,10 @@ def _occluders(
     cell: float,
     depth: Float[np.ndarray, "x y"],
 ) -> Float[np.ndarray, "x y"]:
-    """Depth of what stands before the object in each cell [m]: what is behind it nobody saw. Infinite: nothing does."""
+    """Return the depth of what stands before the object in each cell [m], infinite for nothing."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
-    # Of all that a camera saw little is in the object's image; points that are not finite compare as false.
+    # Of all that a camera saw little is in the object's image. Points that are not finite compare as false.
     x, y, forward = ((whole.points - whole.viewpoint) @ frame).T
     high = low + cell * np.array(depth.shape)
     ahead = (forward > 1e-3) & (x >= low[0] * forward) & (x < high[0] * forward)
@@ -158,18 +159,18 @@ def _occluders(
 
 
 def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
-    """How deep points lie in the support, or in space that a camera saw to be empty [m]; 0: nothing is against them."""
+    """Return how deep points lie in the support, or in space that a camera saw to be empty [m]."""
     return _classify(free_space, points, None)[1]
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Whether guessed points lie on a seen surface, facing its camera; and, 0 to 1, how much speaks against them."""
+    """Return whether guessed points lie on a seen surface that faces its camera, and their contradiction, 0 to 1."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
 
 def on_seen(free_space: FreeSpace, points: Places) -> Bool[np.ndarray, "*batch"]:
-    """Whether points lie on, or a finger's breadth of noise off, a surface that was seen."""
+    """Return whether points lie on a seen surface, within one and a half of the tolerance."""
     found = np.zeros(points.shape[:-1], dtype=bool)
     for view_depth in free_space.view_depths:
         empty, behind = _look(view_depth, points)
@@ -179,7 +180,7 @@ def on_seen(free_space: FreeSpace, points: Places) -> Bool[np.ndarray, "*batch"]
 
 
 def facing(free_space: FreeSpace, points: Points, normals: Points) -> Float[np.ndarray, "n"]:
-    """Cosine between normals and the way to the camera that they face most."""
+    """Return the cosine between normals and the direction to the camera that they face most."""
     most = np.full(len(points), -1.0)
     for view_depth in free_space.view_depths:
         way = view_depth.eye - points
@@ -204,7 +205,7 @@ def _classify(
 
 
 def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
-    """How deep points lie in empty space [m], and how far behind the seen surface (infinite beside the outline)."""
+    """Return how deep points lie in empty space, and how far behind the seen surface [m], infinite beside it."""
     local = (points - view_depth.eye) @ view_depth.frame
     forward = np.maximum(local[..., 2], 1e-6)
     place = (local[..., :2] / forward[..., None] - view_depth.low) / view_depth.cell
@@ -219,7 +220,7 @@ def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
 
 
 def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:
-    """Columns: right, down and forward, towards the middle of the points; any, from there itself."""
+    """Return a camera frame that looks at the middle of the points. Columns: right, down and forward."""
     forward = view.points.mean(0) - view.viewpoint
     length = float(np.linalg.norm(forward))
     forward = forward / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])

@@ -1,7 +1,7 @@
 """Meshes that are views: points of one camera with faces between neighbouring pixels, as camera viewers write them.
 
-Such a sheet is open, all of it faces the camera, and the triangles are halves of pixels. Taken for a solid, a table and
-what stands on it would be one thing.
+Such a sheet is open, all of it faces the camera, and its triangles are halves of pixels. As a solid, a table and the
+objects on it would be one body.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _MOST_FACES, _STEPS = 20_000, 300
 def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
     """Return the view that a mesh is, seen from the origin, or None if the mesh is not one camera's sheet.
 
-    Raises:
-        MeshError: the mesh is a camera's sheet in another frame than the camera's, which does not say where it stood.
+    Raises MeshError: the mesh is a camera's sheet in another frame than the camera's, which does not say where it
+    stood.
     """
     if len(mesh.vertices) < MIN_VERTICES or len(mesh.faces) < MIN_VERTICES or not np.isfinite(mesh.vertices).all():
         return None
@@ -54,7 +54,7 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
 
 
 def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) -> bool:
-    """Whether all faces turn the same side to a place, and lie ahead of it."""
+    """Tell whether all faces turn the same side to a place, and lie ahead of it."""
     way = corners.mean(1) - eye
     distance = np.linalg.norm(way, axis=1)
     if not distance.min() > 0:
@@ -67,7 +67,7 @@ def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) ->
 
 
 def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
-    """Whether the faces are halves of pixels of a camera at the origin that looks along an axis."""
+    """Tell whether the faces are halves of pixels of a camera at the origin that looks along an axis."""
     for axis in range(3):
         depth = corners[..., axis]
         if np.abs(depth).min() < 1e-9:
@@ -82,7 +82,7 @@ def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
 
 
 def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vector | None:
-    """A place outside that all faces turn the same side to; None where none is found."""
+    """Return a place outside that all faces turn the same side to, None if none is found."""
     centre, middle = corners.mean(1), corners.mean((0, 1))
     size = float(np.ptp(centre, axis=0).max())
     for side in (1.0, -1.0):
@@ -96,14 +96,13 @@ def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vecto
 
 
 def _edges(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Each edge once, and how many faces share it."""
     edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     keys, count = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
     return np.column_stack([keys // len(mesh.vertices), keys % len(mesh.vertices)]), count
 
 
 def _borders(mesh: TriangleMesh) -> int:
-    """How many closed lines the surface ends at."""
+    """Return the number of closed lines that the surface ends at."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

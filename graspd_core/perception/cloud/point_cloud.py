@@ -1,4 +1,4 @@
-"""Point clouds [m]: what one camera saw, moved to other frames and cleaned, and the points in a PointCloud2's bytes."""
+"""Point clouds [m] of one camera: moved to other frames, cleaned, and read from a PointCloud2's bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Eyes = Float[np.ndarray, "views 3"]
 MIN_POINTS = 50
 # Points this many times the cloud's size away from its middle are no part of it.
 MAX_DISTANCE_IN_SIZES = 1e3
-# No camera measures what is this near to itself [m]; drivers that have no depth send that.
+# No camera measures what is this near to itself [m]. Drivers that have no depth send that.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
 
 
@@ -29,9 +29,9 @@ class PointCloud:
     """Points that one camera saw. Several views of a scene are several of these, in one frame.
 
     Attributes:
-        points: positions [m]; may hold NaN until cleaned.
+        points: positions [m], which may hold NaN until cleaned.
         viewpoint: where the camera stood, in the same frame [m].
-        forward: unit direction of its optical axis, in the same frame; None where it is not known.
+        forward: unit direction of its optical axis, in the same frame, None if unknown.
         posed: whether the points tell that they were seen from there, as those of a depth image do.
     """
 
@@ -41,12 +41,12 @@ class PointCloud:
     posed: bool = False
 
     def thinned(self, size: float) -> PointCloud:
-        """The first point in every voxel of side `size` [m]."""
+        """Keep the first point in every voxel of side `size` [m]."""
         return replace(self, points=self.points[np.unique(voxel_keys(self.points, size), return_index=True)[1]])
 
 
 def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> PointCloud:
-    """A cloud of frame b, and where its camera stood, in frame a."""
+    """Return a cloud of frame b, with its camera's position, in frame a."""
     rotation, position = T_a_b[:3, :3], T_a_b[:3, 3]
     points = cloud.points @ rotation.T
     points += position
@@ -55,7 +55,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 
 def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
-    """Which points were measured: finite, and not what drivers fill gaps with: zeros, or the camera's place."""
+    """Return which points were measured: finite, and neither zero nor at the camera, as drivers fill gaps."""
     zero = near = finite = np.ones(len(points), dtype=bool)
     # Column by column: NumPy takes ten times as long for what all of a short row is.
     for column, place in zip(points.T, viewpoint, strict=True):
@@ -66,7 +66,7 @@ def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
 
 
 def longest_side(points: Float[np.ndarray, "n k"]) -> float:
-    """Of the bounding box along the axes; column by column, as above."""
+    """Return the longest side of the bounding box along the axes."""
     return max(float(np.ptp(column)) for column in points.T)
 
 
@@ -81,10 +81,10 @@ def convex_hull(points: Float[np.ndarray, "n k"]) -> Any:
 
 
 def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
-    """The unit axis along which points spread the least, of each symmetric matrix of squared spreads.
+    """Return the unit axis of least spread of each symmetric matrix of squared spreads, any axis if all are alike.
 
-    In closed form (the eigenvalues are roots of a cubic, by its cosines), in a quarter of `eigh`'s time for thousands.
-    Any axis where all are alike.
+    The closed form (the eigenvalues are roots of a cubic, by its cosines) takes a quarter of `eigh`'s time for
+    thousands.
     """
     xx, yy, zz = (spreads[:, i, i] for i in range(3))
     xy, xz, yz = spreads[:, 0, 1], spreads[:, 0, 2], spreads[:, 1, 2]
@@ -117,8 +117,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
 def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
     """Drop points that are not finite, thin to an even density, drop outliers.
 
-    Raises:
-        CloudError: empty, all NaN, or fewer than 50 points left.
+    Raises CloudError: empty, all NaN, or fewer than 50 points left.
     """
     import open3d as o3d
 
@@ -172,7 +171,7 @@ class CloudLayout:
     """A cloud as a driver sends it.
 
     Attributes:
-        width, height: points in a row, and rows; height 1 where the cloud is not organised as an image.
+        width, height: points in a row, and rows. Height 1: the cloud is not organised as an image.
         point_step, row_step: bytes from one point, or row, to the next.
         is_bigendian: byte order.
         fields: byte offset within a point and number of the type (`FIELD_TYPES`) of each field.
@@ -189,18 +188,16 @@ class CloudLayout:
 
 
 def points_from_layout(layout: CloudLayout) -> Points:
-    """The finite points of a cloud, in row order, in the cloud's own frame and unit.
+    """Return the finite points of a cloud, in row order, in the cloud's own frame and unit.
 
-    Organised or not, padded points and rows, float32 or float64, either byte order, x, y and z at any offset.
-
-    Raises:
-        CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
+    Organised or not, padded points and rows, float32 or float64, either byte order, x, y and z at any offset. Raises
+    CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
     """
     return finite_points(organised_points(layout))
 
 
 def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Points:
-    """The finite points of an organised cloud, in row order. Raises CloudError: there is none."""
+    """Return the finite points of an organised cloud, in row order. Raises CloudError: there is none."""
     points = pixels.reshape(-1, 3)
     # Column by column: three times as fast as `isfinite(points).all(1)`.
     finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
@@ -211,7 +208,7 @@ def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Points:
 
 
 def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]:
-    """Every point of a cloud in its place, NaN and infinite ones too. Raises CloudError as `points_from_layout`."""
+    """Return every point of a cloud in its place, NaN and infinite too. Raises CloudError as `points_from_layout`."""
     width, height = layout.width, layout.height
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
@@ -242,7 +239,7 @@ def _check_sizes(layout: CloudLayout) -> None:
 
 
 def _place_of(layout: CloudLayout, name: str) -> tuple[np.dtype, int]:
-    """Type and byte offset of a coordinate within a point."""
+    """Return type and byte offset of a coordinate within a point."""
     if name not in layout.fields:
         raise CloudError(f"the cloud has no field {name!r}; it has: {', '.join(layout.fields) or 'none'}")
     offset, number = layout.fields[name]

@@ -1,6 +1,6 @@
 """Scenes as cameras saw them, cropped to the workspace and thinned to one point a voxel.
 
-All decisions about a scene are taken on the thinned points; the full points follow the voxel they lie in.
+All decisions about a scene are taken on the thinned points. The full points follow their voxels.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
 
-# Which voxels of a scene, and the thing that each is part of, numbered from the largest; -1: none.
+# A mask of a scene's voxels. The object that each is part of, numbered from the largest, -1 for none.
 Mask = Bool[np.ndarray, "voxels"]
 Labels = Int[np.ndarray, "voxels"]
 
@@ -52,20 +52,19 @@ class VoxelScene:
 
     @property
     def weight(self) -> Float[np.ndarray, "voxels"]:
-        """Points in each voxel, made independent of how far away the cameras were [m²]."""
+        """Points in each voxel, made independent of the distance of the cameras [m²]."""
         return self.count * self.mean_distance**2
 
     def of_view(self, view: int) -> slice:
-        """Where that view's points lie among `points`."""
+        """Return the slice of a view's points in `points`."""
         start = sum(len(rows) for rows in self.rows[:view])
         return slice(start, start + len(self.rows[view]))
 
 
 def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) -> VoxelScene:
-    """Crop and thin.
+    """Crop all views to the workspace and thin them to one mean point a voxel.
 
-    Raises:
-        CloudError: no view, no point, none measured, too few inside the workspace, or cameras too far apart.
+    Raises CloudError: no view, no point, none measured, too few inside the workspace, or cameras too far apart.
     """
     given = sum(len(view.points) for view in views)
     if given == 0:
@@ -98,7 +97,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
 def _inside(
     view: PointCloud, stride: int, settings: SegmentationConfig
 ) -> tuple[Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], int]:
-    """Every so many-th row of a view if inside the workspace, positions, distances, and how many were measured."""
+    """Return rows, positions and distances of every `stride`-th point inside the workspace, and the number measured."""
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))
     points = view.points[rows].astype(float)
     distance = np.linalg.norm(points - view.viewpoint, axis=1)
@@ -111,7 +110,7 @@ def _inside(
 
 
 def _refuse_far_apart(views: Sequence[PointCloud], rows: Sequence[Int[np.ndarray, "_"]], farthest: float) -> None:
-    """Cameras of which one sees nothing that the first could see are not of one scene, or not in one frame."""
+    """Raise CloudError for cameras too far apart to see anything in common."""
     first, *others = [k for k, kept in enumerate(rows) if len(kept)] or [0]
     for k in others:
         apart = float(np.linalg.norm(views[k].viewpoint - views[first].viewpoint))
@@ -129,7 +128,7 @@ def _unmeasured(views: Sequence[PointCloud], given: int) -> str:
 
 
 def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
-    """What unit the points would be near the camera in, if they are not in metres."""
+    """Return the unit in which the points would be near the camera, as a hint for an error."""
     some = np.concatenate([view.points[:: 1 + len(view.points) // 10_000] - view.viewpoint for view in views])
     away = float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))
     for name, per_metre in UNITS_PER_METRE:
@@ -141,7 +140,7 @@ def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
 
 
 def _voxels(points: Points, size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
-    """Which voxel each point lies in, counted without gaps, and the side it came to."""
+    """Return the voxel of each point, counted without gaps, and the resulting side."""
     # Column by column: NumPy takes seven times as long for the least of short rows.
     low = np.array([column.min() for column in points.T])
     # So many cells an axis have room in one number.

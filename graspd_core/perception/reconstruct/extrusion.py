@@ -1,4 +1,4 @@
-"""What joins an object to the support it stands on: walls beneath the outline seen from above, skirt and base."""
+"""Surfaces between an object and its support: walls beneath the outline seen from above, skirt and base."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothin
 OUTLINE_STEP_M = 0.008
 # How level the surface must be there, and how much it must face a camera [cosines].
 MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
-# Of the object's lowest points, the share that must be of walls for it to have a base; how steep [cosine] those are.
+# Of the object's lowest points, the share that must be of walls for it to have a base. Their steepness [cosine].
 MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
 # The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
 MAX_FOOT_HEIGHT_M = 0.015
@@ -24,10 +24,9 @@ MIN_ENCLOSED_SHARE = 0.6
 
 
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Walls from the outline of what was seen from above, down to the support.
+    """Return walls from the outline of what was seen from above, down to the support.
 
-    Only beneath outlines that are proven: outwards of them the cameras saw nothing; and only walls that they do not
-    contradict.
+    An outline counts only if the cameras saw nothing beyond it. Walls that they contradict are left out.
     """
     from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
     from scipy.spatial import KDTree
@@ -47,7 +46,7 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     height = maximum_filter(top, 3)[rim]
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
     _, nearest = KDTree(seen.points).query(place)
-    # A surface that turns away from the camera at the outline goes on behind it; one that is level there ends.
+    # A surface that turns away from the camera at the outline goes on behind it. One that is level there ends.
     level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
         facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
     )
@@ -67,12 +66,12 @@ def _contradicted(
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the surfels, and where the object stands what joins it to the support."""
+    """Return the surfels, with their connection to the support if the object stands."""
     return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """What joins walls that end just above the support to it, and the base between them."""
+    """Return the walls between the lowest seen points and the support, and the base between them."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
@@ -92,10 +91,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Walls beneath the outlines of what was seen high above the support, where something hides what it rests on.
-
-    The outline of all goes down to the support, and what is high above the rest, as a bottle's cap, to the rest.
-    """
+    """Return walls beneath an object seen only high above the support, and beneath parts high above the rest."""
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
@@ -109,7 +105,7 @@ def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 def _walls(
     surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
 ) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
-    """Walls beneath the outline seen from above, down to the height `bottom` [m], and where they stand."""
+    """Return walls beneath the outline seen from above, down to the height `bottom` [m], and their feet."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(surfels.points[:, :2])
@@ -132,7 +128,7 @@ def _walls(
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
-    """The support within the feet's outline, facing down, where it is hidden."""
+    """Return the support within the feet's outline, facing down, where it is hidden."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(feet)

@@ -1,4 +1,4 @@
-"""An object's hidden side: where one more view would show most of it, and what other shapes it may have.
+"""An object's hidden side: the next best view of it, and its other possible shapes.
 
 Other shapes are guessed by the rules that the reconstruction did not choose.
 """
@@ -37,18 +37,18 @@ _SAME_M = 5e-4
 
 
 def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np.ndarray, "4 4"] | None:
-    """`T_views_camera` [m] (z forward, y down) of the view, as far from the object as the first, that shows most.
+    """Return `T_views_camera` [m] (z forward, y down) of the further view that shows most of the hidden side.
 
-    Of places around the object, above its support where it stands on one: the one that sees most of the surface that
-    is farther from all seen points than the cameras' precision.
+    Candidates lie around the object, above its support, as far away as the first camera. The surface counts as hidden
+    if it is farther from all seen points than the cameras' precision.
 
     Args:
         evidence: what was seen.
         mesh: the object as reconstructed, in the frame of the views [m].
-        shift: added to where the camera is [m].
+        shift: added to the camera's position [m].
 
     Returns:
-        None where no place shows anything new, or nobody knows where the cameras were.
+        None if no candidate shows anything new, or if no camera position is known.
     """
     from scipy.spatial import KDTree
 
@@ -89,15 +89,15 @@ def _looking(eye: Vector, forward: Vector, up: Vector) -> Float[np.ndarray, "4 4
 
 
 def other_rules(evidence: Evidence) -> tuple[str, ...]:
-    """The rules that the reconstruction did not take, the quickest first; none where nothing was hidden."""
+    """Return the rules that the reconstruction did not take, the quickest first, none if nothing was hidden."""
     # The later in `RULES`, the less is looked for in what was seen.
     return tuple(rule for rule in reversed(RULES) if rule != evidence.chosen) if evidence.hidden else ()
 
 
 def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMesh | None:
-    """The object with its hidden side guessed by a rule, in the frame of the views [m].
+    """Return the object with its hidden side guessed by a rule, in the frame of the views [m].
 
-    None where the rule says nothing, no closed surface fits what it says, or the surface is that of `than`.
+    None if the rule makes no guess, no closed surface fits it, or the surface is that of `than`.
     """
     step = max(evidence.step, _STEP_M)
     seen = thin(evidence.seen, step)

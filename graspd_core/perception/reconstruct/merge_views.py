@@ -1,11 +1,10 @@
 """Views become one set of oriented points: several views, or a cloud that shows an object from all round.
 
-Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours, and its
-normal turned to the camera that saw it. Both keep thin walls apart, which no orientation by neighbourhood does.
+Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours. Its
+normal is turned to the camera that saw it. Both keep thin walls apart, which orientation by neighbours does not.
 
-Points and not truncated signed distances (Curless and Levoy 1996), because those wear thin walls and edges away: of 15
-rendered views, Open3D's on a grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of
-0.92, in 0.30 s instead of 0.53.
+Truncated signed distances (Curless and Levoy 1996) wear thin walls and edges away. On 15 rendered views, Open3D's on a
+grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of 0.92.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
 MIN_VIEW_COSINE = 0.1
-# A surface seen from one side rises by less than this many cells over one cell on most lines of sight; with more than
+# A surface seen from one side rises by less than this many cells over one cell on most lines of sight. With more than
 # this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
 # looked it takes more: from above, a third of the lines may run along the sides of a cup.
 MAX_RISE_CELLS = 4.0
@@ -51,22 +50,22 @@ class Surfels:
 
 
 def join(*parts: Surfels) -> Surfels:
-    """All of them."""
+    """Return the surfels of all parts."""
     return Surfels(np.concatenate([p.points for p in parts]), np.concatenate([p.normals for p in parts]))
 
 
 def take(surfels: Surfels, kept: np.ndarray) -> Surfels:
-    """Those that a mask or an index names."""
+    """Return the surfels that a mask or an index chooses."""
     return Surfels(surfels.points[kept], surfels.normals[kept])
 
 
 def nothing() -> Surfels:
-    """No points."""
+    """Return no surfels."""
     return Surfels(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def point_step(views: Sequence[PointCloud]) -> float:
-    """The spacing that all views together are thinned to [m]: an eightieth of the object's diagonal, 1 mm at least."""
+    """Return the spacing that views are thinned to [m]: an eightieth of the object's diagonal, 1 mm at least."""
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [2, 98], axis=0)
     return max(float(np.linalg.norm(high - low)) / 80, 1e-3)
@@ -75,10 +74,10 @@ def point_step(views: Sequence[PointCloud]) -> float:
 def merge_views(
     views: Sequence[PointCloud], step: float | None = None, settings: ReconstructionConfig | None = None
 ) -> Surfels:
-    """The oriented points of all views, strays dropped, noise smoothed, one per cube of side `step` and side of it.
+    """Return the oriented points of all views: strays dropped, noise smoothed, one per cube of side `step` and side of
+    it.
 
-    Raises:
-        CloudError: fewer than 50 points are left.
+    Raises CloudError: fewer than 50 points are left.
     """
     step, settings = point_step(views) if step is None else step, settings or ReconstructionConfig()
     together = join(*(orient_view(view, step, settings) for view in views))
@@ -91,7 +90,7 @@ def merge_views(
 
 
 def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -> Surfels:
-    """One view's surface points, about `step` [m] apart, with normals towards its camera."""
+    """Return one view's surface points, about `step` [m] apart, with normals towards its camera."""
     from scipy.spatial import KDTree
 
     points = _thin_by_sight(view, step)
@@ -120,7 +119,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 
 def thin(surfels: Surfels, step: float) -> Surfels:
-    """The mean of the points in each cube of side `step` [m] that face the same way, to the nearest of six."""
+    """Return the mean of the points in each cube of side `step` [m] that face the same of six directions."""
     if len(surfels.points) == 0:
         return surfels
     facing = np.abs(surfels.normals).argmax(1)
@@ -134,7 +133,7 @@ def thin(surfels: Surfels, step: float) -> Surfels:
 
 
 def _thin_by_sight(view: PointCloud, step: float) -> Points:
-    """One point for each small cone of sight: the one of middle distance, so that strays do not count."""
+    """Return one point for each small cone of sight: that of median distance, so that strays do not count."""
     ray = view.points - view.viewpoint
     distance = np.linalg.norm(ray, axis=1)
     width = step / float(np.median(distance))
@@ -149,11 +148,11 @@ def _thin_by_sight(view: PointCloud, step: float) -> Points:
 
 
 def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
-    """Whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it.
+    """Tell whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it.
 
     Args:
         view: the object's points.
-        axis_known: it is said which way the camera looked.
+        axis_known: whether the camera's direction is known.
     """
     from scipy.spatial import KDTree
 
@@ -173,10 +172,10 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:
-    """Points of an all-round cloud, about `step` [m] apart, with normals to the outside.
+    """Return points of an all-round cloud, about `step` [m] apart, with normals to the outside.
 
-    Which side is outside is seen from all directions: what is nearest in each cell of an image faces that direction.
-    Both sides of a thin wall are so told apart, which no agreement with neighbours does.
+    The outside is seen from many directions: the nearest point in each cell of an image faces that direction. This
+    distinguishes both sides of a thin wall, which agreement with neighbours does not.
     """
     from scipy.spatial import KDTree
 
@@ -201,7 +200,7 @@ def _least_axes_of(groups: Float[np.ndarray, "n k 3"]) -> Points:
 
 
 def _seen_from(points: Points) -> Points:
-    """The sum of the directions, spread evenly, that each point is seen from, nearest in a cell of an image."""
+    """Return the sum of the evenly spread directions from which each point is nearest in a cell of an image."""
     from scipy.spatial import KDTree
 
     width = 2 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
@@ -220,12 +219,12 @@ def _seen_from(points: Points) -> Points:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was seen of an object: other guesses of what was hidden are made of it.
+    """The seen part of an object, from which other guesses of the hidden part are made.
 
     Attributes:
         seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
         rotation, origin: of that frame in the views' [m].
-        chosen: the rule that the reconstruction took; empty where none applied.
+        chosen: the rule that the reconstruction took, empty for none.
         settings: of the reconstruction.
         hidden: whether a good part of the surface was.
         doubts: why the views may not show what was there, so that no grasp counts as verified.

@@ -1,12 +1,11 @@
-"""Oriented points to a closed surface: screened Poisson (Kazhdan and Hoppe 2013), cut back to what the cameras allow.
+"""Oriented points to a closed surface: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
 
 Where points are missing Poisson's surface balloons or runs off. It is sampled on a grid, cut by the space that was seen
-to be empty and by the support, and surfaced again, which closes it whatever it was.
+to be empty and by the support, and surfaced again, which closes it.
 
-The field is found on a regular grid, by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive one. On grids of
-few nodes the first takes a sixth of the second's time, and spares finding the distance to a mesh. As in screened
-Poisson, the field is then drawn to zero at the points. Points that are of no surface, as noise, are so fitted too:
-whether they are of one is asked before.
+The field is found on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive one. On grids of
+few nodes the first takes a sixth of the time. As in screened Poisson, the field is then drawn to zero at the points.
+This fits noise too, so the points are first checked to be of one surface.
 """
 
 from __future__ import annotations
@@ -57,12 +56,12 @@ Field = Callable[[Surfels, Nodes, float], Grid]
 
 
 def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
-    """Width of the cells that a surface through these points is closed on, at least `least` [m]."""
+    """Return the width of the cells that a surface through these points is closed on, at least `least` [m]."""
     return max(float(np.ptp(surfels.points, axis=0).max()) / cells, least)
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
-    """The two sides of walls too thin for the grid moved apart, for they would cancel; by a millimetre or two."""
+    """Move the two sides of walls too thin for the grid apart by a millimetre or two, for they would cancel."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
@@ -84,10 +83,7 @@ def poisson_field(surfels: Surfels, nodes: Nodes, cell: float, finest: float) ->
     """Return the signed distance [m] to Open3D's Poisson surface at the nodes of a grid of cubes, `cell` apart [m].
 
     The surface is open where it leaves the cube of 1.2 times the points' size. Its finest cells are about as wide as
-    `finest` [m]: its grid halves from level to level.
-
-    Raises:
-        CloudError: no surface fits the points.
+    `finest` [m]: its grid halves from level to level. Raises CloudError: no surface fits the points.
     """
     import open3d as o3d
 
@@ -104,7 +100,7 @@ def poisson_field(surfels: Surfels, nodes: Nodes, cell: float, finest: float) ->
 
 
 def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: float) -> TriangleMesh:
-    """The closed surface of what a surface fitted to the surfels encloses, less what is known to be empty.
+    """Return the closed surface of what a surface fitted to the surfels encloses, without the known empty space.
 
     Args:
         field: signed distance near that surface, at the nodes of a grid.
@@ -131,16 +127,13 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Points of the support, at z = 0, beneath level surface that is nearly as low as anything seen: a cup's floor.
-
-    The hull of what was seen ends at that floor, and would cut away all but a sheet thinner than the grid's cells.
-    """
+    """Return points of the support beneath a cup's low floor, where the hull of the seen points would be too thin."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 
 
 def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
-    """The zero surface of a field on a grid of cubes, outwards where it grows."""
+    """Return the zero surface of a field on a grid of cubes, facing where the field grows."""
     import igl
 
     cell = float(axes[0][1] - axes[0][0])
@@ -158,10 +151,10 @@ def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
 
 
 def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
-    """Signed distance at the nodes near the surface, and a signed `BAND_CELLS` of cells elsewhere.
+    """Return signed distance at the nodes near the surface, and a signed `BAND_CELLS` of cells elsewhere.
 
-    The surface has no border within the grid, so it parts it into regions; those away from it take the side that most
-    of their nodes next to the surface are on, by the nearest face's normal.
+    The surface has no border within the grid, so it parts it into regions. A region away from it takes the side of most
+    of its nodes next to the surface, by the nearest face's normal.
     """
     from scipy.ndimage import label
 
@@ -180,7 +173,7 @@ def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
 
 
 def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarray, "x y z"]:
-    """Nodes within some two cells of the surface, whose faces are smaller than a cell or two."""
+    """Return the nodes within some two cells of the surface, whose faces are smaller than a cell or two."""
     from scipy.ndimage import binary_dilation
 
     points = np.concatenate([surface.vertices, surface.vertices[surface.faces].mean(1)])
@@ -192,7 +185,7 @@ def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarra
 
 
 def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) -> Float[np.ndarray, "m"]:
-    """How far nodes lie outside the convex hull of points [m], in which any surface through them may close."""
+    """Return how far nodes lie outside the convex hull of points [m], in which any surface through them may close."""
     hull = convex_hull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
     if hull is None:
         return np.zeros(len(nodes))
@@ -202,7 +195,7 @@ def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) 
 
 
 def _one_solid(value: Grid, cell: float) -> Grid:
-    """The largest part alone, without bubbles, free of the grid's border."""
+    """Keep the largest part alone, without bubbles, free of the grid's border."""
     from scipy.ndimage import label
 
     border = np.ones(value.shape, dtype=bool)
@@ -219,7 +212,7 @@ def _one_solid(value: Grid, cell: float) -> Grid:
 
 
 def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
-    """Signed distance near the points' surface [m] at the nodes of a grid of cubes, outside positive, at most a band.
+    """Return the signed distance near the points' surface [m] at the nodes of a grid of cubes, limited to a band.
 
     Args:
         surfels: all within the grid.
@@ -256,7 +249,9 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     if not slope > 0:
         raise CloudError(f"cloud: the normals of its {len(surfels.points)} points are of no surface")
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
-    _refuse_far(there)
+    near = float((np.abs(there) < 1.0).mean())
+    if near < _MIN_NEAR:
+        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
     for _ in range(_STEPS):
         push, pushed = at_points(spread(-weights * there) * blur / (square + _REACH**-2))
         # As far along it as leaves least at the points.
@@ -266,14 +261,8 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     return cell * np.clip(field.reshape(shape)[inner], -BAND_CELLS, BAND_CELLS)
 
 
-def _refuse_far(there: Float[np.ndarray, "points"]) -> None:
-    near = float((np.abs(there) < 1.0).mean())
-    if near < _MIN_NEAR:
-        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
-
-
 def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> Any:
-    """The matrix, points by nodes, that reads a field at places given in cells."""
+    """Return the matrix, points by nodes, that reads a field at places given in cells."""
     from scipy.sparse import csr_array
 
     corners = np.array(list(product((0, 1), repeat=3)))

@@ -1,8 +1,8 @@
-"""From one or more views of an object to a closed mesh, saying how it was made and how far each part was seen.
+"""A closed mesh from one or more views of an object, with its method and the confidence of each part.
 
-What was seen is surfaced by screened Poisson with normals towards each view's camera: on a grid, and by Open3D where
-that does not fit. What was not is completed first, by the symmetry, revolution or extrusion that the evidence favours;
-what the cameras saw to be empty is cut away.
+The seen part is surfaced by screened Poisson with normals towards each camera: on a grid, or by Open3D if that does not
+fit. The hidden part is completed first, by the symmetry, revolution or extrusion that the evidence favours. Space that
+the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Reconstruction:
         confidence: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
         method: "poisson", and what completed it, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
-        evidence: what else the hidden side may be.
+        evidence: what was seen, for other guesses of the hidden side.
     """
 
     mesh: TriangleMesh
@@ -79,14 +79,14 @@ def reconstruct(
     settings: ReconstructionConfig | None = None,
     whole: Sequence[PointCloud] = (),
 ) -> Reconstruction:
-    """The closed surface of the object that the views show.
+    """Return the closed surface of the object that the views show.
 
     Args:
-        views: the object's points alone, of each camera, all in one frame; NaN and stray points are dropped. A single
-            cloud that shows it from all round may stand for many views.
+        views: the object's points alone, of each camera, all in one frame. NaN and stray points are dropped. A single
+            cloud that shows the object from all round may stand for many views.
         support: what the object stands on, in the same frame.
         settings: precision of the cameras, and sizes.
-        whole: all that the same cameras saw: what stands before the object hides what is behind it.
+        whole: all that the same cameras saw. What stands before the object hides what is behind it.
 
     Raises:
         CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
@@ -130,7 +130,7 @@ def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vect
 def _closed(
     seen: Surfels, guess: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig
 ) -> TriangleMesh:
-    """The closed surface by Poisson on a grid. By Open3D's if `settings` ask for it, or if the grid's does not fit."""
+    """Close the surface by Poisson on a grid, or by Open3D's if `settings` ask for it or the grid's does not fit."""
     adaptive = partial(poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:
@@ -148,7 +148,7 @@ def closed_mesh(
     field: Field,
     cells: int = GRID_CELLS,
 ) -> TriangleMesh:
-    """The closed surface through what was seen and what is guessed, standing on the support where there is one.
+    """Return the closed surface through the seen and the guessed surfels, down to the support if there is one.
 
     Args:
         field: how a surface is fitted to points.
@@ -164,7 +164,7 @@ def closed_mesh(
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
-    """Finite points, near where most are, of the views that have enough of them for a surface."""
+    """Return the finite points near where most are, of the views that have enough of them for a surface."""
     from scipy.spatial import KDTree
 
     if len(views) == 0:
@@ -197,7 +197,7 @@ def _some(view: PointCloud, most: int) -> Points:
 
 
 def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np.ndarray, "3 3"], Vector]:
-    """Axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
+    """Return axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
     points = np.concatenate([view.points for view in views])
     centre = points.mean(0)
     view = views[0].viewpoint - centre
@@ -216,7 +216,7 @@ def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np
 
 
 def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig) -> TriangleMesh:
-    """Few faces, closed, and through the points that were seen."""
+    """Simplify and check the mesh. Raises CloudError: it is not closed, or far from the seen points."""
     try:
         mesh = _fewer(check_mesh(mesh, "reconstruction")[0], settings.max_faces)
     except MeshError as error:
@@ -230,7 +230,7 @@ def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig)
 
 
 def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
-    """At most so many faces; the slower of two simplifiers where the quicker one tears the surface each time."""
+    """Reduce a mesh to at most `most` faces. A slower simplifier is used if the quick one tears the surface."""
     import open3d as o3d
 
     for aggressiveness in (7, 5, 3):
@@ -262,9 +262,9 @@ def _is_guessed(
     standing: bool,
     settings: ReconstructionConfig,
 ) -> bool:
-    """Whether a good part of a surface was not seen; what stands on the support at z = 0 is known."""
+    """Tell whether a good part of a surface was not seen. A foot on the support at z = 0 counts as known."""
     if views > 1:
-        # Whatever a rule filled; and normals of what was seen may cancel though much was not, as of a bottle's sides.
+        # Whatever a rule filled. The normals of the seen part may cancel though much is hidden, as of a bottle's sides.
         return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
     # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
     area = _open_area(mesh, standing)[0]
@@ -273,10 +273,10 @@ def _is_guessed(
 
 
 def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: float) -> float:
-    """Share of a surface that no seen surface is near in place and normal: the back of what is thin is not seen.
+    """Return the share of a surface that no seen surface is near to in place and normal.
 
     Args:
-        reach: how far is near [m]; a turn of 60° is as far.
+        reach: how far is near [m]. A turn of 60° is as far.
     """
     from scipy.spatial import KDTree
 
@@ -287,7 +287,7 @@ def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: floa
 
 
 def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:
-    """Area [m²] and normal of each face, the area none where the face stands on the support at z = 0."""
+    """Return area [m²] and normal of each face. Faces on the support at z = 0 have no area."""
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     across = np.cross(b - a, c - a)
     length = np.linalg.norm(across, axis=1)

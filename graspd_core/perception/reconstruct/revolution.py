@@ -1,9 +1,9 @@
-"""Bodies of revolution: the seen profile turned about its axis, and what closes it.
+"""Bodies of revolution: the seen profile turned about its axis, and its closure.
 
-The axis comes first from the normals of what was seen, then from the points. The normals of such a body all meet its
-axis: with p and n a point and its normal, the axis through c along a obeys n·(c × a) + (p × n)·a = 0, which is linear
-in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001). Normals are noisy where depth is, so that the
-axis is then settled by the points: turned into one half-plane, those of one place of the profile must coincide.
+The axis comes first from the normals, which all meet it. With p and n a point and its normal, the axis through c along
+a obeys n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry,
+2001). Normals are noisy, so the points then settle the axis: turned into one half-plane, points of one place of the
+profile must coincide.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Axis:
 
 
 def fit_axis(surfels: Surfels, direction: Vector) -> Axis:
-    """The line of that direction that the normals pass nearest to, those that miss it by far left out."""
+    """Return the line of that direction that the normals pass nearest to, by robust weights."""
     centre = surfels.points.mean(0)
     points, normals = surfels.points - centre, surfels.normals
     turning = np.cross(points, normals) @ direction
@@ -65,7 +65,7 @@ def fit_axis(surfels: Surfels, direction: Vector) -> Axis:
 
 
 def meeting_direction(surfels: Surfels) -> Vector:
-    """The direction of the line that all normals meet best, by iterated weights."""
+    """Return the direction of the line that all normals meet best, by iterated weights."""
     centre = surfels.points.mean(0)
     size = float(np.abs(surfels.points - centre).max())
     points = (surfels.points - centre) / size
@@ -84,8 +84,11 @@ def meeting_direction(surfels: Surfels) -> Vector:
 
 
 def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, "n 4"]]:
-    """Points turned about the axis into one half-plane: the unit direction that each lies in, then its height along the
-    axis and distance from it [m], and its normal's part along and away from it."""
+    """Turn points about the axis into one half-plane.
+
+    Returns the direction of each point from the axis, and rows. Rows hold height along the axis, distance from it [m],
+    and the normal's part along and away from it.
+    """
     offset = surfels.points - axis.point
     height = offset @ axis.direction
     outward = offset - np.outer(height, axis.direction)
@@ -96,15 +99,16 @@ def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, 
 
 
 def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]:
-    """Which points, in the half-plane, may be of a body of revolution: their normals meet the axis."""
+    """Return which rows may be of a body of revolution: their normals meet the axis."""
     return (rows[:, 2] ** 2 + rows[:, 3] ** 2 > 1 - MAX_SKEW**2) & (rows[:, 1] > 0.5 * step)
 
 
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
-    """The axis tilted to where the points about it make the thinnest profile, its place by the normals as before.
+    """Tilt the axis to make the thinnest profile by Gauss-Newton.
 
-    Gauss-Newton; points far from the profile, a handle, count less and less. The shifts that would go with a tilt are
-    not taken: along the line of sight a half seen from one side does not tell its place, and its normals do.
+    Its place follows from the normals. Points far from the profile, as of a handle, count less and less. The shifts
+    that go with a tilt are not taken. A half seen from one side does not show its place along the line of sight, but
+    its normals do.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
@@ -127,10 +131,10 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
 def _thinner(
     rows: Float[np.ndarray, "n 4"], rates: Float[np.ndarray, "4 n 2"], step: float, scale: float
 ) -> Float[np.ndarray, "4"]:
-    """How far to go by each motion, given the rates at which points rise and move outwards by it.
+    """Return the step by each motion, given the rates at which points rise and move outwards by it.
 
-    A point's residual is how far it is from the others of its cell of the profile, along that cell's normal; so is its
-    rate, for what moves all of a cell alike tells nothing. Residuals beyond `scale` [m] count little.
+    A point's residual is its distance from the others of its cell of the profile, along that cell's normal. Its rate is
+    measured in the same way. Residuals beyond `scale` [m] count little.
     """
     height, radius, along, across = rows.T
     wall = np.abs(across) > np.abs(along)
@@ -161,12 +165,12 @@ def _mean(
 
 @dataclass(frozen=True)
 class Revolution:
-    """The surface that turning what was seen about an axis gives.
+    """The surface of revolution of the seen part about an axis.
 
     Attributes:
         surfels: of the whole surface.
         agree, wrong: share of places on it that confirm and that contradict it.
-        share: how much of what was seen it accounts for.
+        share: how much of the seen part it accounts for.
     """
 
     axis: Axis
@@ -177,7 +181,7 @@ class Revolution:
 
 
 def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Revolution | None:
-    """The revolution that shows most: about an upright axis, if the object stands, or one that all normals meet."""
+    """Return the best revolution: about an upright axis, if the object stands, or about one that all normals meet."""
     met = meeting_direction(surfels)
     # A ball has all axes: one across the view shows its back.
     axes = [fit_axis(surfels, UP if free_space.standing else ACROSS_VIEW)]
@@ -190,7 +194,7 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
 
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
-    """The seen profile turned about the axis; rings that the cameras contradict are left out."""
+    """Turn the seen profile about the axis. Rings that the cameras contradict are left out."""
     from scipy.spatial import KDTree
 
     _, rows = half_plane(surfels, axis)
@@ -215,9 +219,9 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
 
 
 def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
-    """What closes a profile that stops away from the axis: a flat cap, or a curve down to the support.
+    """Return what closes a profile that stops away from the axis: a flat cap, or a curve down to the support.
 
-    A cap only where the cameras saw the rim to be the end, and neither where they contradict it.
+    A cap needs a rim that the cameras saw to be the end. Neither may contradict the cameras.
     """
     found = []
     outer = profile[profile[:, 3] > 0.1]
@@ -244,10 +248,7 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
 
 
 def _foot(rim, way: float, ground: float, step: float) -> Rows:
-    """From an overhanging rim to where the axis meets the support: the parabola that leaves the rim along its tangent.
-
-    Of a ball cut at 30° below its middle it misses the rest by a hundredth of the radius.
-    """
+    """Return the parabola from an overhanging rim, along its tangent, to where the axis meets the support."""
     height, radius = way * -rim[0] + ground, rim[1]
     along, across = way * rim[2], rim[3]
     if along < 0.15 or height < 2 * step:
@@ -268,7 +269,7 @@ def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpac
 
 
 def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "m 4"]:
-    """Means over cells of height, radius and the side they face."""
+    """Return the means over cells of height, radius and the side that they face."""
     side = np.where(np.abs(rows[:, 2]) > np.abs(rows[:, 3]), 2 + (rows[:, 2] > 0), rows[:, 3] > 0)
     cells = np.column_stack([np.floor(rows[:, :2] / step).astype(int), side.astype(int)])
     _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
@@ -279,7 +280,7 @@ def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "
 
 
 def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
-    """Each row of the profile turned to so many places."""
+    """Turn each row of the profile to `counts` places."""
     rows = np.repeat(np.arange(len(profile)), counts)
     place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     turn = 2 * np.pi * place / np.repeat(counts, counts)

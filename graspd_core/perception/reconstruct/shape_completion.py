@@ -1,8 +1,8 @@
-"""The unseen side of an object, guessed by whichever rule the evidence favours.
+"""The unseen side of an object, guessed by the rule that the evidence favours.
 
-Guesses: a body of revolution, one or two mirror planes, a centre of symmetry; beside each, the outline seen from above
-extruded to the support. A guessed point that lies in seen empty space, in the support, or where the surface itself was
-seen is dropped; a rule is used only where the cameras confirm much of it and contradict next to nothing.
+Rules: a body of revolution, one or two mirror planes, a centre of symmetry, and beside each the outline seen from above
+extruded to the support. Guessed points in empty space, in the support, or at seen surface are dropped. A rule is used
+only if the cameras confirm much of it and contradict next to nothing.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Completion:
     """Guessed surface.
 
     Attributes:
-        method: the rule, e.g. "mirror and extrusion"; empty where none applied.
+        method: the rule, e.g. "mirror and extrusion", empty for none.
         surfels: without what contradicts or repeats what was seen.
         openness: share of the surface that was missing before.
     """
@@ -46,7 +46,7 @@ class Completion:
 
 
 def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig) -> Completion:
-    """The guess that the evidence favours: of rules that explain what was seen, the one that says most."""
+    """Return the guess that the evidence favours: of rules that explain what was seen, the one that adds most."""
     from scipy.spatial import KDTree
 
     missing = openness(with_foot(seen, free_space, step), step)
@@ -75,7 +75,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: 
 
 
 def openness(surfels: Surfels, step: float) -> float:
-    """How much of a surface is missing: the normals of a closed one, evenly sampled, add up to nothing."""
+    """Return the missing share of a surface: the normals of a closed one, evenly sampled, add up to nothing."""
     return float(np.linalg.norm(thin(surfels, 2 * step).normals.mean(0)))
 
 
@@ -84,7 +84,7 @@ def _counts(guess: Surfels, seen: Surfels) -> bool:
 
 
 def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """The guess, thinned, less what the cameras speak against and what lies where the surface is known."""
+    """Return the guess, thinned, without points that contradict the cameras or lie at known surface."""
     from scipy.spatial import KDTree
 
     guess = take(guess, empty_depth(free_space, guess.points) < free_space.slack)
@@ -115,9 +115,9 @@ def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
 
 
 def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
-    """What one of `RULES` says of the unseen side, whether or not it is the likeliest; None where it says nothing.
+    """Return the guess of one of `RULES` for the unseen side, likely or not, None if it makes none.
 
-    "" says that nothing is hidden but what the surface closes over.
+    "" guesses that nothing is hidden except what the surface closes over.
     """
     if rule == REVOLUTION:
         turned = find_revolution(seen, free_space, step)

@@ -1,7 +1,7 @@
 """Symmetries that a partly seen object may have: mirror planes and centres.
 
-Each search moves points of what was seen by many candidates at once and keeps the one whose images fall on seen surface
-where cameras looked, never into space that they saw to be empty, and show something new.
+Each search moves seen points by many candidates at once. It keeps the candidate whose images fall on seen surface,
+never into space seen to be empty, and show something new.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graspd_core.se3 import perpendicular
 FINE_SAMPLES, COARSE_SAMPLES = 240, 90
 # What a contradiction weighs against a confirmation.
 CONTRADICTION_WEIGHT = 3.0
-# Directions of mirror planes that are tried of an object that stands, and of one that does not; places of each.
+# Directions of mirror planes that are tried for a standing object and for others, and places of each.
 UPRIGHT_DIRECTIONS, SPHERE_DIRECTIONS, PLANE_OFFSETS = 30, 70, 29
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -34,7 +34,7 @@ Score = Callable[[Shares, Shares, Shares, Shares], Shares]
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A motion, or a reflection, that is thought to take the object onto itself: p ↦ A p + b.
+    """A motion, or a reflection, that may take the object onto itself: p ↦ A p + b.
 
     Attributes:
         linear, shift: A and b [m].
@@ -51,19 +51,19 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class _Sample:
-    """What candidates are judged on: points all over what was seen, and where it ends."""
+    """Points that candidates are scored on: all over the seen part, and at its rim."""
 
     few: Surfels
     rim: Points
 
 
 def image(symmetry: Symmetry, surfels: Surfels) -> Surfels:
-    """The surfels moved."""
+    """Return the surfels moved by the symmetry."""
     return Surfels(surfels.points @ symmetry.linear.T + symmetry.shift, surfels.normals @ symmetry.linear.T)
 
 
 def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
-    """Where every image falls on what is seen anyway, a symmetry is true and useless; where none does, unproven.
+    """Return how useful symmetries are. One whose images all fall on seen surface is true and useless.
 
     Args:
         agree, wrong: share of judged images that the cameras confirm and contradict.
@@ -74,12 +74,12 @@ def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares
 
 
 def truth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
-    """How well a symmetry is proven, useful or not."""
+    """Return how well symmetries are proven, useful or not."""
     return agree * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
 
 
 def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
-    """The mirror plane that shows most, and the one square to it, if that is true as well."""
+    """Return the mirror plane that shows most, and the one normal to it, if that is true as well."""
     sample = _sample(surfels)
     first, normal = _best_plane(_directions(free_space.standing), sample, free_space, worth)
     if free_space.standing:
@@ -94,7 +94,7 @@ def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
 
 
 def find_centre(surfels: Surfels, free_space: FreeSpace) -> Symmetry:
-    """The best centre of symmetry; of a standing object, the best upright axis of half a turn."""
+    """Return the best centre of symmetry, for a standing object the best upright axis of half a turn."""
     sample = _sample(surfels)
     low, high = surfels.points.min(0), surfels.points.max(0)
     middle, size = 0.5 * (low + high), float((high - low).max())
@@ -142,7 +142,7 @@ def _pick(
     free_space: FreeSpace,
     score: Score,
 ) -> tuple[int, Symmetry]:
-    """The best of several, and which it is."""
+    """Return the number of the best candidate, and the candidate."""
     few = sample.few
     points = np.einsum("kij,nj->kni", linear, few.points) + shift[:, None]
     confirmed, against = weigh(free_space, points, np.einsum("kij,nj->kni", linear, few.normals))
@@ -163,7 +163,7 @@ def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) ->
 
 
 def _sample(surfels: Surfels) -> _Sample:
-    """A fixed choice of points, and of those that have neighbours to one side only."""
+    """Return a fixed choice of points, and of those with neighbours to one side only."""
     from scipy.spatial import KDTree
 
     answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
@@ -183,7 +183,7 @@ def _some(surfels: Surfels, count: int) -> Surfels:
 
 
 def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Level directions over half a turn, or directions over half a sphere (golden spiral)."""
+    """Return level directions over half a turn, or directions over half a sphere (golden spiral)."""
     if standing:
         turn = np.pi * np.arange(UPRIGHT_DIRECTIONS) / UPRIGHT_DIRECTIONS
         return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT_DIRECTIONS)])
@@ -194,7 +194,7 @@ def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
 
 
 def _around(normal: Vector, angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Directions within an angle [rad]; of a level one, level ones."""
+    """Return directions within an angle [rad], level ones about a level one."""
     steps = angle * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
     side = np.cross(normal, UP) if standing else perpendicular(normal)
     turned = normal + steps * side
