@@ -13,18 +13,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bag_writer import Record, camera_info_message, cloud_message, depth_message, write_bag
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import TabletopScene, depth_views, on_table, ring_poses, tabletop
+from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
+from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
+from graspd_core.transforms import SECOND
 from graspd_core.types import TriangleMesh
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 MATRIX = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
 POSE = ring_poses(1, elevation=0.6, azimuth=-1.2)[0]
 GITHUB = "https://github.com/"
+FRAME, STAMP = "camera_optical_frame", 1_700_000_000 * SECOND
 
 
 @dataclass(frozen=True)
@@ -170,6 +175,48 @@ def scaled(shape: str, factor: float) -> TriangleMesh:
 
 def millimetres() -> np.ndarray:
     return (1000 * depth_of()[0]).astype(np.uint16)
+
+
+def bag(make_message: Callable[[int], Any], topic: str = "points") -> Callable[[Path], Path]:
+    """A recording of one message, and of its camera beside a depth image."""
+
+    def make(folder: Path) -> Path:
+        records = [Record(f"/{topic}", STAMP, make_message(STAMP))]
+        if topic.startswith("depth"):
+            records.insert(0, Record("/depth/camera_info", STAMP, camera_info_message(CAMERA, FRAME, STAMP)))
+        write_bag(folder / "recording", records)
+        return folder / "recording"
+
+    return make
+
+
+def recorded(row: Situation, path: Path) -> Path | None:
+    """Return the row's input as a recording of what a driver would publish; None where no message can be that."""
+    if path.is_dir():
+        return path
+    if "scale" in row.options or not path.exists() or not is_cloud_file(path):
+        return None
+    arrays = dict(np.load(path)) if path.suffix == ".npz" else {}
+    if "depth" in arrays:
+        whole = arrays["depth"].dtype.kind == "u"
+        depth, encoding = (arrays["depth"] / 1000, "16UC1") if whole else (arrays["depth"], "32FC1")
+        message = lambda stamp: depth_message(depth, FRAME, stamp, encoding=encoding)  # noqa: E731
+        return bag(message, "depth/image_rect")(path.parent) if "K" in arrays else None
+    try:
+        points = np.load(path) if path.suffix == ".npy" else load_views(path)[0].points
+    except CloudError:
+        return None
+    return bag(lambda stamp: cloud_message(points, FRAME, stamp))(path.parent)
+
+
+def camera_place(path: Path) -> tuple[float, ...]:
+    """Where a file says that its camera stood; empty where it does not say."""
+    if path.suffix.removeprefix(".") not in CLOUD_ENDINGS or not is_cloud_file(path):
+        return ()
+    try:
+        return tuple(load_views(path)[0].viewpoint.tolist())
+    except CloudError:
+        return ()
 
 
 BOTTLE, BOX, CYLINDER = volume("bottle"), volume("box"), volume("cylinder")
@@ -369,7 +416,7 @@ MESHES = (
     Situation(
         "a mesh with a target",
         mesh_file("a.stl", make_shape("box")),
-        "target: given with .*a.stl, a mesh",
+        "target(_point)?: given with .*a.stl, a mesh",
         "",
         {"target": (0.0, 0.0, 0.0)},
     ),
@@ -435,4 +482,12 @@ MESHES = (
     ),
     Situation("a file that is not there", lambda folder: folder / "a.ply", "no such", "graspnet/graspnetAPI/issues/3"),
 )
-SITUATIONS = CLOUDS + MESHES
+MESSAGES = (
+    Situation(
+        "a message without points",
+        bag(lambda stamp: cloud_message(np.zeros((0, 3)), FRAME, stamp)),
+        "empty",
+        "QingyongHu/RandLA-Net/issues/197",
+    ),
+)
+SITUATIONS = CLOUDS + MESHES + MESSAGES
