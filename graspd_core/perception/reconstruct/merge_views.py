@@ -21,7 +21,6 @@ from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows, voxel_keys
 from graspd_core.perception.cloud.free_space import FreeSpace, view_frame
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, Vector, clean_cloud, least_axes
-from graspd_core.perception.cloud.viewpoint_check import fits_nowhere
 from graspd_core.se3 import perpendicular
 
 # Points of a surface seen flatter than this flew off an edge.
@@ -169,9 +168,9 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
     np.minimum.at(near, line, local[:, 2])
     np.maximum.at(far, line, local[:, 2])
-    share = float((far - near > MAX_RISE_CELLS * cell).mean())
-    # The name of a frame says an axis, too, of a cloud that no camera on any side sees all of.
-    return share > LAYERED_SHARE and (not axis_known or share > LAYERED_SHARE_OF_CAMERA or fits_nowhere(view))
+    # No camera sees what is behind it, whatever axis the name of its frame says.
+    most = LAYERED_SHARE_OF_CAMERA if axis_known and local[:, 2].min() > 0 else LAYERED_SHARE
+    return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspArray, GraspRequest
+from inputs_made import Situation, camera_place, recorded
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from situations import MESHES, SITUATIONS, Situation, camera_place, recorded
+from situations import MESHES, SITUATIONS
 
 from graspd_core.io.bags import read_raw
 
